@@ -105,7 +105,7 @@ def write(place, name):
     columns["reflectivity"] = rng.integers(0, 256, count).astype(np.uint8)
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
     jobs = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
-    write_table(data.place, [], lambda: jobs)
+    write_table(data.storage, [], lambda: jobs)
     data.finish(jobs)
 
 

@@ -20,7 +20,7 @@ from random import Random
 from typing import Any
 
 from benchmarks.scale import GPUS_EACH
-from lidarpool.run.pipeline.policies import batches_per_task, most_under_way
+from lidarpool.run.pipeline.policies import batches_per_task, max_under_way
 
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
@@ -70,7 +70,7 @@ def batches_a_second(
     vary = Random(1).uniform
     number = count()
     done = 0
-    most = shards * most_under_way(gpus, collectors_of(gpus))
+    most = shards * max_under_way(gpus, collectors_of(gpus))
     begin = 0.0
     events = [(0.0, next(number), n % shards, 0) for n in range(most)]
     while done < ROUNDS * most:

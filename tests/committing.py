@@ -15,7 +15,7 @@ def commit(store, first, counts, triangles, hits, job=None):
     It is of the only job of a run, or of one that is under way.
     """
     rng = np.random.default_rng(first)
-    job = job or store.only.job
+    job = job or store.only_job.job
     counts = np.array(counts)
     survey = job.survey
     columns = {
@@ -32,5 +32,5 @@ def commit(store, first, counts, triangles, hits, job=None):
     name = part_name(store.db.meta["mark"], job.number, first, part.stop)
     store.storage.prepare()
     store.storage.write(name, data)
-    receipt = Receipt.of_part(part, job.number, name, len(data))
+    receipt = Receipt.from_part(part, job.number, name, len(data))
     return bool(store.db.commit([(store.under_way[job.number], receipt)]))

@@ -80,6 +80,6 @@ def write_set(
     for row in rows:
         if row.done:
             data.write_job(row, points_of(scene, row.number), sweeps)
-    write_table(data.place, ["rain"], lambda: rows)
+    write_table(data.storage, ["rain"], lambda: rows)
     data.finish(rows)
     return data

@@ -61,7 +61,7 @@ async def declare(
     pool: Mapping[str, tuple[str, ...]],
     known_partitions: Collection[str],
 ) -> tuple[dict[str, str], list[WorkerInfo]]:
-    """Make all of some partitions, or none, and follow their rules afterwards.
+    """Make all new partitions or none, and follow their rules afterwards.
 
     Parameters
     ----------
@@ -293,7 +293,10 @@ def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
 
 
 def _belongs(seat: Seat, names: Collection[str]) -> bool:
-    """Return whether a worker is in a partition, or was started in it and is in no partition."""
+    """Return whether a worker is in a partition of `names`, or was started in such a partition.
+
+    Only workers without a partition are judged by their start.
+    """
     if seat.partition is None:
         return not seat.original.keys().isdisjoint(names)
     return seat.partition in names

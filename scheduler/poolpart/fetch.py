@@ -23,7 +23,7 @@ _held: dict[str, Any] = {}  # {name: bytes that this process holds}
 
 
 def fetch_available(
-    client: Client, keys: Collection[str], patience_s: float = 2.0, *, at: str | None = None
+    client: Client, keys: Collection[str], patience_s: float = 2.0, *, holder: str | None = None
 ) -> dict[str, Any]:
     """Fetch the results that are available now; a later call fetches further results.
 
@@ -43,7 +43,7 @@ def fetch_available(
     patience_s
         Longest time to wait for an answer of the scheduler, and then for a sign of life of each
         worker, in seconds. A transfer may take longer.
-    at
+    holder
         Address of a worker that has all keys; then the scheduler is not asked where they are.
 
     Returns
@@ -54,8 +54,8 @@ def fetch_available(
     require(FETCHING)
 
     async def fetch() -> dict[str, Any]:
-        if at is not None:
-            return await _take(client, at, list(keys), patience_s)
+        if holder is not None:
+            return await _take(client, holder, list(keys), patience_s)
         try:
             holders = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
         except TimeoutError:

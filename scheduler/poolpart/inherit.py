@@ -125,7 +125,7 @@ def is_inherited(scheduler: Any, name: str) -> bool:
 
 
 def end_inheritance(scheduler: Any, name: str | None) -> None:
-    """End inheritance in a partition, or in all if the name is None; nothing stays behind."""
+    """End inheritance in a partition, or in all partitions if the name is None."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
     if rule is None:
         return
@@ -143,7 +143,7 @@ _requests: set[asyncio.Future[Any]] = set()  # to workers, under way, of all sch
 
 
 def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
-    """Add the plugin of a partition to all workers, or remove the plugin if it is None."""
+    """Add the plugin of a partition to all workers, or remove the plugin with None."""
     for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
         _requests.add(request)
         request.add_done_callback(_requests.discard)

@@ -229,7 +229,7 @@ class Stage:
         calls: Sequence[Sequence[Call]],
         previous_tasks: Sequence[Future] | None = None,
     ) -> list[Future]:
-        """Submit a task for each chunk; `previous_tasks` are those of the stage before."""
+        """Submit a task for each chunk; `previous_tasks` are the tasks of the stage before."""
         # Dask tries again only what fails.
         keep_errors = self.return_exceptions and not self.retries
         # One message is cheaper for the scheduler than one for each task.

@@ -161,7 +161,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe on the scheduler, with its items; do nothing if the pipe is gone."""
+        """Delete the pipe on the scheduler, with its items; do nothing if there is no pipe."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:

@@ -300,7 +300,7 @@ class Pool:
         return partitions_page(self.client)
 
     def pipes(self) -> list[str]:
-        """Return the names of all pipes of the cluster, whichever client has created them.
+        """Return the names of all pipes of the cluster, created by any client.
 
         Dask's ``Queue(name)`` has the items of a pipe, and ``Variable(name)`` its state.
         """
@@ -340,7 +340,7 @@ class Pool:
     def _divide(
         self, rules: Mapping[str, Rule], initial_rules: Mapping[str, Rule]
     ) -> tuple[dict[str, Partition], Pool]:
-        """Make all of some partitions, or none; return them by name, and a pool of the remainder.
+        """Make all partitions or none; return the partitions by name, and a pool of the remainder.
 
         Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
         """

@@ -46,7 +46,7 @@ _ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 
 @dataclass(eq=False)
 class Seat:
-    """Partition and state of a worker, also while the nanny of the worker restarts it."""
+    """Partition and state of a worker, also while the worker's nanny restarts the process."""
 
     key: Hashable  # identifies the worker, see `seat_key`
     info: WorkerInfo
@@ -150,7 +150,7 @@ class Steward(SchedulerPlugin):
             self.put(seat, name, seat.original[name])
 
     def resize(self, name: str | None, change: int) -> None:
-        """Change the number of workers in a rule `n_workers`; do nothing for another rule."""
+        """Change the number of workers in a rule `n_workers`; or do nothing for further rules."""
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))

@@ -139,8 +139,8 @@ def ask_workers(
             answers = asyncio.ensure_future(request)
             try:
                 while silent.isdisjoint(remaining):
-                    answered, _ = await asyncio.wait([answers], timeout=_LOOK_S)
-                    if answered:
+                    finished, _ = await asyncio.wait([answers], timeout=_LOOK_S)
+                    if finished:
                         return dict(answers.result())
                     present = (await ask(client, None, "identity", n_workers=-1))["workers"]
                     silent = silent_workers({a: w["last_seen"] for a, w in present.items()})

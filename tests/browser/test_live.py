@@ -14,7 +14,7 @@ from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Kept, Run
+from lidarpool.run.runner import Run, StoredOutput
 from lidarpool.scenario.build import Job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -53,7 +53,7 @@ class Driven:
         begun = time.monotonic()
         options = RunOptions(client=client)
         screen = Screen(lambda progress: None)
-        survey_run = Run(job, options, Kept(), screen, live, self.on_frame)
+        survey_run = Run(job, options, StoredOutput(), screen, live, self.on_frame)
         self.run = survey_run
 
         def on_frame(frame):
@@ -80,7 +80,7 @@ class Driven:
     @property
     def points(self):
         """What is committed."""
-        return self.run.store.only
+        return self.run.store.only_job
 
     def ended(self):
         """Wait for its end."""

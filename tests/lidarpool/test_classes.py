@@ -194,7 +194,7 @@ def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
     other = replace(sweeps, classes={3: "lane", 8: "tree"})
     for row, of in zip(rows, (sweeps, other), strict=True):
         data.write_job(row, points_of(scene, row.number), of)
-    write_table(data.place, [], lambda: rows)
+    write_table(data.storage, [], lambda: rows)
     data.finish(rows)
     found = lidarpool.sweeps(tmp_path)
     assert found.classes == NAMES | {3: "road; lane", 8: "tree"}

@@ -83,7 +83,7 @@ def test_what_is_committed_is_there_once(db, job):
         assert [p.name for p in parts.ordered] == [one.name, two.name]
         assert (parts.scans_done, parts.point_count, parts.hits) == (7, 9, 27)
         assert parts.missing(0, SCANS) == [(5, 10), (12, SCANS)]
-        assert found.left == SCANS - 7 and not found.scans_complete
+        assert found.missing_count == SCANS - 7 and not found.scans_complete
     again.close()
 
 
@@ -236,7 +236,11 @@ def test_a_job_that_is_restarted_has_nothing(db, job):
     job.frames = 5
     db.save_frames([job])
     db.restart(job)
-    assert (job.left, job.frames, job.parts.ordered) == (SCANS, 0, []) and db.begun == set()
+    assert (job.missing_count, job.frames, job.parts.ordered) == (
+        SCANS,
+        0,
+        [],
+    ) and db.begun == set()
     assert commit(db, job, receipt(0, 6))
     db.restart(read(db, 8))
     again = reopened(db)

@@ -244,7 +244,7 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     assert len(only) == 1 and only.actors
     DataSet(Storage.at(tmp_path), "parquet").write_job(JobRow(0, "0"), cloud, only)
     with np.load(tmp_path / "boxes/0.npz") as kept:
-        np.testing.assert_allclose(kept["centres"][0], Boxes.of(only, 0, cloud).centres)
+        np.testing.assert_allclose(kept["centres"][0], Boxes.from_points(only, 0, cloud).centres)
 
 
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
@@ -271,7 +271,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
 
 
 def test_webdataset_has_a_sample_for_each_sweep(scene, job, sweeps, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.export.webdataset.SHARD_MOST", 60_000)
+    monkeypatch.setattr("lidarpool.export.webdataset.MAX_SHARD_BYTES", 60_000)
     row = JobRow(7, "hall.b", "train", {"rain": 0.5})
     places = [Storage.at(tmp_path / "here"), Storage.at((tmp_path / "there").as_uri())]
     for place in places:  # as at a URL: several ranges are written at a time

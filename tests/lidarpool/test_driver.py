@@ -32,7 +32,7 @@ from lidarpool.run.pipeline.messages import (
 from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
 from lidarpool.run.pipeline.pipeline_job import PipelineJob
 from lidarpool.run.pipeline.placement import TaskRecord
-from lidarpool.run.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
+from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
 from lidarpool.run.store.database import RunDatabase
 from lidarsim.base.storage import Storage
 from poolpart.task_locations import TaskLocations
@@ -103,7 +103,7 @@ class Workers:
     def forget(self, key):
         self.casts.pop(key, None)
 
-    def words_on_memory(self, worker):
+    def memory_clause(self, worker):
         return ""
 
     def release(self):
@@ -332,7 +332,7 @@ class Run:
         assert not self.workers.jobs and not self.driver._announced
 
     def at(self, place, number=None):
-        there = self.driver.dispatcher.at(place)
+        there = self.driver.dispatcher.in_states(place)
         return there if number is None else [b for b in there if b.job.number == number]
 
 
@@ -366,7 +366,7 @@ def test_the_driver_waits_for_more_news_only_while_much_is_under_way(empty):
     empty.driver.wait(0.0)
     alone = empty.stages.linger_s
     dispatcher = empty.driver.dispatcher
-    empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.most, idle="cast")
+    empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.max_weight, idle="cast")
     empty.driver.wait(0.0)
     assert alone == driver.LINGER_S < empty.stages.linger_s <= 10 * driver.LINGER_S
     empty.end()
@@ -538,7 +538,7 @@ def test_a_suspect_that_is_innocent_is_not_divided(run):
     batch = run.at(BatchState.CASTING)[0]
     for _ in range(2):
         run.workers.die(batch.worker)
-        run.until(lambda: batch.place is BatchState.CASTING, idle="cast")
+        run.until(lambda: batch.state is BatchState.CASTING, idle="cast")
     alone = [b for b in run.at(BatchState.CASTING) if b.worker == batch.worker]
     assert batch.deaths["intersect"] == 2 and alone == [batch]
     run.end()
@@ -546,14 +546,14 @@ def test_a_suspect_that_is_innocent_is_not_divided(run):
 
 
 def test_batches_under_way_are_bounded_whoever_is_slow(run):
-    most = most_under_way(2, 2)
+    most = max_under_way(2, 2)
     run.stages.advice = 1
     for _ in range(5 * most):
         run.step()
         run.stages.generate()
     assert len(run.driver.dispatcher.batches) == most and not run.stages.wanted
     oldest = min(run.driver.dispatcher.batches.values(), key=lambda batch: batch.first)
-    for _ in range(5 * SPAN * most):  # all the others go on
+    for _ in range(5 * MAX_SPAN * most):  # all the others go on
         run.step()
         run.stages.generate()
         for key in run.workers.open:
@@ -563,7 +563,7 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
             run.stages.inbox += run.stages.collect(order)
         for orders in run.stages.orders.values():
             orders.clear()
-    assert run.job.generated - oldest.first <= max(SPAN * most, SCANS) and run.frames[0] == []
+    assert run.job.generated - oldest.first <= max(MAX_SPAN * most, SCANS) and run.frames[0] == []
 
 
 def test_a_run_that_is_stopped_leaves_nothing(run):
@@ -609,7 +609,7 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 
     work = [run.stages.generate, collect, cast, run.stages.sort]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policies, "KILLS_MOST", 10**6)  # here nobody is to blame
+        patch.setattr(policies, "MAX_KILLS", 10**6)  # here nobody is to blame
         for _ in range(100):
             chance.choice([*work, *work, *work, lose_stage, lose_worker, wake])()
             if chance.random() < 0.7:
@@ -776,7 +776,7 @@ def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     begin()
     assert begun >= ANNOUNCED
     empty.until(begin)
-    assert 32 <= most <= 2 * most_under_way(2, 2, 32)
+    assert 32 <= most <= 2 * max_under_way(2, 2, 32)
 
 
 def test_slots_are_wanted_as_long_as_there_is_work(run):

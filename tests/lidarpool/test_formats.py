@@ -531,7 +531,7 @@ def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
         survey = Survey(Sensor.grid(360, 4), poses, steps=steps)
         sweeps = Sweeps.from_survey(survey, scene)
         points = Cloud(np.zeros((1, 3)), {"scan": [scan], "object": [car]})
-        boxes = Boxes.of(sweeps, sweep, points)
+        boxes = Boxes.from_points(sweeps, sweep, points)
         assert boxes.points.tolist() == [1]
         np.testing.assert_allclose(boxes.centres, [[10 * when_s, 0, 0.75]], atol=0.02)
 

@@ -169,7 +169,7 @@ def test_hash_and_classes_do_not_depend_on_the_division(cuts):
     edges = [0, *sorted(cuts), 500]
     for first, stop in pairwise(edges):
         tally.add(cloud[first:stop])
-    whole = Tally.of(cloud)
+    whole = Tally.from_cloud(cloud)
     assert (tally.points, tally.sha256, tally.classes) == (500, whole.sha256, whole.classes)
     assert sum(tally.classes.values()) == 500
     assert tally.classes[6] == np.count_nonzero(cloud["class"] == 6)
@@ -180,6 +180,6 @@ def test_hash_can_be_computed_from_its_description():
     places = hashlib.sha256(np.arange(6, dtype="<f8").tobytes()).hexdigest()
     classes = hashlib.sha256(np.array([3, 4], "<u2").tobytes()).hexdigest()
     lines = f"positions <f8 {places}\nclass <u2 {classes}\n"
-    assert Tally.of(cloud).sha256 == hashlib.sha256(lines.encode()).hexdigest()
-    assert Tally().sha256 == Tally.of(cloud[:0]).sha256
+    assert Tally.from_cloud(cloud).sha256 == hashlib.sha256(lines.encode()).hexdigest()
+    assert Tally().sha256 == Tally.from_cloud(cloud[:0]).sha256
     assert Tally().classes == {}

@@ -33,7 +33,7 @@ from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.pipeline.messages import Receipt
 from lidarpool.run.progress import Progress, Screen
-from lidarpool.run.runner import Kept, Run
+from lidarpool.run.runner import Run, StoredOutput
 from lidarpool.run.store.job_under_way import JobUnderWay
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.columns.ply_format import header, row_type
@@ -55,7 +55,7 @@ def make_job(scans: int) -> OneJob:
 def shown(store: RunStore):
     """Yield the page of a run that nobody looks at."""
     with live_page(port=0, browser=False) as live:
-        live.begun(store.only)
+        live.begun(store.only_job)
         yield live
 
 
@@ -80,35 +80,35 @@ def displayed(live: LivePage) -> int:
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     store = RunStore(make_job(100))
-    live = LiveJob(store.only, most=500)
+    live = LiveJob(store.only_job, most=500)
     for scan in range(100):
         commit(store, scan, [33], [scan % 10], [165])
-        live.add([store.only.parts.part_of(scan)])
+        live.add([store.only_job.parts.part_of(scan)])
         live.gather()
     assert 150 < len(live.cloud) <= 500
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 100))[0]
     assert by_tenth.min() > 0.3 * by_tenth.mean()
-    assert np.array_equal(live.hit_counts(), store.only.hit_counts())
+    assert np.array_equal(live.hit_counts(), store.only_job.hit_counts())
 
 
 def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     store = RunStore(make_job(4))
-    live = LiveJob(store.only)
+    live = LiveJob(store.only_job)
     for scan in range(3):
         commit(store, scan, [5], [7], [25])
-    store.storage.remove([store.only.parts.part_of(1).name])
-    live.add(store.only.parts.ordered)
+    store.storage.remove([store.only_job.parts.part_of(1).name])
+    live.add(store.only_job.parts.ordered)
     live.gather()
     assert len(live.cloud) == 10
 
 
 def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
     job = make_job(100)
-    first = RunStore(job, place=tmp_path / "run")
+    first = RunStore(job, location=tmp_path / "run")
     for scan in range(60):
         commit(first, scan, [10], [7], [50])
     first.db.close()
-    store = RunStore(job, place=tmp_path / "run", resume=True)
+    store = RunStore(job, location=tmp_path / "run", resume=True)
     with shown(store) as live:
         # Before there is a cluster, what is left of the first is there to see.
         told = news(live)
@@ -138,7 +138,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
 
         options = RunOptions(client=client, backend="numpy")
         on_frame = scans.append
-        run = Run(job, options, Kept(), Screen(show), live, lambda f: on_frame(f.scan))
+        run = Run(job, options, StoredOutput(), Screen(show), live, lambda f: on_frame(f.scan))
         result = run.execute()
         assert scans == [*range(survey.scan_count)]
         told = news(live)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from lidarpool import Cloud, LidarError
 from lidarpool.columns.parts import (
     StoredCloud,
+    deletable_files,
     mark_name,
-    own_files,
     pack,
     part_name,
     probe_name,
@@ -148,12 +148,12 @@ def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
     for name in own | foreign:
         storage.write(name, b"x")
     for which in (mark, None):
-        assert own_files(storage, which) == []
+        assert deletable_files(storage, which) == []
     storage.write(mark_name(mark), b"")
     for which in (mark, None):
-        found = own_files(storage, which)
+        found = deletable_files(storage, which)
         assert {*found} == {*own, mark_name(mark)} and found[-1] == mark_name(mark)
-    assert own_files(storage, other) == []
+    assert deletable_files(storage, other) == []
     assert scans_of(part, mark) == (3, 5, 120)
     assert {scans_of(name, mark) for name in (own | foreign) - {part}} == {None}
     assert scans_of(part, other) is None

@@ -11,11 +11,11 @@ from lidarpool.run.pipeline.batches import Batch, BatchState, Outcome
 from lidarpool.run.pipeline.names import INTERSECT
 from lidarpool.run.pipeline.placement import TaskRecord
 from lidarpool.run.pipeline.policies import (
-    AHEAD,
-    COLLECTING,
     LATE_FACTOR,
     LATE_S,
     SUSPECT_DEATHS,
+    TASKS_PER_COLLECTOR,
+    TASKS_PER_SLOT,
     batches_per_task,
     handovers,
     late_after_s,
@@ -24,7 +24,7 @@ from lidarpool.run.pipeline.policies import (
     scans_per_batch,
     slots_wanted,
 )
-from lidarpool.run.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
+from lidarpool.run.pipeline.task_book import MAX_MISPLACED, MAX_RECORDS, StageTotals, TaskBook
 from poolpart.task_locations import TaskLocations, TaskPlace
 
 A = "tcp://a:1"
@@ -101,9 +101,12 @@ def test_slots_are_wanted_for_what_is_left():
 
 def test_the_worker_with_the_least_work_for_its_slots_gets_the_next_batch():
     slots = {A: 1, B: 3}
-    chosen = offers([casting(0, A), casting(1, B), *waiting(9)], slots, most=99)
+    chosen = offers([casting(0, A), casting(1, B), *waiting(9)], slots, max_weight=99)
     assert numbers(chosen)[:3] == [(10, B), (11, B), (12, A)]
-    assert Counter(where for _, where in chosen) == {A: AHEAD - 1, B: 3 * AHEAD - 1}
+    assert Counter(where for _, where in chosen) == {
+        A: TASKS_PER_SLOT - 1,
+        B: 3 * TASKS_PER_SLOT - 1,
+    }
 
 
 def sizes(there, per_task=4):
@@ -134,7 +137,7 @@ def test_a_collector_on_the_host_of_the_columns_is_preferred():
         0: "collect-1", 1: "collect-0", 2: "collect-1", 3: "collect-1", 4: "collect-0",
         5: "collect-0",
     }  # fmt: skip
-    assert len(chosen) == 2 * COLLECTING
+    assert len(chosen) == 2 * TASKS_PER_COLLECTOR
     assert handovers(there, {}) == []
 
 
@@ -186,7 +189,7 @@ def record(number: int, resources: tuple[str, ...] = ("GPU",), every: float = 1.
 
 def test_totals_are_exact_however_many_tasks_there_are():
     book = TaskBook()
-    count = 5 * RECORDS_MOST
+    count = 5 * MAX_RECORDS
     for number in range(count):
         book.add(record(number))
     totals = book.stages["intersect"]
@@ -200,11 +203,11 @@ def test_totals_are_exact_however_many_tasks_there_are():
 
 def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
     totals = StageTotals("intersect", "GPU")
-    for number in range(3 * MISPLACED_MOST):
+    for number in range(3 * MAX_MISPLACED):
         totals.add(record(number, ("OTHER",) if number % 2 else ()))
-    assert totals.violations == 3 * MISPLACED_MOST
+    assert totals.violations == 3 * MAX_MISPLACED
     assert totals.misplaced == [
-        record(n, ("OTHER",) if n % 2 else ()) for n in range(MISPLACED_MOST)
+        record(n, ("OTHER",) if n % 2 else ()) for n in range(MAX_MISPLACED)
     ]
     assert totals.resources == {"OTHER": 30, "none": 30}
 

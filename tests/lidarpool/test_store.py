@@ -74,30 +74,34 @@ def unfinished(folder):
 
 def test_a_run_from_its_beginning_to_its_end(folder):
     store = opened(folder)
-    assert (store.kept, store.only.complete, store.only.resumed) == ("", False, 0)
+    assert (store.committed_in_words, store.only_job.complete, store.only_job.resumed) == (
+        "",
+        False,
+        0,
+    )
     add(store, 2, 6)
-    assert store.kept == "4 of 6 scans" and store.only.progress().points == 12
+    assert store.committed_in_words == "4 of 6 scans" and store.only_job.progress().points == 12
     add(store, 0, 2)
-    store.only.frames = 6
-    assert store.only.complete
-    cloud = store.only.points().load()
+    store.only_job.frames = 6
+    assert store.only_job.complete
+    cloud = store.only_job.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
-    assert len(store.only.points()) == 18 == store.only.parts.point_count
+    assert len(store.only_job.points()) == 18 == store.only_job.parts.point_count
     for scan in range(6):
-        points = store.only.points_of_scan(scan)
+        points = store.only_job.points_of_scan(scan)
         assert set(points.scan) == {scan} and "time" in points.columns
         assert np.array_equal(points.positions, cloud.positions[3 * scan : 3 * scan + 3])
-    hits = store.only.hit_counts()
+    hits = store.only_job.hit_counts()
     assert hits.shape == (len(SCENE.faces),)
     assert hits[[0, 2, 6]].tolist() == [1, 3, 2] and hits.sum() == 6
-    rays = store.only.sample_rays()
+    rays = store.only_job.sample_rays()
     assert rays.shape[1:] == (2, 3) and set(rays[:, 1, 0]) == {0, 2}
     assert set(map(tuple, rays[:, 0].tolist())) == {(0, 0, 1)}
     mark = store.db.meta["mark"]
     store.storage.write(part_name(mark, 0, 0, 2), b"of a collector that died")
     store.storage.write(probe_name(mark, "0a1b2c3d"), b"of a driver that died")
     store.tidy()
-    assert store.storage.sizes().keys() == {*store.only.points().names, mark_name(mark)}
+    assert store.storage.sizes().keys() == {*store.only_job.points().names, mark_name(mark)}
     store.remove()
     assert not folder.exists()
 
@@ -105,8 +109,8 @@ def test_a_run_from_its_beginning_to_its_end(folder):
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     store = opened()
     add(store, 0, 6)
-    points = store.only.points()
-    folder = store.place.local()
+    points = store.only_job.points()
+    folder = store.location.local()
     del store
     gc.collect()
     assert len(points.load()) == 18
@@ -117,8 +121,8 @@ def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
 
 def test_it_is_gone_on_with(unfinished):
     store = opened(unfinished, resume=True)
-    assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
-    assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)]
+    assert (store.only_job.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
     with pytest.raises(LidarError, match=r"'embree' is asked for, .* cast with 'numpy'"):
@@ -151,7 +155,7 @@ def test_another_version_cannot_go_on(unfinished, monkeypatch):
 def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
     opened(folder).db.close()
     store = opened(folder, job=OTHERS["scene"])
-    assert store.only.resumed == 0
+    assert store.only_job.resumed == 0
     store.db.close()
     opened(folder, job=OTHERS["scene"]).db.close()
 
@@ -159,11 +163,11 @@ def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
 def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
     store = opened(folder, job=job)
-    store.db.add_trials(store.only, [run_trial(PLANNING, 1)])
-    assert store.kept == "1 of 2 planning trials"
+    store.db.add_trials(store.only_job, [run_trial(PLANNING, 1)])
+    assert store.committed_in_words == "1 of 2 planning trials"
     store.db.close()
     again = opened(folder, resume=True, job=job)
-    assert [trial.trial for trial in again.only.trials] == [1] and not again.only.complete
+    assert [trial.trial for trial in again.only_job.trials] == [1] and not again.only_job.complete
 
 
 def part_of(folder, first):
@@ -192,13 +196,13 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     part.write_bytes(DAMAGES[damage](before, part_of(unfinished, 0).read_bytes()))
     assert part.read_bytes() != before
     store = opened(unfinished, resume=True)
-    assert (store.only.resumed, store.only.parts.missing(0, 6)) == (2, [(2, 6)])
+    assert (store.only_job.resumed, store.only_job.parts.missing(0, 6)) == (2, [(2, 6)])
     (note,) = store.notes
     assert "scans 3 to 4; " in note and f"{part.name} was damaged" in note
     assert add(store, 3, 5)
     store.tidy()
-    assert {*store.only.points().names, mark_of(store)} == store.storage.sizes().keys()
-    assert len(store.only.points().load()) == 12
+    assert {*store.only_job.points().names, mark_of(store)} == store.storage.sizes().keys()
+    assert len(store.only_job.points().load()) == 12
     store.db.close()
     assert opened(unfinished, resume=True).notes == []
 
@@ -208,23 +212,23 @@ def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
     add(store, 0, 2)
     part = part_of(folder, 0)
     part.write_bytes(part.read_bytes()[:-1])
-    for read in (lambda: store.only.points().load(), store.only.hit_counts):
+    for read in (lambda: store.only_job.points().load(), store.only_job.hit_counts):
         with pytest.raises(LidarError, match="cannot be used") as caught:
             read()
         assert "Resuming the run (--resume, in Python resume=True) casts its" in str(caught.value)
         assert "anew" not in str(caught.value)
     with pytest.raises(LidarError) as caught, store.kept_on_error():
-        store.only.points().load()
+        store.only_job.points().load()
     (note,) = caught.value.__notes__
     assert "continue with --resume" in note
     again = opened(folder, resume=True)
-    assert again.only.parts.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
+    assert again.only_job.parts.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
 
 
 def test_parts_that_are_gone_are_made_again(unfinished):
     shutil.rmtree(unfinished / "parts")
     store = opened(unfinished, resume=True)
-    assert store.only.resumed == 0
+    assert store.only_job.resumed == 0
     (note,) = store.notes
     assert note.startswith("cast again: scans 0 to 1, scans 3 to 4; ")
     assert note.endswith(f".npz were missing in {unfinished / 'parts'}")
@@ -241,7 +245,7 @@ def test_storage_that_cannot_be_read_is_not_taken_for_damage(unfinished, monkeyp
         patch.setattr(Storage, "read", refuse)
         with pytest.raises(LidarError, match=r"\.npz cannot be read: Permission denied"):
             opened(unfinished, resume=True)
-    assert opened(unfinished, resume=True).only.resumed == 4
+    assert opened(unfinished, resume=True).only_job.resumed == 4
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -258,19 +262,19 @@ def test_parts_elsewhere_have_a_folder_of_their_own_and_go_with_the_run(folder, 
     add(store, 0, 6)
     assert names(folder) <= {"run.db", "run.db-journal"}
     store.tidy()
-    assert len(store.only.points().load()) == 18
+    assert len(store.only_job.points().load()) == 18
     store.remove()
     assert not folder.exists() and store.storage.sizes() == {}
-    assert len(theirs.only.points().load()) == 18
+    assert len(theirs.only_job.points().load()) == 18
 
 
 def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
     store = opened(anywhere, place)
     add(store, 0, 4)
-    store.save(now=True)
+    store.save(force=True)
     store.db.close()
     again = opened(anywhere, tmp_path / "other", resume=True)
-    assert again.only.resumed == 4 and again.storage.url == store.storage.url
+    assert again.only_job.resumed == 4 and again.storage.url == store.storage.url
     again.db.close()
     remove_run(anywhere)
     assert left(anywhere) == set() == store.storage.sizes().keys()
@@ -286,13 +290,13 @@ def test_places_that_cannot_be(tmp_path):
 def test_an_error_tells_how_to_go_on(anywhere):
     store = opened(anywhere)
     add(store, 0, 2)
-    store.only.frames = 1
+    store.only_job.frames = 1
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__
     assert note.startswith(f"2 of 6 scans are kept in {anywhere}: continue with --resume")
     again = opened(anywhere, resume=True)
-    assert (again.only.resumed, again.only.frames) == (2, 1)
+    assert (again.only_job.resumed, again.only_job.frames) == (2, 1)
 
 
 def test_an_error_before_anything_was_kept_leaves_nothing(anywhere):
@@ -391,7 +395,7 @@ def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
     remove_run(folder)
     named = tmp_path / "named"
     named.symlink_to(theirs)
-    assert opened(named, resume=True).only.resumed == 6, "a link that was named is one's own"
+    assert opened(named, resume=True).only_job.resumed == 6, "a link that was named is one's own"
 
 
 def campaign(folder, *, height=1.0, resume=False):
@@ -404,7 +408,7 @@ def campaign(folder, *, height=1.0, resume=False):
         return Job(SCENE, Survey(Sensor.grid(layers=2), poses, steps=6))
 
     jobs = Campaign(make, 2)
-    return RunStore(jobs, place=folder, resume=resume), jobs.job(0)
+    return RunStore(jobs, location=folder, resume=resume), jobs.job(0)
 
 
 @pytest.mark.parametrize("left", ["a job that is done", "a job under way"])
@@ -415,7 +419,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
     remove_run(folder)
     store, job = campaign(folder)
     if left == "a job under way":
-        store.take_on(job)
+        store.open_job(job)
         add(store, 0, 2, job)
     else:
         store.end([JobRow(0, "0000")])
@@ -430,14 +434,14 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
 @pytest.mark.parametrize("change", ["none", "another height", "of unknown content"])
 def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, folder):
     store, job = campaign(folder)
-    store.take_on(job)
+    store.open_job(job)
     add(store, 0, 2, job)
     if change != "of unknown content":
         store.save()
     store.db.close()
     again, job = campaign(folder, height=2.0 if change == "another height" else 1.0, resume=True)
     same = change == "none"
-    assert again.take_on(job).resumed == (2 if same else 0)
+    assert again.open_job(job).resumed == (2 if same else 0)
     assert any(name.endswith(".npz") for name in again.storage.sizes()) == same
 
 
@@ -448,14 +452,14 @@ def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
     (folder / "run.db").unlink()
     for end in ("killed", "interrupted", "alive"):
         store, job = campaign(folder, resume=True)
-        assert store.begun and not store.kept  # nothing is taken over yet
+        assert store.begun and not store.committed_in_words  # nothing is taken over yet
         if end != "alive":
             store.close() if end == "interrupted" else store.db.close()
-    store.take_on(job)
+    store.open_job(job)
     add(store, 0, 2, job)
     store.close()
     store, _ = campaign(folder, resume=True)
-    assert store.kept == "0 of 2 jobs"
+    assert store.committed_in_words == "0 of 2 jobs"
     store.db.close()
     remove_run(folder)
     campaign(folder)[0].db.close()
@@ -468,7 +472,7 @@ def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):
     part.rename(victim)
     part.symlink_to(victim)
     store = opened(unfinished, resume=True)
-    assert store.only.resumed == 2 and "was missing" in store.notes[0]
+    assert store.only_job.resumed == 2 and "was missing" in store.notes[0]
     store.db.close()
     remove_run(unfinished)
     assert victim.exists() and part.is_symlink()
@@ -495,7 +499,7 @@ def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
     remove_run(folder)
     assert not folder.exists()
     assert content(tmp_path / "victim").keys() == FOREIGN
-    assert len(other.only.points().load()) == 18
+    assert len(other.only_job.points().load()) == 18
 
 
 def test_parts_of_another_mark_stay(unfinished, tmp_path):
@@ -534,10 +538,13 @@ def test_a_lost_database_is_made_again_from_the_parts(harm, folder, place):
         opened(folder, place, resume=True, job=OTHERS["scene"])
     assert names(folder) == before
     again = opened(folder, place, resume=True)
-    assert (again.only.resumed, again.backend) == (4, "numpy") and "is made again" in again.notes[0]
+    assert (again.only_job.resumed, again.backend) == (
+        4,
+        "numpy",
+    ) and "is made again" in again.notes[0]
     add(again, 2, 3), add(again, 5, 6)
-    assert set(again.only.sample_rays()[:, 1, 0]) == {0, 2, 3, 5}
-    assert again.only.parts.hits == 12 == again.only.hit_counts().sum()
+    assert set(again.only_job.sample_rays()[:, 1, 0]) == {0, 2, 3, 5}
+    assert again.only_job.parts.hits == 12 == again.only_job.hit_counts().sum()
 
 
 def test_a_database_of_another_program_stays(folder):
@@ -557,7 +564,7 @@ def test_a_run_that_is_going_on_is_not_dropped(folder):
     add(store, 0, 6)
     with pytest.raises(LidarError, match=f"Another run is using {folder}"):
         remove_run(folder)
-    assert len(store.only.points().load()) == 18
+    assert len(store.only_job.points().load()) == 18
 
 
 @pytest.fixture
@@ -573,7 +580,7 @@ def remote_run(url):
     store = opened(url)
     store.cast_with("numpy", {})
     add(store, 0, 2)
-    store.save(now=True)
+    store.save(force=True)
     add(store, 3, 5)
     store.db.close()
     return url
@@ -581,16 +588,20 @@ def remote_run(url):
 
 def test_it_goes_on_from_the_last_copy(remote_run):
     store = opened(remote_run, resume=True)
-    assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
-    assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)], "parts say what is not in the copy"
+    assert (store.only_job.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)], (
+        "parts say what is not in the copy"
+    )
     assert add(store, 2, 3) and add(store, 5, 6)
-    store.only.frames = 6
-    store.save(now=True)
+    store.only_job.frames = 6
+    store.save(force=True)
     store.tidy()
     mark = mark_name(store.db.meta["mark"])
-    assert left(remote_run) == {"run.db", "run.owner", mark, *store.only.points().names}
+    assert left(remote_run) == {"run.db", "run.owner", mark, *store.only_job.points().names}
     again = opened(remote_run, resume=True)
-    assert again.notes == [] and again.only.complete and len(again.only.points().load()) == 18
+    assert (
+        again.notes == [] and again.only_job.complete and len(again.only_job.points().load()) == 18
+    )
     again.remove()
     assert left(remote_run) == set()
 
@@ -610,23 +621,23 @@ def test_copies_are_made_now_and_then(url, monkeypatch):
 def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     early = opened(url)
     add(early, 0, 2)
-    early.save(now=True)
+    early.save(force=True)
     if how == "dropped":
         remove_run(url)
     late = opened(url, resume=True)
     add(late, 2, 6)
-    late.save(now=True)
+    late.save(force=True)
     before = left(url)
     with (
         pytest.raises(LidarError, match=f"taken over or deleted {url}") as caught,
         early.kept_on_error(),
     ):
-        early.save(now=True)
+        early.save(force=True)
     assert not hasattr(caught.value, "__notes__")
     assert left(url) == before
-    late.save(now=True)
+    late.save(force=True)
     again = opened(url, resume=True)
-    assert again.only.resumed == (6 if how == "resumed" else 4)
+    assert again.only_job.resumed == (6 if how == "resumed" else 4)
     with pytest.raises(LidarError, match="this one has ended"), late.kept_on_error():
         late.remove()
     assert left(url) == before
@@ -640,6 +651,6 @@ def test_storage_that_fails(url, monkeypatch):
 
     monkeypatch.setattr(lidarpool.run.store.remote.Storage, "write", fail)
     with pytest.raises(LidarError, match=f"cannot be kept in {url}: it is full"):
-        store.save(now=True)
+        store.save(force=True)
     with pytest.raises(LidarError, match=rf"Cannot write to {url} \(it is full\)"):
         opened(url, resume=True)

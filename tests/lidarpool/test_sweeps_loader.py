@@ -95,8 +95,8 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         if name != "kitti":
             np.testing.assert_array_equal(sweep.columns["channel"], points.channel)
         assert sweep.object_names == (*scene.names, "Car 1", "Van 1")
-        boxes = Boxes.of(all_sweeps, inside, points)
-        there = np.flatnonzero(boxes.there)
+        boxes = Boxes.from_points(all_sweeps, inside, points)
+        there = np.flatnonzero(boxes.present)
         assert sweep.boxes.names == tuple(("Car 1", "Van 1")[k] for k in there)
         assert sweep.boxes.types == tuple(("Car", "Van")[k] for k in there)
         np.testing.assert_array_equal(sweep.boxes.points, boxes.points[there])

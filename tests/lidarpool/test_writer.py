@@ -11,7 +11,7 @@ from lidarpool.datasets.dataset import DataSet
 from lidarpool.run import writer
 from lidarpool.run.cluster.checks import check_workers
 from lidarpool.run.pipeline.failures import JobError
-from lidarpool.run.writer import TOGETHER, JobWriter
+from lidarpool.run.writer import MAX_JOBS_PER_TASK, JobWriter
 from lidarsim.base.storage import Storage
 
 
@@ -39,16 +39,16 @@ def add(to, count):
 def test_jobs_wait_a_moment_to_be_written_with_others(jobs):
     to, written, clock = jobs
     add(to, 2)
-    to.step(4, more=True)
+    to.step(4, more_to_come=True)
     assert written == []
     clock.now += writer.GATHER_S
-    to.step(4, more=True)
-    add(to, TOGETHER)
-    to.step(4, more=True)
-    assert written == [2, TOGETHER]  # those are enough
+    to.step(4, more_to_come=True)
+    add(to, MAX_JOBS_PER_TASK)
+    to.step(4, more_to_come=True)
+    assert written == [2, MAX_JOBS_PER_TASK]  # those are enough
     add(to, 1)
-    to.step(4, more=False)  # and nothing comes after the last
-    assert written == [2, TOGETHER, 1]
+    to.step(4, more_to_come=False)  # and nothing comes after the last
+    assert written == [2, MAX_JOBS_PER_TASK, 1]
     to.close()
 
 

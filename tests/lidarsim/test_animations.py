@@ -443,7 +443,7 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     cloud = Cloud(positions, found, sweeps=lambda: sweeps)
     sizes = []
     for number, points in enumerate(sweeps.points(cloud)):
-        boxes = Boxes.of(sweeps, number, points)
+        boxes = Boxes.from_points(sweeps, number, points)
         own = points["object"] == 1
         assert own.sum() > 50 and set(points["class"][own]) == {7}
         # An actor's way in half a sweep, as of others, and the rounding of points.

@@ -228,7 +228,7 @@ def test_images_find_the_rays_of_frozen_sweeps():
     found = cast(survey)
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
-    image = Image.of(sweeps, 2, points)
+    image = Image.from_points(sweeps, 2, points)
     azimuth = image.of_rays()["azimuth"][image.row, image.column]
     np.testing.assert_allclose(azimuth, some["azimuth"], atol=1e-4)
 
@@ -252,7 +252,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     frozen = Sweeps.from_survey(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
     assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
-    assert Sweep.of(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
+    assert Sweep.from_points(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
     pieces = Pieces(cloud, sweeps)
     told = [
         b"".join(pieces._members(k, points, None)) for k, points in enumerate(sweeps.points(cloud))
@@ -273,7 +273,9 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
     boxes = []
     for faults in ((), [Fault("time_jump", 0.1, by_s=-7.5)]):
         sweeps, cloud = clouds(replace(survey, faults=faults), scene)
-        boxes.append([Boxes.of(sweeps, k, points) for k, points in enumerate(sweeps.points(cloud))])
+        boxes.append(
+            [Boxes.from_points(sweeps, k, points) for k, points in enumerate(sweeps.points(cloud))]
+        )
         write_rosbag2(path := tmp_path / f"{len(bags)}", cloud, sweeps, "velodyne")
         with AnyReader([path]) as bag:
             bags.append([

@@ -94,9 +94,9 @@ def test_results_come_from_the_worker_that_has_them(client):
     there, elsewhere = (part.submit(twice, n, workers=a) for n, a in ((3, one), (4, two)))
     wait([there, elsewhere], timeout=LONG_S)
     keys = [there.key, elsewhere.key, "never-submitted"]
-    assert fetch_available(client, keys, LONG_S, at=one) == {there.key: 6}
-    assert fetch_available(client, keys, LONG_S, at=two) == {elsewhere.key: 8}
-    assert fetch_available(client, [], LONG_S, at=one) == {}
+    assert fetch_available(client, keys, LONG_S, holder=one) == {there.key: 6}
+    assert fetch_available(client, keys, LONG_S, holder=two) == {elsewhere.key: 8}
+    assert fetch_available(client, [], LONG_S, holder=one) == {}
 
 
 SIZE = 8 * 2**20
@@ -129,12 +129,12 @@ def test_what_a_dead_worker_had_is_given_up_soon(nannies):
     address, pid = nannies.submit(hold, "part").result(LONG_S)
     result = nannies.submit(os.getpid, workers=[address])
     wait([result], timeout=LONG_S)
-    assert fetch_available(nannies, [result.key], LONG_S, at=address) == {result.key: pid}
+    assert fetch_available(nannies, [result.key], LONG_S, holder=address) == {result.key: pid}
     os.kill(pid, signal.SIGKILL)
     while address in worker_identities(nannies):
         time.sleep(0.01)
     start = time.monotonic()
     with dask.config.set({"distributed.comm.timeouts.connect": "1h"}):
         assert take_held(nannies, address, "part", patience_s=0.5) is None
-        assert fetch_available(nannies, [result.key], 0.5, at=address) == {}
+        assert fetch_available(nannies, [result.key], 0.5, holder=address) == {}
     assert time.monotonic() - start < LONG_S

@@ -756,7 +756,7 @@ def test_killed_workers_change_no_byte(outside, files, whole):
 @pytest.mark.parametrize("other", ["campaign", "survey"])
 def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
     """There are slots for the stages of both, and none for writing."""
-    monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.5)
+    monkeypatch.setattr(lidarpool.run.writer, "MAX_STALL_S", 0.5)
     campaign = Campaign.load(files / "c.yaml")
     scene = Scene.seed()
     survey = job(SENSOR, 3).survey
@@ -788,7 +788,7 @@ def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
 @pytest.mark.slow
 def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monkeypatch):
     """Its last slots went with a worker that does not come back."""
-    monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.05)
+    monkeypatch.setattr(lidarpool.run.writer, "MAX_STALL_S", 0.05)
     needed = {"GPU": 1, "LIDAR": 3}
     monkeypatch.setattr(lidarpool.run.cluster.cluster, "slots_needed", lambda *_, **__: needed)
     with (

@@ -56,7 +56,7 @@ def test_frames_come_in_order_and_every_scan_once(
 
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "lidarpool.run.pipeline.policies.TASK_BATCHES", 1
+        "lidarpool.run.pipeline.policies.MAX_BATCHES_PER_TASK", 1
     )  # or all would be under way
 
     def on_frame(frame: ScanFrame) -> None:

@@ -102,7 +102,7 @@ def test_the_disk_of_the_result_is_full(
     disk, run, expected, cluster, lidarpool, tmp_path, monkeypatch
 ):
     """The run is complete, and there is no room for its files beside an earlier result."""
-    monkeypatch.setattr(forecast, "ROOM_BYTES", 0)  # else it would be refused at once
+    monkeypatch.setattr(forecast, "REPORT_BYTES", 0)  # else it would be refused at once
     out = disk(4000) / "out"
     out.mkdir()
     for name in FILES:

@@ -12,7 +12,7 @@ import lidarpool.run.pipeline.long_stages
 import lidarpool.run.pipeline.rigs
 import lidarpool.run.trials
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.run.pipeline.failures import words_on_memory
+from lidarpool.run.pipeline.failures import memory_clause
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
 POISON = 57
@@ -58,7 +58,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
 
 @pytest.mark.slow
 def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
-    monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "DEATHS_MOST", 2)
+    monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "MAX_DEATHS", 2)
     sabotage("sort.get", POISON)
     with pytest.raises(LidarError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
@@ -67,9 +67,9 @@ def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatc
 
 def test_a_worker_that_was_ended_for_its_memory_is_known(cluster_client: Client):
     cluster_client.log_event("worker-restart-memory", {"worker": "tcp://127.0.0.1:1", "rss": 1})
-    assert words_on_memory(cluster_client, ["tcp://127.0.0.1:2"]) == ""
+    assert memory_clause(cluster_client, ["tcp://127.0.0.1:2"]) == ""
     until = time.monotonic() + 120
-    while not (words := words_on_memory(cluster_client, ["tcp://127.0.0.1:1"])):
+    while not (words := memory_clause(cluster_client, ["tcp://127.0.0.1:1"])):
         assert time.monotonic() < until
     assert "memory" in words
 

@@ -12,11 +12,10 @@ def main() -> NoReturn:
     """Run the command, see `cli.main`."""
     end_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
-    from .base.streams import Unheard
     from .cli.commands import main as command
 
     if sys.stdout is not None:  # `lidarpool run … | head -3` runs to its end
-        sys.stdout = cast(TextIO, Unheard(sys.stdout, BrokenPipeError))
+        sys.stdout = cast(TextIO, TolerantStream(sys.stdout, BrokenPipeError))
     command()
 
 

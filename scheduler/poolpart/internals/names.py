@@ -341,7 +341,7 @@ def _slots(kind: type) -> Iterator[str]:
 
 
 def _assigned(kind: type) -> tuple[str, ...]:
-    """Return the names in the constructor of a class, among them unannotated attributes."""
+    """Return the names in the constructor of a class, including unannotated attributes."""
     constructor = vars(kind).get("__init__")
     code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
     return code.co_names if code is not None else ()

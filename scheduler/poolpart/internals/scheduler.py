@@ -177,7 +177,7 @@ def is_idle(scheduler: Any, worker: Any) -> bool:
 
 
 def takes_tasks(worker: Any) -> bool:
-    """Return whether a worker gets tasks now, or after it has finished joining."""
+    """Return whether a worker gets tasks now, or after joining."""
     return worker.status in (Status.running, Status.init)
 
 

@@ -79,7 +79,7 @@ class Result(RunResult):
         from ..export.formats import Format
         from ..report.output import SurveyOutput
 
-        further_formats = [Format.of(entry) for entry in formats]
+        further_formats = [Format.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
         with output.held():

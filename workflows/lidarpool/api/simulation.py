@@ -23,11 +23,11 @@ from ..live import page_of
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
 from ..run.job_source import OneJob
-from ..run.options import RunKeywords, RunOptions, given_options
+from ..run.options import RunKeywords, RunOptions, options_of_call
 from ..run.pipeline.messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
-from ..run.runner import Kept, Run
+from ..run.runner import Run, StoredOutput
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
@@ -134,13 +134,15 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    chosen = given_options("simulate", options, without=_NOT_OF_SURVEYS)
+    chosen = options_of_call("simulate", options, without=_NOT_OF_SURVEYS)
     run_options = RunOptions(**chosen)
     jobs = OneJob(Job(scene, survey, planning))
-    if run_options.own:  # before the folder is changed
+    if run_options.starts_workers:  # before the folder is changed
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
-        result = Run(jobs, run_options, Kept(), Screen(on_progress), page, on_frame).execute()
+        result = Run(
+            jobs, run_options, StoredOutput(), Screen(on_progress), page, on_frame
+        ).execute()
     return Result(**declared(result, RunResult))
 
 
@@ -210,7 +212,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             another campaign or version; the message says which and what to do.
         """
         target = output_place(out)
-        chosen = given_options("run", options, without=_NOT_OF_CAMPAIGNS)
+        chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
         run_options = RunOptions(out=target, folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
@@ -254,7 +256,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         LidarError
             If the split is unknown; in the loop, if the cluster lacks a resource or is lost.
         """
-        chosen = given_options("stream", options, without=_NOT_OF_STREAMS)
+        chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             hint = (
                 did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."

@@ -1,1 +1,1 @@
-"""Errors, interrupts and words: what every room uses."""
+"""Errors, interrupts and words for all rooms."""

@@ -11,15 +11,15 @@ from typing import Any
 from lidarsim.base.errors import LidarError
 from lidarsim.base.interrupts import deferred_interrupts
 
-_LOCK = Lock()  # a second thread would find the package that is to be taken away
+_LOCK = Lock()  # a second thread would find the temporary package
 
 
 def load_open3d() -> Any:
     """Return the extension module of Open3D, which has `core`, `t`, `io` and `utility`.
 
-    Importing the package takes more than twice the time: it brings Dash and Plotly for viewers in
-    a browser. So the extension is loaded below a package that has not been run, and that is taken
-    away again: whoever says `import open3d`, before or after, gets the whole package.
+    Importing the package takes more than twice the time: it brings Dash and Plotly for viewers in a
+    browser. So the extension is loaded below a temporary package without code, which is removed
+    again: `import open3d`, before or after, gives the full package.
 
     LidarError if Open3D is not installed, or lacks a library of the system.
     """

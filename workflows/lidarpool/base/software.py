@@ -23,19 +23,19 @@ T = TypeVar("T")
 
 PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
 # Files beside a package in a checkout, which an installed package lacks.
-_OF_DISTRIBUTION = ("pyproject.toml", "README.md", "LICENSE")
-IMPORTED = time.time()  # in a forked worker, when the fork server imported it
-CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
+_DISTRIBUTION_FILES = ("pyproject.toml", "README.md", "LICENSE")
+IMPORTED = time.time()  # in a forked worker, the time of the fork server's import
+CLOCK_TOLERANCE_S = 5.0  # largest difference of the clocks of a file server and of this machine
 
 
 def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str]:
-    """Describe the software of this process: equal software gives equal bytes.
+    """Return the software of this process by name: equal software gives equal bytes.
 
-    ``lidarpool`` is its version and a hash of the installed sources. Where it casts with a
-    ray-casting `backend`, ``numpy`` and ``backend`` are versions. Each of the `plugins` that are
-    used has its distribution, with version and sources, unless this process lacks it. Processors
-    do not matter: no byte comes from a function whose last bits depend on them, see `elementary`
-    and `vectors`.
+    ``lidarpool`` is its version and a hash of the installed sources. For casting with a ray-casting
+    `backend`, ``numpy`` and ``backend`` are versions. Each of the used `plugins` has its
+    distribution, with version and sources, unless this process lacks the plug-in. Processors do not
+    matter: no byte comes from a function whose last bits depend on them, see `elementary` and
+    `vectors`.
     """
     described = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
@@ -49,21 +49,21 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
 
 @cache
 def sources() -> str:
-    """Hash of the installed sources: eight hexadecimal digits.
+    """Return the hash of the installed sources: eight hexadecimal digits.
 
-    "changed" if files have changed since this process started: it may run code of before.
+    "changed" if files have changed since this process started: it may run older code.
     """
     return _hash_of(PACKAGES)
 
 
 @cache
 def _version_of(plugin: Plugin) -> str:
-    """Version of a plug-in's distribution, and the hash of the package that has its module."""
+    """Return the version of a plug-in's distribution, and the hash of its package."""
     return f"{plugin.version} (sources {_hash_of((_package_of(plugin.module),))})"
 
 
 def _package_of(module: str) -> str:
-    """Name of the outermost package of a module that is no namespace, or of the module itself."""
+    """Return the name of the outermost regular package of a module, or of the module itself."""
     parts = module.split(".")
     for count in range(1, len(parts)):
         name = ".".join(parts[:count])
@@ -74,7 +74,7 @@ def _package_of(module: str) -> str:
 
 
 def _hash_of(packages: Iterable[str]) -> str:
-    """Hash of the files of packages or modules, see `sources`."""
+    """Return the hash of the files of packages or modules, see `sources`."""
     digest = hashlib.sha256()
     newest_s = 0.0
     for package in packages:
@@ -82,7 +82,7 @@ def _hash_of(packages: Iterable[str]) -> str:
             content = path.read_bytes()
             newest_s = max(newest_s, path.stat().st_mtime)
             digest.update(f"{name} {len(content)} ".encode() + content)
-    if newest_s > min(IMPORTED, psutil.Process().create_time()) + CLOCKS_S:
+    if newest_s > min(IMPORTED, psutil.Process().create_time()) + CLOCK_TOLERANCE_S:
         return "changed since the process started"
     return digest.hexdigest()[:8]
 
@@ -91,7 +91,7 @@ def _files_of(package: str) -> Iterator[tuple[str, Path]]:
     """Yield the files of a package or module, with names that start with the package's."""
     try:
         spec = find_spec(package)
-    except ModuleNotFoundError:  # of the package that it is in
+    except ModuleNotFoundError:  # its outer package is missing
         spec = None
     if spec is None:
         return
@@ -102,20 +102,23 @@ def _files_of(package: str) -> Iterator[tuple[str, Path]]:
     root = Path(spec.submodule_search_locations[0])
     files = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
     for name in sorted(files):
-        if "__pycache__" not in files[name].parts and name not in _OF_DISTRIBUTION:
+        if "__pycache__" not in files[name].parts and name not in _DISTRIBUTION_FILES:
             yield f"{package}/{name}", files[name]
 
 
-def software_there(
+def software_query(
     backend: str = "", plugins: Sequence[Plugin] = ()
 ) -> Callable[[], dict[str, str]]:
-    """Make a function that describes a worker's software.
+    """Return a function that describes a worker's software.
 
     It is nested, so that it is sent by value: a worker without the package, or with another
     version, can run it too. Without the package it returns an empty dictionary.
     """
-    # By value as well: classes of this package are sent by name.
-    named = [(one.group, one.name, one.value, one.distribution, one.version) for one in plugins]
+    # As tuples, which are sent by value: classes of this package are sent by name.
+    named = [
+        (plugin.group, plugin.name, plugin.value, plugin.distribution, plugin.version)
+        for plugin in plugins
+    ]
 
     def ask() -> dict[str, str]:
         try:
@@ -128,7 +131,7 @@ def software_there(
             from .software import software
         except ModuleNotFoundError:
             return {"lidarpool": __version__}
-        return software(backend, [Plugin(*one) for one in named])
+        return software(backend, [Plugin(*fields) for fields in named])
 
     return ask
 
@@ -138,12 +141,13 @@ def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
     return {plugin: _version_of(plugin) for plugin in plugins}
 
 
-def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
+def call_with_same_sources(required: str, function: Callable[..., T], *arguments: Any) -> T:
     """Call a function in a task, if its worker has the sources of the run.
 
-    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarError if not.
+    `required` is ``lidarpool`` in the `software` of the run's driver. LidarError for different
+    sources.
     """
-    return _call(software(), {"lidarpool": wanted}, function, *arguments)
+    return _call(software(), {"lidarpool": required}, function, *arguments)
 
 
 def call_with_plugins(
@@ -151,16 +155,19 @@ def call_with_plugins(
 ) -> T:
     """Call a function in a task, if its worker has the plug-ins of the run's driver.
 
-    `versions` are those of `plugin_versions`. LidarError if a plug-in differs or is missing.
+    `versions` as of `plugin_versions`. LidarError if a plug-in differs or is missing.
     """
-    wanted = {_entry_of(plugin): version for plugin, version in versions.items()}
-    return _call(software(plugins=versions), wanted, function, *arguments)
+    required = {_entry_of(plugin): version for plugin, version in versions.items()}
+    return _call(software(plugins=versions), required, function, *arguments)
 
 
 def _call(
-    here: Mapping[str, str], wanted: Mapping[str, str], function: Callable[..., T], *arguments: Any
+    installed: Mapping[str, str],
+    required: Mapping[str, str],
+    function: Callable[..., T],
+    *arguments: Any,
 ) -> T:
-    if differs := difference(here, wanted):
+    if differs := difference(installed, required):
         worker = get_worker()
         raise LidarError(
             f"worker {worker.name} at {worker.address} has {differs}: install the same on both, "
@@ -170,14 +177,14 @@ def _call(
 
 
 def _entry_of(plugin: Plugin) -> str:
-    """Name of a plug-in's entry in `software`."""
+    """Return the name of a plug-in's entry in `software`."""
     return f"plug-in {plugin.distribution}"
 
 
-def difference(there: Mapping[str, Any], here: Mapping[str, str]) -> str:
-    """Describe what differs in a clause, such as "numpy 2.3.1, the run 2.4.6"; "" for nothing."""
-    for name, value in here.items():
-        if there.get(name) != value:
-            what = "" if name == "backend" else f"{name} "
-            return f"{what}{there.get(name) or 'not installed'}, the run {what}{value}"
+def difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
+    """Return a clause such as "numpy 2.3.1, the run 2.4.6", or "" if all software is the same."""
+    for name, value in required.items():
+        if installed.get(name) != value:
+            label = "" if name == "backend" else f"{name} "
+            return f"{label}{installed.get(name) or 'not installed'}, the run {label}{value}"
     return ""

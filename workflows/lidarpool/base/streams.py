@@ -1,4 +1,4 @@
-"""Output that nobody reads any more."""
+"""Output whose reader may have gone."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from contextlib import suppress
 from typing import Any, TextIO
 
 
-class Unheard:
-    """A stream whose writes do not fail once its reader has `gone`: a run goes on without.
+class TolerantStream:
+    """A stream whose writes succeed after its reader has gone, so that a run goes on.
 
-    Each write is flushed; other errors are raised.
+    `reader_gone` is the kind of error of such writes. Each write is flushed; other errors are
+    raised.
     """
 
-    def __init__(self, stream: TextIO, gone: type[OSError] = OSError) -> None:
+    def __init__(self, stream: TextIO, reader_gone: type[OSError] = OSError) -> None:
         self._stream = stream
-        self._gone = gone
+        self._reader_gone = reader_gone
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -25,10 +26,10 @@ class Unheard:
         try:
             self._stream.write(text)
             self._stream.flush()
-        except self._gone:  # its buffer would fail again when Python exits
+        except self._reader_gone:  # the stream's buffer would fail again when Python exits
             with suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: `write` flushes."""
+        """Skip flushing, since `write` flushes."""

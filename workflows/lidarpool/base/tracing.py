@@ -11,7 +11,7 @@ _sink: Sink | None = None  # of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:
-    """Report that a run has reached a named point, ``stage.event``, with some plain values.
+    """Report that a run has reached a point, ``stage.event``, with values for its trace.
 
     Does nothing without a listener.
     """
@@ -20,9 +20,9 @@ def trace(point: str, /, **fields: Any) -> None:
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Call `sink(point, fields)` at each point of this process; None stops this.
+    """Call `sink(point, fields)` at each point of this process; None stops the calls.
 
-    It is called in the thread that reaches the point, before that continues: it can log the
+    It is called in the thread that reaches the point, before that thread continues: it can log the
     point, hold the thread, or end the process.
     """
     global _sink

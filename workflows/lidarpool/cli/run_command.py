@@ -28,7 +28,7 @@ from ..report.report import summary
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
-from ..run.runner import Kept, Run
+from ..run.runner import Run, StoredOutput
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
@@ -56,7 +56,7 @@ def run_scenario(
     of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, {"backend": backend})
-    if options.own:  # before reading the scene, which may take long
+    if options.starts_workers:  # before reading the scene, which may take long
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
@@ -69,7 +69,7 @@ def run_scenario(
     assert options.out is not None, "commands write"
     run_notes = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
     jobs = OneJob(job, shard)
-    output = Kept({**made_of, **run_notes})
+    output = StoredOutput({**made_of, **run_notes})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Run(jobs, options, output, terminal, page).execute()
     points = len(result.points)
@@ -184,7 +184,7 @@ def run_job(
         hashes = [row.sha256 for row in rows if row.number == number and row.done]
         if not hashes:
             return ""
-        if Tally.of(result.points).sha256 not in hashes:
+        if Tally.from_cloud(result.points).sha256 not in hashes:
             raise LidarError(
                 f"job {name} has other points than those in {target}: files that it is "
                 "made of have changed, such as images of a mesh."

@@ -16,8 +16,8 @@ from rich.console import Console
 
 from lidarsim.base.writing_progress import WritingProgress
 
-from ..base.streams import Unheard
-from ..run.progress import Pace, Progress, Screen, Show, bars, rows, standing_still
+from ..base.streams import TolerantStream
+from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED, set_logs
 
 # Plain lines follow after a tenth of the elapsed time, within these bounds, so that a survey of
@@ -37,7 +37,7 @@ class Terminal(Screen):
     @property
     def _stream(self) -> Any:
         """Stream for messages; None for a quiet command."""
-        return None if self.quiet or sys.stderr is None else Unheard(sys.stderr)
+        return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
     def _console(self) -> Console | None:
@@ -79,7 +79,7 @@ class Terminal(Screen):
         """Show a bar for each output that the body writes; in a log, `words` and lines."""
         console = self._console
         if console is not None:
-            with rows(console) as show:
+            with progress_rows(console) as show:
                 yield show
         else:
             with self.status(words):
@@ -96,13 +96,13 @@ class Terminal(Screen):
 
     @contextmanager
     def starting(
-        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+        self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
         """Show a status until the cluster has started; its workers log as this process does."""
         with ExitStack() as stack:
             with self.status(words):
                 client = stack.enter_context(cluster)
-            if own:  # its workers share the terminal
+            if shares_terminal:
                 set_logs(self.verbose)
                 client.register_worker_callbacks(partial(set_logs, self.verbose))
             yield client
@@ -143,7 +143,7 @@ class PlainLines:
     def __call__(self, progress: Progress) -> None:
         """Write a line if a line is due or a stage has been completed."""
         elapsed_s = progress.seconds
-        if (standing := standing_still(progress)) != self._standing_still:
+        if (standing := waiting_reason(progress)) != self._standing_still:
             self._standing_still = standing
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
@@ -161,7 +161,7 @@ class PlainLines:
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):
-            pace = self._paces[stage].told(elapsed_s, count, total)
+            pace = self._paces[stage].text(elapsed_s, count, total)
             if total and count == total and stage not in self._completed:
                 self._completed.add(stage)
                 _tell(self.stream, f"{stage}  done: {stage_summary} in {elapsed_s:.1f} s")

@@ -1,10 +1,10 @@
-"""Parts: the columns of some consecutive scans as one file.
+"""Parts: the columns of consecutive scans as a file.
 
 A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
-rows in (scan, ray) order, and more: `.scans`, first scan and one past the last; of each scan
-`.counts`, its rows, `.scan_hits`, its hits including those that were not kept, and `.samples`, ends
-of some of its rays; and the hits of each triangle, `.triangles` and `.hits`. `x`, `y` and `z` are
-whole multiples of the precision from the scene's local origin, so that they are rounded only once.
+rows in (scan, ray) order, and further arrays: `.scans`, first scan and one past the last; for each
+scan `.counts`, its rows, `.scan_hits`, its hits including thinned out hits, and `.samples`, ends of
+sample rays; and the hits of each triangle, `.triangles` and `.hits`. `x`, `y` and `z` are whole
+multiples of the precision from the scene's local origin, so that they are rounded only once.
 """
 
 from __future__ import annotations
@@ -31,57 +31,58 @@ from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
 
-# Files of a run in the folder of its parts: its mark, then what it is.
+# Files of a run in the folder of its parts: the mark of the run, then the kind of the file.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
 _OTHER = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8})", re.ASCII)
 _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
-# A run deletes what it wrote, and nothing else: the names of its files begin with its mark, 16
-# random digits, and an empty file in the folder of the parts says that they are this mark's.
+# A run deletes only files that it wrote: their names begin with its mark, 16 random digits, and a
+# file in the folder of the parts names the mark of the folder.
 
 
 def part_name(mark: str, job: int, first: int, stop: int) -> str:
-    """Name of the part of these scans: who writes it a second time writes the same bytes."""
+    """Return the name of the part of scans; repeated work writes the same bytes to the part."""
     return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
 
 
 def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
-    """Job, first scan and end of the part of a run that has a name; None for other names."""
-    found = _PART.fullmatch(name)
-    if found is None or found[1] != mark:
+    """Return job, first scan and end from the name of a run's part; None for foreign names."""
+    match = _PART.fullmatch(name)
+    if match is None or match[1] != mark:
         return None
-    return int(found[2]), int(found[3]), int(found[4])
+    return int(match[2]), int(match[3]), int(match[4])
 
 
 def probe_name(mark: str, driver: str) -> str:
-    """Name of the file by which workers of a driver find out whether they see the folder."""
+    """Return the name of the file that shows workers of a driver whether they see the folder."""
     return f"{mark}-probe-{driver}"
 
 
 def mark_name(mark: str) -> str:
-    """Name of the file that says whose parts are in a folder."""
+    """Return the name of the file with the mark of the run whose parts are in a folder."""
     return f"{mark}-mark"
 
 
-def own_files(storage: Storage, mark: str | None) -> list[str]:
-    """Names of the files that a run may delete, those that killed writers left among them.
+def deletable_files(storage: Storage, mark: str | None) -> list[str]:
+    """Return the names of the files that a run may delete, including files of killed writers.
 
-    `mark` is that of the run; None for each that the folder has. Without the mark in the folder
-    there are none. Marks come last, so that what an interrupted removal has left stays known.
+    `mark` is the mark of the run; None for each mark that the folder has. Without the mark in the
+    folder there are none. Mark files come last, so that the files of an interrupted removal stay
+    known.
     """
     names = [*storage.sizes()]
     marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
     marks &= marks if mark is None else {mark}
-    own = [name for name in names if _mark_of(target_of(name)) in marks]
-    return sorted(own, key=lambda name: name.endswith("-mark"))
+    names_with_mark = [name for name in names if _mark_of(target_of(name)) in marks]
+    return sorted(names_with_mark, key=lambda name: name.endswith("-mark"))
 
 
 def _mark_of(name: str) -> str:
-    """Mark in the name of a file of a run; empty for any other name."""
-    found = _PART.fullmatch(name) or _OTHER.fullmatch(name)
-    return found[1] if found else ""
+    """Return the mark in the name of a file of a run; empty for foreign names."""
+    match = _PART.fullmatch(name) or _OTHER.fullmatch(name)
+    return match[1] if match else ""
 
 
 def pack(part: PartColumns) -> bytearray:
@@ -113,7 +114,7 @@ def pack(part: PartColumns) -> bytearray:
 def unpack(data: bytes) -> PartColumns:
     """Inverse of `pack`; every array's checksum is compared.
 
-    LidarError if it is not a part, or damaged; the message is a clause.
+    LidarError if the data is not a part, or damaged; the message is a clause.
     """
     try:
         arrays = read_arrays(data)
@@ -131,13 +132,13 @@ def unpack(data: bytes) -> PartColumns:
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
             raise ValueError("its arrays do not fit together")
-    except Exception as error:  # zipfile, zlib, lzma and NumPy have a dozen kinds
+    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds of errors
         raise LidarError(f"it is damaged ({error})") from error
     return part
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part; LidarError if it is missing, cannot be read or is damaged."""
+    """Read a part; LidarError if the part is missing, unreadable or damaged."""
     try:
         return unpack(storage.read(name))
     except LidarError as error:
@@ -151,7 +152,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
-    """Read the hits of each triangle of a part, and nothing else; errors as of `read_part`."""
+    """Read only the triangles of a part and the hits of each; errors as of `read_part`."""
     if not storage.is_local:
         part = read_part(storage, name)
         return part.triangles, part.hits
@@ -159,7 +160,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
             triangles = read_npy(archive.read(".triangles.npy"), "triangles")
             return triangles, read_npy(archive.read(".hits.npy"), "hits")
-    except Exception as error:  # as above
+    except Exception as error:  # of many kinds, as in `unpack`
         raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
@@ -167,22 +168,22 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 @dataclass(eq=False, repr=False)
 class StoredCloud(CloudDisplay):
-    """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`."""
+    """The points of parts in (scan, ray) order, read in chunks; a `CloudLike`."""
 
     storage: Storage  # of the parts
     names: Sequence[str]  # of the parts, in scan order
-    firsts: Sequence[int]  # their first scans
-    rows: Sequence[int]  # their numbers of points
+    firsts: Sequence[int]  # first scan of each part
+    rows: Sequence[int]  # number of points of each part
     columns: Sequence[Column]  # of a part
-    cells: Ints | None  # lowest and highest, (2, 3); None without points
+    cells: Ints | None  # lowest and highest cell, (2, 3); None without points
     precision_m: float  # size of the cells that positions were rounded to
     origin: Floats  # world position of the scene's local origin, (3,), metres
-    keeper: Any = None  # kept alive while the parts can be read
+    keeper: Any = None  # object that the parts are deleted with
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
     tell: Callable[[int], object] = abs  # is called with the number of points that were read
 
     def __getstate__(self) -> dict[str, Any]:
-        # Both hold the scene, and nobody hears of other processes.
+        # Keeper and sweeps hold the scene, and progress is not reported across processes.
         return self.__dict__ | {"keeper": None, "sweeps": None, "tell": abs}
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
@@ -200,21 +201,21 @@ class StoredCloud(CloudDisplay):
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns beside the positions, in the order of files."""
-        rest = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
-        return (SCAN, *rest)
+        """The columns without positions, in the order of files."""
+        columns = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
+        return (SCAN, *columns)
 
     @property
     def recorded(self) -> bool:
-        """Whether its points have waveforms."""
+        """True if the points have waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, rows: Integers | slice = slice(None)) -> Cloud:
-        """Points of a part, or some of them."""
+        """Return the points of a part, or a selection of rows."""
         return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Read the cloud in order, from row `first` on, so many points at a time.
+        """Yield the cloud in order, from row `first` on, in chunks of `points`.
 
         LidarError if a part cannot be read.
         """
@@ -240,25 +241,25 @@ class StoredCloud(CloudDisplay):
             yield Cloud.joined(held)
 
     def row_of(self, scan: int) -> int:
-        """Row of the first point of a scan."""
-        at = bisect_right(self.firsts, scan) - 1
-        row = sum(self.rows[: max(0, at)])
-        if at < 0 or scan == self.firsts[at]:
+        """Return the row of the first point of a scan."""
+        index = bisect_right(self.firsts, scan) - 1
+        row = sum(self.rows[: max(0, index)])
+        if index < 0 or scan == self.firsts[index]:
             return row
-        counts = read_part(self.storage, self.names[at]).counts
-        return row + int(counts[: scan - self.firsts[at]].sum())
+        counts = read_part(self.storage, self.names[index]).counts
+        return row + int(counts[: scan - self.firsts[index]].sum())
 
-    def sample(self, most: int, parts: int) -> Cloud:
-        """Read at most so many evenly spaced points, of at most so many parts."""
+    def sample(self, max_points: int, max_parts: int) -> Cloud:
+        """Read evenly spaced points, at most `max_points` of at most `max_parts` parts."""
         filled = [i for i, rows in enumerate(self.rows) if rows]
-        opened = [filled[i] for i in even_indices(len(filled), parts)]
+        opened = [filled[i] for i in even_indices(len(filled), max_parts)]
         total = sum(self.rows[i] for i in opened)
-        picked = even_indices(total, most)
+        picked = even_indices(total, max_points)
         clouds = []
-        before = 0
+        start = 0
         for i in opened:
-            inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
-            before += self.rows[i]
+            inside = picked[(picked >= start) & (picked < start + self.rows[i])] - start
+            start += self.rows[i]
             clouds.append(self.cloud_of(read_part(self.storage, self.names[i]), inside))
         return Cloud.joined(clouds) if clouds else self.load()
 
@@ -267,6 +268,6 @@ class StoredCloud(CloudDisplay):
         parts = list(self.chunks())
         if parts:
             return Cloud.joined(parts)
-        rest = (column for column in self.columns if column not in AXES)
-        columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *rest)}
+        columns_of_parts = (column for column in self.columns if column not in AXES)
+        columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *columns_of_parts)}
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)

@@ -1,4 +1,4 @@
-"""Data sets of many jobs: each job writes files of its own, `finish` those that all share."""
+"""Data sets of many jobs: each job writes its own files, `finish` the files that all jobs share."""
 
 from __future__ import annotations
 
@@ -42,33 +42,33 @@ INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
 _MANIFESTS = ".jobs"
 VERSION = 2  # of INDEX_FILE
-_REQUESTS = 8  # to an object store at a time
-_AHEAD = 16  # jobs that are looked at ahead
-_LISTED = 32  # folders whose files are known at a time, some of which all jobs share
+_REQUESTS = 8  # simultaneous requests to an object store
+_AHEAD = 16  # jobs that are checked ahead
+_MAX_LISTED_FOLDERS = 32  # folders whose listings are cached; all jobs share some folders
 
 
-def _names_in(row: FormatRow) -> str:
-    """Pattern of the names of files of jobs in a format."""
-    place = re.escape(row.of_job).replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
-    return "/".join(filter(None, (place, row.inside and f"({row.inside})")))
+def _name_pattern(row: FormatRow) -> str:
+    """Return a pattern of the names of files of jobs in a format."""
+    folder = re.escape(row.of_job).replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
+    return "/".join(filter(None, (folder, row.inside and f"({row.inside})")))
 
 
-# Files of jobs, in all formats.
-OF_JOBS = re.compile(
+# Names of files of jobs, in all formats.
+JOB_FILES = re.compile(
     r"\.jobs/[^/]+\.json|jobs/[^/]+/(sweeps|boxes)\.npz|(sweeps|boxes)/[^/]+\.npz|"
-    + "|".join(_names_in(FORMATS[name]) for name in DATA_SETS.values())
+    + "|".join(_name_pattern(FORMATS[name]) for name in DATA_SETS.values())
 )
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
-    """Name of a job's SWEEPS_FILE or BOXES_FILE in a data set.
+    """Return the name of a job's SWEEPS_FILE or BOXES_FILE in a data set.
 
     Examples
     --------
     >>> job_file("kitti", "0417", "sweeps.npz"), job_file("folder", "0417", "sweeps.npz")
     ('sweeps/0417.npz', 'jobs/0417/sweeps.npz')
     """
-    if format == "folder":  # where `read_cloud` finds them
+    if format == "folder":  # `read_cloud` reads them from this folder
         return f"jobs/{name}/{file}"
     stem, _, ending = file.partition(".")
     return f"{stem}/{name}.{ending}"
@@ -77,7 +77,7 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 @dataclass(frozen=True)
 @checked_fields
 class DataSet:
-    """The files of many jobs in one place: small when pickled, any process writes a job.
+    """The files of many jobs in a folder or storage; small when pickled, any process writes jobs.
 
     - kitti: `sequences/07` of job 7, of further sensors `sequences/07_NAME`
     - nuscenes: a scene for each job; `finish` writes the tables
@@ -87,46 +87,46 @@ class DataSet:
     - images: `images/NAME/SENSOR/000000.npz`
     - folder: `jobs/NAME/cloud.ply`
 
-    Beside these are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors, `boxes/NAME.npz`,
-    which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`. `.jobs/NAME.json`, the
-    job's manifest, is the last file that a job writes: it lists the others with bytes and CRC, and
-    the files that the job was made of, and has the job's row and what `finish` needs. The manifest
-    of a job that has failed lists no files. Each manifest ends with its own CRC; the table of jobs
-    follows from the manifests.
+    In addition there are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors,
+    `boxes/NAME.npz`, which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`.
+    `.jobs/NAME.json`, the job's manifest, is the last file that a job writes: it lists the job's
+    files with bytes and CRC, and the input files of the job, and has the job's row and data for
+    `finish`. The manifest of a job that has failed lists no files. Each manifest ends with its own
+    CRC; the table of jobs follows from the manifests.
 
     Parameters
     ----------
-    place
+    storage
         A folder or URL. Without `durable` a power failure may lose jobs that were written.
     format
         kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
-        Of points in mcap: velodyne, autoware, ouster or images.
+        Layout of points in mcap: velodyne, autoware, ouster or images.
     compensated
-        Points in mcap are in the sensor's axes at the start of the sweep, and have no times; else
-        at their firing. `lidarpool.sweeps` gives both at the start of the sweep.
+        Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
+        their firing. `lidarpool.sweeps` gives both at the start of the sweep.
     made_with
-        What the bytes of all jobs depend on, for JSON; each manifest says it.
+        Identity and software that determine the bytes of all jobs, for JSON; part of each manifest.
     """
 
-    place: Storage
+    storage: Storage
     format: Literal[tuple(DATA_SETS)]  # type: ignore[valid-type]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
     compensated: bool = False
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def _of_jobs(self) -> Format:
+    def _job_format(self) -> Format:
         return Format(DATA_SETS[self.format], self.layout, self.compensated)
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that clouds of jobs must have."""
-        return self._of_jobs.needs
+        return self._job_format.needs
 
     def check_installed(self) -> None:
-        """Check that it can be written here; LidarError if a package is missing."""
-        self._of_jobs.check_installed()
+        """Raise LidarError if a package that writes the format is missing in this environment."""
+        self._job_format.check_installed()
 
     def write_job(
         self,
@@ -137,114 +137,113 @@ class DataSet:
         *,
         listing: Listing | None = None,
     ) -> JobRow:
-        """Write the files of a job; whoever writes them again writes the same bytes.
+        """Write the files of a job, always the same bytes; return its row with counts of points.
 
-        Returns its row, with what is counted of the points.
-
-        Points are read in order, a sweep at a time or, for Parquet, a million. Every file
-        appears completely or not at all. `made_of` has names and hashes of the files that the
-        job was made of; `listing` gets the files, also if not all are written.
+        Points are read in order, a sweep at a time or, for Parquet, a million. Every file appears
+        completely or not at all. `made_of` has names and hashes of the input files of the job;
+        `listing` gets the written files, also after an error.
 
         Raises
         ------
         LidarError
-            If a package or column is missing, the cloud is not of these sweeps, or the place
+            If a package or column is missing, the cloud is not of these sweeps, or the storage
             cannot be written to.
         """
         name = row.name
-        one = self._of_jobs
+        file_format = self._job_format
         entry = Entry(row.number, name, row.split, row.values)
-        one.check_installed()
-        tally = Tally.of(cloud)
+        file_format.check_installed()
+        tally = Tally.from_cloud(cloud)
         row = replace(row, points=tally.points, sha256=tally.sha256, classes=tally.classes)
-        one.check_columns(cloud)
-        place = listing or Listing.of(self.place)
+        file_format.check_columns(cloud)
+        storage = listing or Listing.from_storage(self.storage)
         boxes: list[Boxes] = []
-        with explained(f"Job {name} cannot be written to {place}"):
-            if one.row.in_pieces:
-                pieces = pieces_of(one.format, cloud, sweeps, entry)
-                made = _write_pieces(pieces, place)
-                manifest = pieces.summary(made)
-                boxes = made if one.row.boxes else []
+        with explained(f"Job {name} cannot be written to {storage}"):
+            if file_format.row.in_pieces:
+                pieces = pieces_of(file_format.format, cloud, sweeps, entry)
+                details = _write_pieces(pieces, storage)
+                manifest = pieces.summary(details)
+                boxes = details if file_format.row.boxes else []
             else:
                 manifest = {}
-                path = entry.place(one.format)
-                place.prepare(Path(path).parent)
-                with local_folder(place.local() if place.is_local else place) as folder:
+                path = entry.path_of(file_format.format)
+                storage.prepare(Path(path).parent)
+                with local_folder(storage.local() if storage.is_local else storage) as folder:
                     (folder / path).parent.mkdir(parents=True, exist_ok=True)
-                    one.write(folder / path, cloud, sweeps, overwrite=True)
-                    place.files[path] = Storage(str(folder)).checksum(path)
-                    if not place.is_local:
-                        place.put(folder / path, path)
+                    file_format.write(folder / path, cloud, sweeps, overwrite=True)
+                    storage.files[path] = Storage(str(folder)).checksum(path)
+                    if not storage.is_local:
+                        storage.put(folder / path, path)
             files = {job_file(self.format, name, SWEEPS_FILE): sweeps.packed()}
             if sweeps.actors:
                 boxes = boxes or [
-                    Boxes.of(sweeps, sweep, points)
+                    Boxes.from_points(sweeps, sweep, points)
                     for sweep, points in enumerate(sweeps.points(cloud))
                 ]
                 files[job_file(self.format, name, BOXES_FILE)] = _packed(boxes)
             for file, data in files.items():
-                place.write(file, data)
-            of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
-            manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
+                storage.write(file, data)
+            sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
+            manifest |= {"sensors": [*zip(sweeps.sensors, sweeps_per_sensor, strict=True)]}
             manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
             manifest |= {"materials": sweeps.materials} if sweeps.materials else {}
-            manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
-            self._write_manifest(place, row, manifest)
+            manifest |= {"made_of": made_of, "files": dict(sorted(storage.files.items()))}
+            self._write_manifest(storage, row, manifest)
         return row
 
     def write_failed(self, rows: Iterable[JobRow]) -> None:
-        """Write the manifests of jobs that have failed; LidarError if that fails."""
-        with explained(f"{self.place} cannot be written"):
-            place = Listing.of(self.place)
+        """Write the manifests of jobs that have failed; LidarError on failure."""
+        with explained(f"{self.storage} cannot be written"):
+            storage = Listing.from_storage(self.storage)
             failed = (row for row in rows if not row.done)
-            deque(ahead(lambda row: self._write_manifest(place, row, {"files": {}}), failed), 0)
+            deque(
+                read_ahead(lambda row: self._write_manifest(storage, row, {"files": {}}), failed), 0
+            )
 
-    def _write_manifest(self, place: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
-        """Write the manifest of a job, with the part of its row that every run gives."""
+    def _write_manifest(self, storage: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
+        """Write the manifest of a job, with the part of its row that is the same in every run."""
         row_of_all_runs = asdict(replace(row, seconds=0.0))
         manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
         manifest["crc"] = _crc(manifest)
-        place.write(manifest_file(row.name), json.dumps(manifest).encode())
+        storage.write(manifest_file(row.name), json.dumps(manifest).encode())
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
-        """Write the files that hold all jobs, from those that are done, in their order.
+        """Write the shared files from the finished jobs, in their order.
 
-        One job is in memory at a time, and its number of sweeps. No job may be written meanwhile.
-        `dataset.json` is removed first and written last: it says that the data set is finished.
+        A single job's manifest is in memory at a time. No job may be written meanwhile.
+        `dataset.json` is removed first and written last: it marks a finished data set.
 
         Raises
         ------
         LidarError
-            If a job's files are not those of its manifest, or the place cannot be written to.
+            If a job's files differ from its manifest, or the storage cannot be written to.
         """
-        with explained(f"{self.place} cannot be written"):
-            self.place.remove([INDEX_FILE])
-            self.place.tidy()
-            with self.place.writing(INDEX_FILE) as file:
+        with explained(f"{self.storage} cannot be written"):
+            self.storage.remove([INDEX_FILE])
+            self.storage.tidy()
+            with self.storage.writing(INDEX_FILE) as file:
                 index = SealedWriter(file)
                 head: dict[str, Any] = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
                 head |= {"compensated": self.compensated}
                 with suppress(FileNotFoundError):
-                    head["table"] = self.place.checksum(TABLE_FILE)
+                    head["table"] = self.storage.checksum(TABLE_FILE)
                 index.write(f'{json.dumps(head)[:-1]}, "jobs": [')
                 manifests = self._indexed(jobs, index)
                 if self.format == "nuscenes":
-                    merge(self.place, manifests)
+                    merge(self.storage, manifests)
                 else:
                     deque(manifests, maxlen=0)
                 index.seal()
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
-        """Yield the manifest of each job that is done, and add it to the index, with names."""
-        # {class: names that jobs have for it}
+        """Yield the manifests of finished jobs, and write their names and sensors to the index."""
         comma = ""
-        named = dict[int, dict[str, None]]()
-        for job, (manifest, wrong) in self.look(jobs):
-            if wrong:
-                told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
-                raise LidarError(f"{told} Make it again with --resume.")
+        named = dict[int, dict[str, None]]()  # {class: its names in the jobs, in order}
+        for job, (manifest, damage) in self.look(jobs):
+            if damage:
+                message = f"Job {job.name} of {self.storage} is not whole: its {damage}."
+                raise LidarError(f"{message} Make it again with --resume.")
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}")
             comma = ","
@@ -253,128 +252,129 @@ class DataSet:
             yield manifest
         classes = {number: "; ".join(names) for number, names in named.items()}
         if classes and self.format == "kitti":
-            self.place.write(NAMES_FILE, labels_file(classes))
-        more = f', "classes": {json.dumps(classes)}' if classes else ""
-        index.write(f"\n]{more}")
+            self.storage.write(NAMES_FILE, labels_file(classes))
+        classes_field = f', "classes": {json.dumps(classes)}' if classes else ""
+        index.write(f"\n]{classes_field}")
 
     def look(
         self, jobs: Iterable[JobRow], *, contents: bool = False
     ) -> Iterator[tuple[JobRow, tuple[dict[str, Any], str]]]:
-        """Yield the jobs that are done, their manifests, and what is wrong with their files.
+        """Yield the finished jobs with their manifests and a description of damage to their files.
 
-        The last is a clause, or empty; then the manifest may be, too. Sizes are compared, and with
-        `contents` every byte is read. OSError if the place cannot be read.
+        The description is a clause, or empty without damage; the manifest may be empty, too. Sizes
+        are compared, and with `contents` every byte is read. OSError if the storage cannot be read.
         """
-        look_at = self._looker(contents)
-        yield from ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+        look_at = self._job_checker(contents)
+        yield from read_ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
 
-    def _looker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
-        """Return what looks at a job by its name, see `look`."""
-        sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
+    def _job_checker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
+        """Return a function that checks a job by its name, see `look`."""
+        sizes = lru_cache(_MAX_LISTED_FOLDERS)(lambda folder: self.storage.below(folder).sizes())
 
         def look_at(job: str) -> tuple[dict[str, Any], str]:
             manifest = self._manifest(job)
-            if not manifest or "sensors" not in manifest:  # the latter of a job that has failed
+            if not manifest or "sensors" not in manifest:  # a failed job has no sensors
                 return {}, f"{manifest_file(job)} is missing or damaged"
             for name, (size, crc) in manifest["files"].items():
                 folder, _, file = name.rpartition("/")
-                same = sizes(folder).get(file) == size
-                if not same or (contents and self.place.checksum(name) != [size, crc]):
+                same_size = sizes(folder).get(file) == size
+                if not same_size or (contents and self.storage.checksum(name) != [size, crc]):
                     return manifest, f"{name} is missing or damaged"
             return manifest, ""
 
         return look_at
 
-    def take(self, place: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
-        """Copy the files of jobs from another data set of this format, which is in `place`.
+    def take(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
+        """Copy the files of jobs from another data set of this format, in `source`.
 
-        Files that are here already are not read again. A job that has failed there stays as the
-        job is here. Yields the name of each job of which there is a manifest, the row that the
-        manifest has, and the first file there that is missing, damaged or of jobs of another
-        `identity`, else "". OSError if a place cannot be read or written to.
+        Files that exist in this data set are not read again. A job that has failed in the source
+        stays as it is in this data set. Yields the name of each job with a manifest, the row of the
+        manifest, and the first file in the source that is missing, damaged or of jobs of another
+        `identity`, else "". OSError if a storage cannot be read or written to.
         """
-        here = self._looker()
-        there = replace(self, place=place)
+        look_at = self._job_checker()
+        other_set = replace(self, storage=source)
 
         def take(name: str) -> tuple[JobRow | None, str]:
-            manifest = there._manifest(name)
-            last = manifest_file(name)
+            manifest = other_set._manifest(name)
+            manifest_name = manifest_file(name)
             if not manifest or manifest["made_with"].get("identity") != identity:
-                return None, place.path(last)
-            row = JobRow.of(manifest["row"])
-            if here(name) == (manifest, "") or (not row.done and self._manifest(name)):
+                return None, source.path(manifest_name)
+            row = JobRow.from_json(manifest["row"])
+            if look_at(name) == (manifest, "") or (not row.done and self._manifest(name)):
                 return row, ""
-            for file, checksum in (manifest["files"] | {last: None}).items():
-                if ".." in Path(file).parts or Path(file).is_absolute():  # of somebody else
-                    return row, place.path(last)
+            for file, checksum in (manifest["files"] | {manifest_name: None}).items():
+                # No file of a data set: the manifest is foreign or edited.
+                if ".." in Path(file).parts or Path(file).is_absolute():
+                    return row, source.path(manifest_name)
                 with suppress(FileNotFoundError):
-                    self.place.prepare(Path(file).parent)
-                    self.place.take(place, file, file)
-                    if file == last or self.place.checksum(file) == checksum:
+                    self.storage.prepare(Path(file).parent)
+                    self.storage.take(source, file, file)
+                    if file == manifest_name or self.storage.checksum(file) == checksum:
                         continue
-                    self.place.remove([file])
-                return row, place.path(file)
+                    self.storage.remove([file])
+                return row, source.path(file)
             return row, ""
 
-        for name, (row, wrong) in ahead(take, iter(there.manifests())):
-            yield name, row, wrong
+        for name, (row, damaged_file) in read_ahead(take, iter(other_set.manifests())):
+            yield name, row, damaged_file
 
     def _manifest(self, name: str) -> dict[str, Any]:
-        """Read the manifest of a job; empty if it is missing, damaged or of another job."""
+        """Read the manifest of a job; empty if missing, damaged or of another job."""
         try:
-            manifest: dict[str, Any] = json.loads(self.place.read(manifest_file(name)))
-            whole = manifest.pop("crc") == _crc(manifest)
-            whole &= JobRow.of(manifest["row"]).name == name
-            whole &= isinstance(manifest["made_with"], dict)
-            whole &= all(len(checksum) == 2 for checksum in manifest["files"].values())
+            manifest: dict[str, Any] = json.loads(self.storage.read(manifest_file(name)))
+            valid = manifest.pop("crc") == _crc(manifest)
+            valid &= JobRow.from_json(manifest["row"]).name == name
+            valid &= isinstance(manifest["made_with"], dict)
+            valid &= all(len(checksum) == 2 for checksum in manifest["files"].values())
         except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
             return {}
-        return manifest if whole else {}
+        return manifest if valid else {}
 
     def manifests(self) -> list[str]:
-        """Return the names of the jobs of which there is a manifest, by length and letters."""
-        files = self.place.below(_MANIFESTS).sizes()
+        """Return the names of the jobs that have a manifest, by length and letters."""
+        files = self.storage.below(_MANIFESTS).sizes()
         names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
         return sorted(names, key=lambda name: (len(name), name))
 
-    def rows(self, known: Collection[str] = ()) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
-        """Yield the rows of jobs as their manifests have them, and what the jobs were made with.
+    def rows(self, known_names: Collection[str] = ()) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
+        """Yield the rows of jobs from their manifests, and the identity and software of the jobs.
 
-        Rows of `known` names and damaged manifests are left out. OSError if the place
-        cannot be read.
+        Jobs in `known_names` and damaged manifests are left out. OSError if the storage cannot be
+        read.
         """
-        unknown = (name for name in self.manifests() if name not in known)
-        for _, manifest in ahead(self._manifest, unknown):
+        unknown = (name for name in self.manifests() if name not in known_names)
+        for _, manifest in read_ahead(self._manifest, unknown):
             if manifest:
-                yield JobRow.of(manifest["row"]), manifest["made_with"]
+                yield JobRow.from_json(manifest["row"]), manifest["made_with"]
 
 
 @dataclass(frozen=True)
 class Listing(Storage):
-    """A storage that lists the files that are written, {name: [bytes, CRC-32]}."""
+    """A storage that lists the written files, {name: [bytes, CRC-32]}."""
 
     files: dict[str, list[int]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, place: Storage) -> Listing:
-        """List the files that are written to a place from now on."""
-        return cls(place.url, place.durable, place.named)
+    def from_storage(cls, storage: Storage) -> Listing:
+        """Return a storage that lists the files written from now on."""
+        return cls(storage.url, storage.durable, storage.named)
 
-    def write(self, name: str, data: Any) -> None:  # noqa: D102 - as of any
+    def write(self, name: str, data: Any) -> None:  # noqa: D102 - as in Storage
         self.prepare(Path(name).parent)
         super().write(name, data)
         self.files[name] = [len(data), zlib.crc32(data)]
 
 
-def ahead(read: Callable[[T], R], things: Iterator[T]) -> Iterator[tuple[T, R]]:
-    """Yield each thing with what is read for it; several are read at a time."""
+def read_ahead(read: Callable[[T], R], items: Iterator[T]) -> Iterator[tuple[T, R]]:
+    """Yield items with the results of `read`, which runs ahead in threads."""
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
-        while some := [*islice(things, _AHEAD)]:
-            yield from zip(some, pool.map(read, some), strict=True)
+        while group := [*islice(items, _AHEAD)]:
+            yield from zip(group, pool.map(read, group), strict=True)
 
 
 def manifest_file(name: str) -> str:
-    """Name of the manifest of a job in a data set."""
+    """Return the name of the manifest of a job in a data set."""
     return f"{_MANIFESTS}/{name}.json"
 
 
@@ -382,15 +382,22 @@ def _crc(manifest: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(manifest).encode())
 
 
-def _write_pieces(pieces: Pieces, place: Storage) -> list[Any]:
-    """Write all pieces of a job; returns what was made of them."""
-    # Elsewhere each file takes a request.
-    spans = [(0, len(pieces))] if place.is_local else pieces.spans(_REQUESTS)
+def _write_pieces(pieces: Pieces, storage: Storage) -> list[Any]:
+    """Write all pieces of a job; return their details."""
+    # In an object store each file takes a request.
+    spans = [(0, len(pieces))] if storage.is_local else pieces.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:
-        return pieces.finish(place, [*pool.map(lambda span: pieces.write(place, *span), spans)])
+        return pieces.finish(storage, [*pool.map(lambda span: pieces.write(storage, *span), spans)])
 
 
 def _packed(boxes: Sequence[Boxes]) -> bytes:
-    """Boxes of all sweeps as a NumPy archive: float64 (n, a, 3), ... as the fields of `Boxes`."""
-    names = ("centres", "quaternions", "points", "there")  # sizes are those of the sweeps
-    return packed({name: np.stack([getattr(one, name) for one in boxes]) for name in names})
+    """Return boxes of all sweeps as a NumPy archive: float64 (n, a, 3), ... by names of fields."""
+    # The sizes are in the sweeps.
+    return packed(
+        {
+            "centres": np.stack([boxes_of_sweep.centres for boxes_of_sweep in boxes]),
+            "quaternions": np.stack([boxes_of_sweep.quaternions for boxes_of_sweep in boxes]),
+            "points": np.stack([boxes_of_sweep.points for boxes_of_sweep in boxes]),
+            "there": np.stack([boxes_of_sweep.present for boxes_of_sweep in boxes]),
+        }
+    )

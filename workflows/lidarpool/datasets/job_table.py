@@ -1,10 +1,10 @@
-"""The table of the jobs of a data set, and what is counted of a job's points.
+"""The table of the jobs of a data set, and the tally of a job's points.
 
-`jobs.csv` has a row for each job: number, name, split, then what was varied, then what came of it,
-then the points of each class. A varied value is written as JSON writes it, so that it is read with
-its type: ``12``, ``0.5``, ``true``; text stands as it is unless it looks like one of these, as
-``"12"`` does. Nothing stands where a job has no such value. Before text that a spreadsheet would
-run as a formula stands an apostrophe, as OWASP advises against CSV injection.
+`jobs.csv` has a row for each job: number, name, split, then varied values, then results, then the
+points of each class. A varied value is written as JSON writes it, so that it is read with its type:
+``12``, ``0.5``, ``true``; text is written as it is unless it looks like such a value, as ``"12"``
+does. The cell is empty where a job has no such value. Text that a spreadsheet would run as a
+formula has a leading apostrophe, as OWASP advises against CSV injection.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Value = bool | int | float | str
 
 TABLE_FILE = "jobs.csv"
 PARQUET_FILE = "jobs.parquet"
-AGAIN = "run the campaign again with --resume, which writes it anew"
+WRITE_AGAIN = "run the campaign again with --resume, which writes it anew"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
-JOBS_MOST = 100_000_000  # of a campaign: a larger number is not that of a job
-ERROR_MOST = 4_000  # letters of an error in the table: csv.reader refuses cells of 131,072
+MAX_JOBS = 100_000_000  # of a campaign: a larger number is not a job's
+MAX_ERROR_LETTERS = 4_000  # of an error in the table: csv.reader refuses cells of 131,072
 
 _HEAD = {"number": int, "name": str, "split": str}
 _TAIL = {
@@ -54,9 +54,9 @@ _TAIL = {
 }
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
 _UTF8 = codecs.getwriter("utf-8")
-_ESCAPED = "backslashreplace"  # of text that may hold parts of names that are no UTF-8
-# Text that begins like this is a formula for spreadsheets, also behind apostrophes, which would
-# else not be read as they were written.
+_ESCAPED = "backslashreplace"  # for text with parts of names that are no UTF-8
+# Text with such a start is a formula for spreadsheets. Leading apostrophes count as well: without
+# that, a cell with an apostrophe of its own would be read back without it.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 # Before the name of a varied value that would look like another column.
 _VARIED = "varied."
@@ -64,7 +64,7 @@ _VARIED = "varied."
 
 @dataclass(frozen=True)
 class JobRow:
-    """One job of a campaign.
+    """A job of a campaign.
 
     Parameters
     ----------
@@ -75,15 +75,15 @@ class JobRow:
     split
         Its split, such as "train"; "" without splits.
     values
-        {path: value} of what was varied; of a sample of things, how many.
+        {path: varied value}; for a sample of objects, their number.
     error
         Why it failed; "" for a job that is done.
     scans, sweeps, rays, hits, points
-        How many.
+        Numbers of scans, sweeps, rays, hits and points.
     seconds
-        Of casting, all its tasks. The only entry that differs between runs.
+        Casting time of all its tasks. The only entry that differs between runs.
     sha256
-        Of its points, see `Tally`: the same on any cluster.
+        Hash of its points, see `Tally`: the same on any cluster.
     classes
         {class: points}; empty if the points have no column ``class``.
     """
@@ -104,12 +104,12 @@ class JobRow:
 
     @property
     def done(self) -> bool:
-        """Whether its points are in the data set."""
+        """True if the points of the job are in the data set."""
         return not self.error
 
     @classmethod
-    def of(cls, data: Mapping[str, Any]) -> JobRow:
-        """Make a row of what JSON gives of one.
+    def from_json(cls, data: Mapping[str, Any]) -> JobRow:
+        """Return a row from its JSON object.
 
         ValueError if an entry is missing, unknown or of another type.
         """
@@ -124,12 +124,12 @@ class JobRow:
 
 
 class Tally:
-    """What is counted of the points of a job, a piece at a time and in order.
+    """Counts and hash of the points of a job, added in chunks and in order.
 
     Examples
     --------
     >>> cloud = Cloud(np.zeros((3, 3)), {"class": np.array([6, 2, 6])})
-    >>> tally = Tally.of(cloud)
+    >>> tally = Tally.from_cloud(cloud)
     >>> tally.points, tally.classes
     (3, {2: 1, 6: 2})
     >>> again = Tally()
@@ -145,8 +145,8 @@ class Tally:
         self._columns: dict[str, Any] = {}  # {name and type: hash of the values}
 
     @classmethod
-    def of(cls, cloud: CloudLike) -> Tally:
-        """Count a whole cloud."""
+    def from_cloud(cls, cloud: CloudLike) -> Tally:
+        """Return the tally of a whole cloud."""
         tally = cls()
         for chunk in cloud.chunks():
             tally.add(chunk)
@@ -155,7 +155,7 @@ class Tally:
     def add(self, chunk: Cloud) -> None:
         """Count the next points.
 
-        LidarError if they have other columns than those before.
+        LidarError if their columns differ from the columns of earlier points.
         """
         if not len(chunk):
             return
@@ -188,21 +188,23 @@ class Tally:
     def sha256(self) -> str:
         """Hash of positions and columns, 64 hexadecimal digits.
 
-        It is that of the columns' names, types and hashes, one a line, positions first: the same
-        for float32 and float64 positions of equal value, and however the points were divided.
+        It is the hash of the columns' names, types and hashes, a line each, positions first: the
+        same for float32 and float64 positions of equal value, and for any division into chunks.
         """
         lines = (f"{name} {digest.hexdigest()}\n" for name, digest in self._columns.items())
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterable[JobRow]]) -> None:
+def write_table(
+    storage: Storage, names: Sequence[str], jobs: Callable[[], Iterable[JobRow]]
+) -> None:
     """Write the table of jobs: jobs.csv, and jobs.parquet if pyarrow is installed.
 
     Rows are not held in memory: they are read once for the columns, and again for each file.
 
     Parameters
     ----------
-    place
+    storage
         Folder of the data set, which must exist.
     names
         Names of the varied values, in the order of their columns.
@@ -214,20 +216,22 @@ def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterabl
     LidarError
         If a row has a value that is not in `names`, or the table cannot be written.
     """
-    with explained(f"The table of jobs cannot be written to {place}", "make room or see to rights"):
+    with explained(
+        f"The table of jobs cannot be written to {storage}", "make room or see to rights"
+    ):
         classes, kinds = _columns(names, jobs())
         header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
-        with place.writing(TABLE_FILE) as file:
+        with storage.writing(TABLE_FILE) as file:
             writer = csv.writer(_UTF8(file, _ESCAPED), lineterminator="\n")
             writer.writerow(map(_shielded, header))
             for row in jobs():
                 writer.writerow(_cells(row, names, classes))
         if find_spec("pyarrow") is not None:
-            with place.writing(PARQUET_FILE) as file:
+            with storage.writing(PARQUET_FILE) as file:
                 _write_parquet(file, header, names, kinds, iter(jobs()))
 
 
-def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterator[JobRow]:
+def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Iterator[JobRow]:
     """Yield the rows of jobs.csv in order.
 
     `checksum` has the bytes and the CRC-32 that the file must have.
@@ -235,21 +239,21 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
     Raises
     ------
     LidarError
-        If there is no such table, or it is damaged: no checksum, a number that is not greater
-        than the one before, or no row of a table.
+        If there is no such table, or it is damaged: another checksum, numbers that do not increase,
+        or a row that does not fit the table.
     """
     with ExitStack() as stack:
-        with explained(f"{place.path(TABLE_FILE)} cannot be read", AGAIN):
-            if place.is_local:
-                path = place.local(TABLE_FILE)
+        with explained(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
+            if storage.is_local:
+                path = storage.local(TABLE_FILE)
             else:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarpool-"))
                 path = Path(folder, TABLE_FILE)
-                place.get(TABLE_FILE, path)
+                storage.get(TABLE_FILE, path)
             if checksum is not None and Storage(str(path.parent)).checksum(path.name) != checksum:
                 raise LidarError(
-                    f"{place.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
-                    f"the data set: {AGAIN}."
+                    f"{storage.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
+                    f"the data set: {WRITE_AGAIN}."
                 )
             file = TextIOWrapper(open_input(path), encoding="utf-8", newline="")
             stack.enter_context(file)
@@ -270,21 +274,21 @@ def read_table(place: Storage, checksum: Sequence[int] | None = None) -> Iterato
             last_number = -1
             for cells in reader:
                 row = _row(header, names, cells)
-                if not last_number < row.number < JOBS_MOST:
+                if not last_number < row.number < MAX_JOBS:
                     raise ValueError(f"job {row.number} follows job {last_number}")
                 last_number = row.number
                 yield row
         except (ValueError, csv.Error) as error:
             raise LidarError(
-                f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
-                f"{AGAIN}."
+                f"{storage.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
+                f"{WRITE_AGAIN}."
             ) from error
 
 
 def _column_of(name: str) -> str:
-    """Name of the column of a varied value."""
-    taken = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
-    return f"{_VARIED}{name}" if taken else name
+    """Return the name of the column of a varied value."""
+    ambiguous = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
+    return f"{_VARIED}{name}" if ambiguous else name
 
 
 def _columns(
@@ -294,9 +298,9 @@ def _columns(
     classes: set[int] = set()
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
-        if others := [name for name in row.values if name not in kinds]:
+        if unknown := [name for name in row.values if name not in kinds]:
             raise LidarError(
-                f"Job {row.name} has a value {others[0]!r}, which is not among those that vary: "
+                f"Job {row.name} has a value {unknown[0]!r}, which is not among those that vary: "
                 f"{', '.join(names) or 'none'}."
             )
         classes.update(row.classes)
@@ -306,7 +310,7 @@ def _columns(
 
 
 def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
-    """Cells of a row of jobs.csv."""
+    """Yield the cells of a row of jobs.csv."""
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
@@ -314,7 +318,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
         entry = getattr(row, name)
         # Before Python 3.13, csv.writer left a bare carriage return unquoted.
         if kind is str:
-            yield _shielded("\n".join(entry[:ERROR_MOST].splitlines()))
+            yield _shielded("\n".join(entry[:MAX_ERROR_LETTERS].splitlines()))
         else:
             yield json.dumps(entry)
     for number in classes:
@@ -322,7 +326,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
 
 
 def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
-    """Read a row of jobs.csv; ValueError if it is none."""
+    """Return the job of a row of jobs.csv; ValueError for an invalid row."""
     if len(cells) != len(header):
         raise ValueError(f"{len(cells)} cells in {len(header)} columns")
     first = len(_HEAD)
@@ -330,22 +334,22 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     fixed = dict(zip(header[:first], cells, strict=False))
     fixed |= dict(zip(header[stop:], cells[stop:], strict=True))
     kinds = _HEAD | _TAIL
-    given: dict[str, Any] = {
+    entries: dict[str, Any] = {
         name: _unshielded(fixed[name]) if kind is str else kind(fixed[name])
         for name, kind in kinds.items()
     }
     classes = {
-        int(found[1]): int(text)
+        int(match[1]): int(text)
         for name, text in fixed.items()
-        if (found := _CLASS.fullmatch(name)) and text != "0"
+        if (match := _CLASS.fullmatch(name)) and text != "0"
     }
     varied = zip(names, cells[first:stop], strict=True)
     values = {name: _read(text) for name, text in varied if text}
-    return JobRow(values=values, classes=classes, **given)
+    return JobRow(values=values, classes=classes, **entries)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as an object of Python, which a function may have made with NumPy."""
+    """Return a value of NumPy as an object of Python."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -362,7 +366,7 @@ def _kind(value: Any) -> type:
 
 
 def _written(value: Any) -> str:
-    """Write a varied value as a cell that is read with its type."""
+    """Return a cell for a varied value, which is read back with its type."""
     plain = _plain(value)
     if not isinstance(plain, str):
         return json.dumps(plain)
@@ -384,12 +388,12 @@ def _shielded(text: str) -> str:
 
 
 def _unshielded(text: str) -> str:
-    """Return the text that `_shielded` was given."""
+    """Return the text before `_shielded`."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
 def _read(text: str) -> Value:
-    """Read a cell of a varied value."""
+    """Return the varied value of a cell."""
     plain = _unshielded(text)
     return _parsed(text) if plain == text else plain
 
@@ -410,17 +414,17 @@ def _write_parquet(
     kinds: Mapping[str, set[type]],
     rows: Iterator[JobRow],
 ) -> None:
-    """Write jobs.parquet. A value that is text in some rows and not in others is text in all."""
+    """Write jobs.parquet. A varied value that is text in any row is text in all rows."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     plain = {int: pa.int64(), float: pa.float64(), str: pa.string(), bool: pa.bool_()}
 
     def type_of(name: str) -> Any:
-        there = kinds[name]
-        if len(there) == 1:
-            return plain[next(iter(there))]
-        return pa.float64() if there == {int, float} else pa.string()
+        kinds_of_name = kinds[name]
+        if len(kinds_of_name) == 1:
+            return plain[next(iter(kinds_of_name))]
+        return pa.float64() if kinds_of_name == {int, float} else pa.string()
 
     types = {_column_of(name): type_of(name) for name in names}
     types |= {name: plain[kind] for name, kind in (_HEAD | _TAIL).items()}
@@ -428,8 +432,8 @@ def _write_parquet(
     columns = {_column_of(name): name for name in names}
 
     def cell(row: JobRow, name: str) -> Any:
-        if found := _CLASS.fullmatch(name):
-            return row.classes.get(int(found[1]), 0)
+        if match := _CLASS.fullmatch(name):
+            return row.classes.get(int(match[1]), 0)
         value = getattr(row, name) if name not in columns else row.values.get(columns[name])
         if value is None or types[name] != pa.string():
             plain = _plain(value)

@@ -34,16 +34,16 @@ from ..export.formats import Format
 from ..export.pieces import Entry
 from ..export.reading import Reader
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
-from .job_table import AGAIN, TABLE_FILE, JobRow, read_table
+from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import Sweep
 
 _REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
-_OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
+_OPEN_JOBS = 16  # jobs of which a thread keeps poses, boxes and opened files
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Sweeps of a sensor of a job, which are consecutive in the job's `Sweeps`."""
+    """Consecutive sweeps in a job's `Sweeps`, of a single sensor."""
 
     job: JobRow
     first: int
@@ -53,20 +53,20 @@ class _Run:
 class SavedSweeps:
     """A sequence of the sweeps of a data set in an order; see `sweeps`.
 
-    An item is read when it is asked for; a loop reads ahead in threads. Several threads may ask,
-    and processes that this one forks or that get a pickled copy. `classes` are names of semantic
-    classes, {number: name}.
+    An item is read on access; a loop reads ahead in threads. Several threads may access items, and
+    forked processes or processes with a pickled copy. `classes` are names of semantic classes,
+    {number: name}.
     """
 
     classes: Mapping[int, str]
 
     def __init__(
-        self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
+        self, storage: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
     ) -> None:
-        self._place = place
+        self._storage = storage
         self._written = written
         self._runs = runs
-        self._ends = np.cumsum([run.count for run in runs], dtype=np.int64)
+        self._run_stops = np.cumsum([run.count for run in runs], dtype=np.int64)
         self._order = None  # int64 (n,): 8 bytes for each sweep
         if shuffle is not None:
             self._order = np.random.default_rng(shuffle).permutation(len(self))
@@ -79,28 +79,28 @@ class SavedSweeps:
         self.__dict__ |= state | {"_local": threading.local()}
 
     def __repr__(self) -> str:
-        return f"<{len(self):,} sweeps of {self._place} ({self._written.row.data_set})>"
+        return f"<{len(self):,} sweeps of {self._storage} ({self._written.row.data_set})>"
 
     def __len__(self) -> int:
-        return int(self._ends[-1]) if len(self._ends) else 0
+        return int(self._run_stops[-1]) if len(self._run_stops) else 0
 
     def __iter__(self) -> Iterator[Sweep]:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Give some sweeps in this order; the next ones are read meanwhile."""
-        if self._place.is_local and self._written.row.raw:
-            # To hand such a sweep from thread to thread takes as long as to read it.
-            soon, now = tee(map(self._at, indices))
-            for job, number in islice(soon, _REQUESTS):
+        """Yield the sweeps of these indices in order; the next sweeps are read meanwhile."""
+        if self._storage.is_local and self._written.row.raw:
+            # Handing such a sweep from thread to thread takes as long as reading it.
+            upcoming, current = tee(map(self._locate, indices))
+            for job, number in islice(upcoming, _REQUESTS):
                 job.reader.expect(number)
-            for job, number in now:
-                for later, sweep in islice(soon, 1):
-                    later.reader.expect(sweep)
+            for job, number in current:
+                for next_job, sweep in islice(upcoming, 1):
+                    next_job.reader.expect(sweep)
                 yield job.read(number)
             return
-        # At a URL each request takes long. A job that is one file for all sweeps is opened once.
-        threads = 1 if self._place.is_local or not self._written.row.boxes else _REQUESTS
+        # At a URL each request takes long. A job with one file for all sweeps is opened once.
+        threads = 1 if self._storage.is_local or not self._written.row.boxes else _REQUESTS
         coming: deque[Future[Sweep]] = deque()
         with ThreadPoolExecutor(threads, "sweeps") as pool:
             try:
@@ -113,7 +113,7 @@ class SavedSweeps:
             finally:
                 for task in coming:
                     task.cancel()
-                with suppress(RuntimeError):  # as the program ends, threads take nothing more
+                with suppress(RuntimeError):  # while the program ends, threads take no tasks
                     pool.submit(self._close)
 
     def __getitem__(self, index: int) -> Sweep:
@@ -121,27 +121,27 @@ class SavedSweeps:
 
         LidarError if a file is missing or damaged; IndexError if there is no such sweep.
         """
-        job, number = self._at(index)
+        job, number = self._locate(index)
         return job.read(number)
 
-    def _at(self, index: int) -> tuple[_OpenJob, int]:
-        """Return the job of a sweep, opened, and the sweep's number there."""
-        at = operator.index(index)
-        at += len(self) if at < 0 else 0
-        if not 0 <= at < len(self):
+    def _locate(self, index: int) -> tuple[_OpenJob, int]:
+        """Return the opened job of a sweep, and the number of the sweep in that job."""
+        position = operator.index(index)
+        position += len(self) if position < 0 else 0
+        if not 0 <= position < len(self):
             raise IndexError(f"there is no sweep {index} of {len(self)}")
         if self._order is not None:
-            at = int(self._order[at])
-        which = bisect_right(self._ends, at)
-        run = self._runs[which]
-        number = run.first + at - (int(self._ends[which]) - run.count)
+            position = int(self._order[position])
+        run_index = bisect_right(self._run_stops, position)
+        run = self._runs[run_index]
+        number = run.first + position - (int(self._run_stops[run_index]) - run.count)
         return self._opened(run.job), number
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.
 
         The workers of a DataLoader share the sweeps, and so do the ranks of torch.distributed if
-        that is initialised when the loader begins. Each sweep is read by one of them.
+        that is initialised when the loader begins. Each sweep is read by a single worker.
 
         Parameters
         ----------
@@ -150,8 +150,8 @@ class SavedSweeps:
             (whole numbers as int64), `boxes` (k, 7: centre, length, width, height, yaw),
             `box_objects`; and `box_types`, `job`, `sensor`, `number`, `time_ns`.
         even
-            Whether to leave out the last sweeps, fewer than there are ranks, so that all ranks have
-            the same number: with one more on some, training with DistributedDataParallel waits for
+            Whether to leave out the last sweeps, fewer than the ranks, so that all ranks have the
+            same number: with different numbers, training with DistributedDataParallel waits for
             ever.
 
         Raises
@@ -172,14 +172,14 @@ class SavedSweeps:
         self._local.__dict__.clear()
 
     def _opened(self, job: JobRow) -> _OpenJob:
-        """Return a job that is open in this thread."""
+        """Return a job, opened in this thread."""
         local = self._local
         if getattr(local, "process", None) != os.getpid():  # a fork shares the positions of files
             local.process = os.getpid()
             local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
         if job.number not in jobs:
-            jobs[job.number] = _OpenJob(self._place, self._written, job)
+            jobs[job.number] = _OpenJob(self._storage, self._written, job)
             if len(jobs) > _OPEN_JOBS:
                 jobs.popitem(last=False)[1].reader.close()
         jobs.move_to_end(job.number)
@@ -187,40 +187,46 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """What is kept of a job while its sweeps are read."""
+    """Poses, boxes and reader of a job whose sweeps are read."""
 
-    def __init__(self, place: Storage, written: Format, job: JobRow) -> None:
-        self.place = place
+    def __init__(self, storage: Storage, written: Format, job: JobRow) -> None:
+        self.storage = storage
         self.job = job
         row = written.row
         name = job_file(row.data_set, job.name, SWEEPS_FILE)
-        self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
+        self.sweeps = Sweeps.load(storage.path(name), partial(storage.read, name))
         self.boxes: Boxes | None = None
         if self.sweeps.actors:
             name = job_file(row.data_set, job.name, BOXES_FILE)
-            with open_archive(place.path(name), partial(place.read, name)) as arrays:
-                # (a, 3), or (a, n, 3) if any deforms: of each sweep
+            with open_archive(storage.path(name), partial(storage.read, name)) as arrays:
+                # (a, 3), or for each sweep (a, n, 3) if any actor deforms
                 sizes = np.diff(self.sweeps.actor_bounds, axis=-2)[..., 0, :]
                 sizes = sizes if sizes.ndim == 2 else sizes.swapaxes(0, 1)
                 sizes = np.broadcast_to(sizes, arrays["centres"].shape)
-                boxes = Boxes(sizes=sizes, **arrays)
+                boxes = Boxes(
+                    arrays["centres"],
+                    arrays["quaternions"],
+                    sizes,
+                    arrays["points"],
+                    present=arrays["there"],
+                )
                 self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
-        self.reader: Reader = row.provides("Reader")(place, self.sweeps, entry, written.layout)
+        self.reader: Reader = row.provides("Reader")(storage, self.sweeps, entry, written.layout)
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""
         try:
             points = self.reader.read(sweep)
-        except Exception as error:  # libraries of five formats have many kinds
-            file = self.place.path(self.reader.last or self.reader.files(sweep)[0])
+        except Exception as error:  # libraries of five formats raise many kinds of errors
+            file = self.storage.path(self.reader.last or self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
-        return Sweep.of(self.job, self.sweeps, sweep, points, self.boxes, sweep)
+        return Sweep.from_points(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
 
 @checked
 def sweeps(
-    place: str | Path,
+    location: str | Path,
     *,
     split: str | Sequence[str] | None = None,
     jobs: Sequence[int | str] | None = None,
@@ -231,23 +237,23 @@ def sweeps(
 
     Parameters
     ----------
-    place
+    location
         Folder or URL of the data set.
     split
-        Only the jobs of this split, or these.
+        Only the jobs of this split, or of these splits.
     jobs
         Only these jobs, by number or name.
     sensors
         Only the sweeps of these sensors, by name.
     shuffle
-        A seed: the sweeps of all jobs are in an order that follows from it. Without, they are in
-        the order of jobs, sensors and time. Give another seed for each epoch.
+        A seed for a random order of the sweeps of all jobs. Without a seed, sweeps are in the order
+        of jobs, sensors and time. Give another seed for each epoch.
 
     Returns
     -------
-    A sequence of `Sweep`, which reads each when it is asked for; a loop reads a few ahead in
-    threads. Going through it again gives the same order. In memory are a row for each job, 8 bytes
-    for each sweep if shuffled, and in each thread poses and boxes of 16 jobs.
+    A sequence of `Sweep`, which reads each on access; a loop reads a few ahead in threads. A second
+    loop gives the same order. In memory are a row for each job, 8 bytes for each sweep if shuffled,
+    and in each thread poses and boxes of 16 jobs.
 
     Raises
     ------
@@ -255,23 +261,23 @@ def sweeps(
         If there is no data set, it is unfinished or damaged, a package that its format needs is
         not installed, or there is no such split, job or sensor.
     """
-    storage = replace(Storage.at(place), named="")  # links of the user's own are welcome
+    storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)
     written = Format(DATA_SETS[head["format"]], head["layout"], head["compensated"])
     written.check_installed()
-    of_sensors = head["jobs"]
+    sweep_counts = head["jobs"]
     table = read_table(storage, head["table"])
-    rows = [job for job in table if job.number in of_sensors]
-    if len(rows) < len(of_sensors):
-        raise LidarError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {AGAIN}.")
+    rows = [job for job in table if job.number in sweep_counts]
+    if len(rows) < len(sweep_counts):
+        raise LidarError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {WRITE_AGAIN}.")
     rows = _chosen(rows, split, jobs, storage)
-    there = list(dict.fromkeys(name for job in rows for name in of_sensors[job.number]))
+    sensor_names = list(dict.fromkeys(name for job in rows for name in sweep_counts[job.number]))
     if sensors is not None:
-        _check_known("sensor", sensors, there, storage)
+        _check_known("sensor", sensors, sensor_names, storage)
     runs = []
     for job in rows:
         first = 0
-        for name, count in of_sensors[job.number].items():
+        for name, count in sweep_counts[job.number].items():
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
@@ -280,10 +286,10 @@ def sweeps(
     return saved
 
 
-def read_index(place: Storage) -> dict[str, Any]:
-    """Read the index, with jobs by number, of a data set; LidarError if it is not finished."""
+def read_index(storage: Storage) -> dict[str, Any]:
+    """Read the index of a data set, with jobs by number; LidarError if the set is unfinished."""
     try:
-        head = unsealed(place.read(INDEX_FILE))
+        head = unsealed(storage.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"it is of version {head['version']}, not {VERSION}")
         if head["format"] not in DATA_SETS:
@@ -292,20 +298,20 @@ def read_index(place: Storage) -> dict[str, Any]:
             raise ValueError(f"it has no checksum of {TABLE_FILE}")
         head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
-        if ".jobs" in place.entries():
+        if ".jobs" in storage.entries():
             raise LidarError(
-                f"{place} is an unfinished data set: lidarpool run CAMPAIGN --out {place} --resume "
-                "continues it."
+                f"{storage} is an unfinished data set: lidarpool run CAMPAIGN --out {storage} "
+                "--resume continues it."
             ) from error
         raise LidarError(
-            f"{place} is no data set of lidarpool, which has a {INDEX_FILE}: give the --out of a "
+            f"{storage} is no data set of lidarpool, which has a {INDEX_FILE}: give the --out of a "
             "campaign."
         ) from error
     except OSError as error:
-        raise _unreadable(place.path(INDEX_FILE), error) from error
+        raise _unreadable(storage.path(INDEX_FILE), error) from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise LidarError(
-            f"{place.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
+            f"{storage.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
             "run the campaign again with --resume, or merge its shards again."
         ) from error
     return head
@@ -315,37 +321,39 @@ def _chosen(
     rows: list[JobRow],
     split: str | Sequence[str] | None,
     jobs: Sequence[int | str] | None,
-    place: Storage,
+    storage: Storage,
 ) -> list[JobRow]:
-    """Select jobs of these splits, and with these numbers or names."""
+    """Return the jobs of these splits, and with these numbers or names."""
     if split is not None:
         splits = [split] if isinstance(split, str) else list(split)
-        _check_known("split", splits, dict.fromkeys(row.split for row in rows), place)
+        _check_known("split", splits, dict.fromkeys(row.split for row in rows), storage)
         rows = [row for row in rows if row.split in splits]
     if jobs is not None:
-        wanted = {operator.index(job) if not isinstance(job, str) else job for job in jobs}
-        known = {row.number for row in rows} | {row.name for row in rows}
-        if missing := [job for job in jobs if job not in known]:
+        requested = {operator.index(job) if not isinstance(job, str) else job for job in jobs}
+        available = {row.number for row in rows} | {row.name for row in rows}
+        if missing := [job for job in jobs if job not in available]:
             raise LidarError(
-                f"{place} has no job {missing[0]!r}"
+                f"{storage} has no job {missing[0]!r}"
                 + ("" if split is None else f" in split {split!r}")
                 + " that is done: jobs.csv lists all, with their splits and errors."
             )
-        rows = [row for row in rows if row.number in wanted or row.name in wanted]
+        rows = [row for row in rows if row.number in requested or row.name in requested]
     return rows
 
 
-def _check_known(what: str, wanted: Sequence[str], there: Any, place: Storage) -> None:
-    """Check that there are splits or sensors of these names, or raise LidarError."""
-    names = [name for name in there if name]
-    for name in wanted:
-        if name not in there:
-            known = f" It has {', '.join(names)}." if names else f" It names no {what}s."
-            raise LidarError(f"{place} has no {what} {name!r}.{did_you_mean(name, names) or known}")
+def _check_known(label: str, requested: Sequence[str], available: Any, storage: Storage) -> None:
+    """Raise LidarError if a requested split or sensor does not exist."""
+    names = [name for name in available if name]
+    for name in requested:
+        if name not in available:
+            hint = f" It has {', '.join(names)}." if names else f" It names no {label}s."
+            raise LidarError(
+                f"{storage} has no {label} {name!r}.{did_you_mean(name, names) or hint}"
+            )
 
 
 def _unreadable(file: str, error: Exception) -> LidarError:
-    """Return the error of a file that is missing or damaged, in a line."""
+    """Return the error for a file that is missing or damaged, in a line."""
     if isinstance(error, LidarError):
         return error
     if isinstance(error, OSError) and (error.strerror or error.__cause__):  # the latter of a URL

@@ -1,4 +1,4 @@
-"""A sweep of a job, as data sets and streams give it."""
+"""A sweep of a job, read from a data set or a stream."""
 
 from __future__ import annotations
 
@@ -22,41 +22,42 @@ from .job_table import JobRow, Value
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
-    """A sweep of a sensor: its points, where the sensor was, and what was there.
+    """A sweep of a sensor: its points, the pose of the sensor, and the boxes of actors.
 
-    Axes are those of the sensor when the sweep began: x ahead, y to the left, z up, unless its
-    mount is turned. The motion during the sweep is taken out of the points.
+    The frame is the sensor frame at the start of the sweep: x ahead, y to the left, z up, unless
+    the mount is turned. The motion during the sweep is taken out of the points.
     """
 
     job: str  # name
     job_number: int
     split: str  # "" without splits
-    values: Mapping[str, Value]  # what was varied, by its path
-    sensor: str  # name; "" where there is only one
-    number: int  # among the sweeps of its sensor in the job, from 0
-    time_ns: int  # its start, nanoseconds since the start of the survey
-    points: Floats32  # (n, 3): metres, in the sensor's axes
-    columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
-    pose: Floats  # (4, 4): from the sensor's axes to the world's
-    object_names: tuple[str, ...]  # what the column `object` counts
-    faults: tuple[Fault, ...]  # that the sensor has at some time of the sweep
-    _boxes: SweepBoxes | tuple[Sweeps, Boxes | None, int | EllipsisType]  # or what they are made of
+    values: Mapping[str, Value]  # {path: varied value}
+    sensor: str  # name; "" for a single sensor without a name
+    number: int  # index among the sweeps of its sensor in the job, from 0
+    time_ns: int  # start of the sweep, nanoseconds since the start of the survey
+    points: Floats32  # (n, 3): metres, sensor frame
+    columns: Mapping[str, AnyArray]  # {name: (n,)}: columns that the format holds
+    pose: Floats  # (4, 4): from the sensor frame to the world frame
+    object_names: tuple[str, ...]  # names of the numbers in the column `object`
+    faults: tuple[Fault, ...]  # faults of the sensor at any time of the sweep
+    # Boxes, or arguments of `SweepBoxes.select`.
+    _boxes: SweepBoxes | tuple[Sweeps, Boxes | None, int | EllipsisType]
 
     @classmethod
-    def of(
+    def from_points(
         cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns,
-        boxes: Boxes | None, which: int | EllipsisType = ...,
+        boxes: Boxes | None, index: int | EllipsisType = ...,
     ) -> Sweep:  # fmt: skip
-        """Make the sweep of a number among all of a job; boxes are as of `SweepBoxes.of`."""
+        """Return a sweep by its number in the job; boxes and index as of `SweepBoxes.select`."""
         return cls(
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
             round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            sweeps.all_names, sweeps.faults_in(number), (sweeps, boxes, which),
+            sweeps.all_names, sweeps.faults_in(number), (sweeps, boxes, index),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_boxes": self.boxes}  # without those of all other sweeps
+        return self.__dict__ | {"_boxes": self.boxes}  # without the boxes of further sweeps
 
     def __len__(self) -> int:
         return len(self.points)
@@ -67,20 +68,20 @@ class Sweep:
 
     @cached_property
     def boxes(self) -> SweepBoxes:
-        """Boxes of the actors that are in the scene, in the sensor's axes."""
-        return SweepBoxes.of(*self._boxes) if isinstance(self._boxes, tuple) else self._boxes
+        """Boxes of the actors that are in the scene, in the sensor frame."""
+        return SweepBoxes.select(*self._boxes) if isinstance(self._boxes, tuple) else self._boxes
 
     @property
     def intensity(self) -> Floats32 | None:
-        """float32 (n,): energy received, see the column; None if the data set lacks it."""
+        """Received energy, float32 (n,), see the column; None if the data set lacks the column."""
         return self.columns.get("intensity")
 
     @property
     def classes(self) -> NDArray[np.uint16] | None:
-        """uint16 (n,): semantic classes, 0 for none; None if the data set lacks them."""
+        """Semantic classes, uint16 (n,), 0 for none; None if the data set lacks the column."""
         return self.columns.get("class")
 
     @property
     def objects(self) -> Ints32 | None:
-        """int32 (n,): instances, indices into `object_names`; None if the data set lacks them."""
+        """Instances, int32 (n,), indices into `object_names`; None if the column is missing."""
         return self.columns.get("object")

@@ -17,17 +17,17 @@ from .sweep_data import Sweep
 
 
 class ReadSweeps(Protocol):
-    """Sweeps that can be read by their indices, such as those of a data set."""
+    """Sweeps that can be read by index, such as the sweeps of a data set."""
 
     def __len__(self) -> int: ...
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Read the sweeps of some indices, in this order."""
+        """Yield the sweeps of these indices, in this order."""
         ...
 
 
 class JobStream(Protocol):
-    """Sweeps of some jobs of a campaign, in the order of jobs."""
+    """Sweeps of jobs of a campaign, in the order of jobs."""
 
     @property
     def numbers(self) -> Sequence[int]:
@@ -35,7 +35,7 @@ class JobStream(Protocol):
         ...
 
     def of_jobs(self, numbers: Sequence[int]) -> Self:
-        """Return the stream of some of the jobs."""
+        """Return the stream of a subset of the jobs."""
         ...
 
     def __iter__(self) -> Generator[Sweep]: ...
@@ -81,22 +81,23 @@ class TorchStream(torch.utils.data.IterableDataset):
                 "A stream is read by the process that trains, since the cluster works ahead: give "
                 "the DataLoader num_workers=0."
             )
-        (rank, ranks), jobs = _ranks(), self.stream.numbers
-        of_rank = self.stream.of_jobs(jobs[rank : len(jobs) - len(jobs) % ranks : ranks])
-        with closing(iter(of_rank)) as sweeps:
+        rank, ranks = _ranks()
+        jobs = self.stream.numbers
+        stream = self.stream.of_jobs(jobs[rank : len(jobs) - len(jobs) % ranks : ranks])
+        with closing(iter(stream)) as sweeps:
             yield from map(self.transform, sweeps)
 
 
 def _ranks() -> tuple[int, int]:
-    """Rank of this process, and how many there are."""
-    there = torch.distributed
-    if not (there.is_available() and there.is_initialized()):
+    """Return the rank of this process and the number of ranks."""
+    distributed = torch.distributed
+    if not (distributed.is_available() and distributed.is_initialized()):
         return 0, 1
-    return there.get_rank(), there.get_world_size()
+    return distributed.get_rank(), distributed.get_world_size()
 
 
 def tensors(sweep: Sweep) -> dict[str, Any]:
-    """Make a dict of tensors, as `SavedSweeps.torch` describes it."""
+    """Return a sweep as a dict of tensors, see `SavedSweeps.torch`."""
     boxes = sweep.boxes
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array

@@ -25,14 +25,14 @@ _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: 
 
 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor's axes: pose, intensity, colours, normals.
+    """Write each sweep that has points, in the sensor frame: pose, intensity, colours, normals.
 
-    Normals are those of the extension for surface normals; 0, 0, 0 without a surface.
+    Normals are in the extension for surface normals; 0, 0, 0 without a surface.
     """
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
     normals = {*NORMAL} <= {column.name for column in cloud.table}
-    kind, fields = (_WithNormals, _normal_fields) if normals else (pye57.E57, nullcontext)
-    with _named_by(content), fields(), kind(str(path), mode="w") as file:
+    file_class, fields = (_WithNormals, _normal_fields) if normals else (pye57.E57, nullcontext)
+    with _named_by(content), fields(), file_class(str(path), mode="w") as file:
         if normals:
             file.image_file.extensionsAdd("nor", _NORMALS_URI)
         try:
@@ -55,25 +55,25 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
     if {*NORMAL} <= {*points.columns}:
         columns = sweeps.columns_compensated(sweep, points)
         data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
-    turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
-    place = sweeps.pose.positions[sweep]
+    quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
+    position = sweeps.pose.positions[sweep]
     file.write_scan_raw(
-        data, name=f"sweep {sweep}, motion compensated", rotation=turn, translation=place
+        data, name=f"sweep {sweep}, motion compensated", rotation=quaternion, translation=position
     )
 
 
 class _WithNormals(pye57.E57):
-    """A file whose scans have normals; pye57 leaves them out."""
+    """A file whose scans have normals, which pye57 leaves out."""
 
-    def make_buffers(self, field_names: Sequence[str], *given: Any, **options: Any) -> Any:
-        """Add the buffers of normals."""
-        return super().make_buffers([*field_names, *_FIELDS], *given, **options)
+    def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
+        """Return buffers with the fields of normals added."""
+        return super().make_buffers([*field_names, *_FIELDS], *arguments, **options)
 
 
 @contextmanager
 def _normal_fields() -> Iterator[None]:
     """Have pye57 write fields of normals."""
-    known = pye57.e57.SUPPORTED_POINT_FIELDS
+    supported = pye57.e57.SUPPORTED_POINT_FIELDS
     library = pye57.e57.libe57
 
     def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
@@ -82,24 +82,24 @@ def _normal_fields() -> Iterator[None]:
             prototype.set(field, node)
         return libe57.CompressedVectorNode(image_file, prototype, codecs)
 
-    pye57.e57.SUPPORTED_POINT_FIELDS = known | dict.fromkeys(_FIELDS, "f")
+    pye57.e57.SUPPORTED_POINT_FIELDS = supported | dict.fromkeys(_FIELDS, "f")
     pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
     try:
         yield
     finally:
-        pye57.e57.SUPPORTED_POINT_FIELDS = known
+        pye57.e57.SUPPORTED_POINT_FIELDS = supported
         pye57.e57.libe57 = library
 
 
 @contextmanager
 def _named_by(content: str) -> Iterator[None]:
-    """Derive the GUIDs of a file and its scans from a text: pye57 draws random ones."""
+    """Derive the GUIDs of a file and its scans from a text, where pye57 draws random GUIDs."""
     numbers = count()
-    drawn = pye57.e57.uuid
+    uuid_module = pye57.e57.uuid
     pye57.e57.uuid = SimpleNamespace(
         uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")
     )
     try:
         yield
     finally:
-        pye57.e57.uuid = drawn
+        pye57.e57.uuid = uuid_module

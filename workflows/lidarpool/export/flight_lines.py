@@ -13,26 +13,26 @@ from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
-_MAX_SOURCE = 65_535  # that the format holds
-# A flight line begins where the direction of flight has changed by so much, and then stays within
-# so much for so long.
+_MAX_SOURCE = 65_535  # largest number of a source in the format
+# A flight line begins where the direction of flight has changed by the first angle, and then stays
+# within the second angle for this time.
 _TURN_DEG = 20.0
 _STEADY_DEG = 5.0
 _STEADY_NS = 1e9
-_MIN_STEP_M = 1e-6  # of a carrier that moves: in 2 ms, or a sweep
-_LINES = 1 << 40  # numbers of lines of a station
+_MIN_STEP_M = 1e-6  # movement of a carrier in 2 ms, or a sweep, from which on it counts as moving
+_LINES = 1 << 40  # numbers reserved for the lines of a station
 
 
 @dataclass(frozen=True, eq=False)
 class LineFields:
-    """Fields of some points."""
+    """Fields of points that depend on mirrors and flight lines."""
 
     # (k,): degrees about the direction of flight from straight down, negative to the left.
     scan_angle_deg: Floats
     direction: Bytes  # (k,): 1 while a mirror sweeps from left to right, else 0
-    edge: Bools  # (k,): whether the pulse is the last of its line with a return
-    source: Ints  # (k,): number of flight line or station, and sensor, from 1; 0 if beyond
-    line: Ints  # (k,): different numbers for different lines of mirrors; -1 without a mirror
+    edge: Bools  # (k,): True if the pulse is the last of its line with a return
+    source: Ints  # (k,): number of flight line or station, and sensor, from 1; 0 if too large
+    line: Ints  # (k,): number of a mirror's line, unique in the survey; -1 without a mirror
 
     @classmethod
     def empty(cls, count: int) -> LineFields:
@@ -47,16 +47,16 @@ class LineFields:
 
 
 class FlightLines:
-    """Finds the fields of the points of a survey.
+    """Computes the line fields of the points of a survey.
 
-    The direction of flight is that in which the sensor moves, or the x axis of one that stands.
-    Sources are numbered by flight line or station, and with several sensors by sensor.
+    The direction of flight is the direction of the sensor's movement, or the x axis of a static
+    sensor. Sources are numbered by flight line or station, and with several sensors by sensor.
     """
 
     def __init__(self, sweeps: Sweeps) -> None:
         self.sweeps = sweeps
 
-    def of(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
+    def with_fields(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
         """Yield consecutive points with their fields.
 
         Points that are not in the order of their scans have no edges of lines.
@@ -72,16 +72,16 @@ class FlightLines:
                 continue
             fields = self._fields(chunk)
             if held is not None:
-                _, known = held
-                if known.line[-1] == fields.line[0]:  # the line goes on in this chunk
-                    known.edge[known.line == known.line[-1]] = False
+                _, held_fields = held
+                if held_fields.line[-1] == fields.line[0]:  # the line goes on in this chunk
+                    held_fields.edge[held_fields.line == held_fields.line[-1]] = False
                 yield held
             held = chunk, fields
         if held is not None:
             yield held
 
     def _fields(self, chunk: Cloud) -> LineFields:
-        """Return the fields of a chunk, whose end is taken for the end of a line."""
+        """Return the fields of a chunk, whose end counts as the end of a line."""
         fields = LineFields.empty(len(chunk))
         if not len(self.sweeps) or "scan" not in chunk.columns:
             return fields
@@ -95,18 +95,18 @@ class FlightLines:
         if (np.diff(sweep) < 0).any():
             return fields
         # Index of the last point of each line; a pulse has one time, or without times one ray.
-        ends = np.append(np.flatnonzero(np.diff(line)), len(line) - 1)
-        last = ends[np.searchsorted(ends, np.arange(len(line)))]
+        last_rows = np.append(np.flatnonzero(np.diff(line)), len(line) - 1)
+        last = last_rows[np.searchsorted(last_rows, np.arange(len(line)))]
         pulse = next((chunk[name] for name in ("time", "ray") if name in chunk.columns), None)
         same_pulse = np.arange(len(line)) == last if pulse is None else pulse == pulse[last]
         fields.edge[:] = (line >= 0) & same_pulse
         return fields
 
     def _fill(self, fields: LineFields, rows: Indices, sweep: int, points: Cloud) -> None:
-        """Fill in the fields of the points of a sweep, but for edges."""
+        """Fill in the fields of the points of a sweep, without edges."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
-        # As files hold them: parts and cloud.ply have other digits behind the precision.
+        # Rounded as in files: parts and cloud.ply have other digits behind the precision.
         exact = np.rint(points.positions.astype(np.float64) / sweeps.precision_m)
         exact *= sweeps.precision_m
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
@@ -131,7 +131,7 @@ class FlightLines:
 
     @cached_property
     def _directions(self) -> Floats:
-        """Level unit vectors (n, 3) of the direction of flight in each sweep."""
+        """Direction of flight in each sweep, level unit vectors (n, 3)."""
         axes = self.sweeps.pose.rotations[:, :, 0]
         knots = self.sweeps.knots
         moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
@@ -157,7 +157,7 @@ class FlightLines:
 
 
 def _level(moves: Floats, axes: Floats) -> Floats:
-    """Return level unit vectors (k, 3) along movements (k, 3), or along axes where these are none.
+    """Return level unit vectors (k, 3) along movements (k, 3), or along axes without a movement.
 
     `axes` are (k, 3) or (3,); where they point straight up or down, the direction is x.
     """
@@ -171,7 +171,7 @@ def _level(moves: Floats, axes: Floats) -> Floats:
 def _flight_lines(directions: Floats, begins_ns: Floats) -> Ints:
     """Return the flight line of each sweep (n,), from 0; `directions` (n, 3) are of unit length.
 
-    What a carrier measures in a turn belongs to the line before.
+    Sweeps in a turn of the carrier belong to the line before.
     """
     heading_deg = np.degrees(np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
     window = np.searchsorted(begins_ns, begins_ns + _STEADY_NS)

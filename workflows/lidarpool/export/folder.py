@@ -19,32 +19,34 @@ LAST_FILE = "report.json"  # a result with this file is complete
 
 
 def output_place(text: str | Path) -> Path | Storage:
-    """Place of a result: a folder, or storage for a URL."""
+    """Return the destination of a result: a folder, or storage for a URL."""
     return Storage.at(text) if is_url(text) else Path(text)
 
 
 @contextmanager
-def result_folder(place: Path | Storage) -> Iterator[Path]:
-    """Lock a folder for a result or export: made if missing, writable, exclusive.
+def result_folder(output: Path | Storage) -> Iterator[Path]:
+    """Lock a folder for a result or export: created if missing, writable, exclusive.
 
     Leftovers of a killed run or export are removed; and, if the body ends without leaving files,
-    folders that were made for it. For storage it is a temporary folder, whose files the caller
+    folders that were created for it. For storage it is a temporary folder, whose files the caller
     puts into the storage.
 
     Raises
     ------
     LidarError
-        If it is a file, cannot be made or written to, or another run or export uses it.
+        If it is a file, cannot be created or written to, or another run or export uses it.
     """
-    if isinstance(place, Storage):
-        place.claim()
-        with local_folder(place) as folder:
+    if isinstance(output, Storage):
+        output.claim()
+        with local_folder(output) as folder:
             yield folder
         return
-    folder = place
+    folder = output
     if folder.exists() and not folder.is_dir():
         raise LidarError(f"{folder} is a file: give a folder with --out.")
-    made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
+    missing_folders = [
+        path for path in (folder, *folder.parents) if not path.exists()
+    ]  # innermost first
     with explained(f"Cannot write to the folder {folder}", "give another with --out"):
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -59,81 +61,81 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
     try:
         yield folder
     finally:
-        for path in made:
+        for path in missing_folders:
             if path.exists() and not any(path.iterdir()):
                 path.rmdir()
         os.close(lock)
 
 
 @contextmanager
-def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
-    """Yield the folder of a result: from storage, a temporary copy of some of its files.
+def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
+    """Yield the folder of a result: for storage, a temporary copy of the files `names`.
 
     LidarError if the storage cannot be read, or has no complete result.
     """
-    with local_folder(place) as folder:
-        if not isinstance(place, Storage):
+    with local_folder(output) as folder:
+        if not isinstance(output, Storage):
             yield folder
             return
-        with explained(f"{place.url} cannot be read"):
-            there = place.sizes()
-            if LAST_FILE not in there:
+        with explained(f"{output.url} cannot be read"):
+            sizes = output.sizes()
+            if LAST_FILE not in sizes:
                 raise LidarError(
-                    f"{place.url} has no complete result, which has a {LAST_FILE}: give the URL of "
-                    "a finished run (its --out); lidarpool run --resume continues an unfinished "
+                    f"{output.url} has no complete result, which has a {LAST_FILE}: give the URL "
+                    "of a finished run (its --out); lidarpool run --resume continues an unfinished "
                     "one."
                 )
             for name in (*names, LAST_FILE):
-                if name in there:
-                    place.get(name, folder / name)
+                if name in sizes:
+                    output.get(name, folder / name)
         yield folder
 
 
-def send(path: Path, place: Path | Storage) -> str:
-    """Copy a file or folder of `result_folder` into its storage, if the place is one.
+def send(path: Path, output: Path | Storage) -> str:
+    """Copy a file or folder of `result_folder` to storage, unless the destination is local.
 
-    What the storage has of that name is replaced. Returns the path or URL, for messages.
+    Files of that name in the storage are replaced. Returns the path or URL, for messages.
     LidarError if the storage cannot be written to.
     """
-    if not isinstance(place, Storage):
+    if not isinstance(output, Storage):
         return str(path)
-    url = place.path(path.name)
+    url = output.path(path.name)
     with explained(f"{url} cannot be written"):
-        place.discard(path.name)
-        place.put(path, path.name)
+        output.discard(path.name)
+        output.put(path, path.name)
     return url
 
 
 @contextmanager
-def local_folder(place: Path | Storage) -> Iterator[Path]:
-    """Give a folder itself, and for storage a temporary one with the last name of its URL."""
-    if not isinstance(place, Storage):
-        yield place
+def local_folder(output: Path | Storage) -> Iterator[Path]:
+    """Yield a folder itself; for storage a temporary folder with the last name of its URL."""
+    if not isinstance(output, Storage):
+        yield output
         return
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
-        folder = Path(temporary, place.url.rpartition("/")[2])
+        folder = Path(temporary, output.url.rpartition("/")[2])
         folder.mkdir()
         yield folder
 
 
 @contextmanager
-def staging(folder: Path, place: object = None) -> Iterator[Path]:
-    """Temporary folder in a folder, for what is moved into place once it is whole.
+def staging(folder: Path, shown: object = None) -> Iterator[Path]:
+    """Temporary folder in a folder, for files that are moved into place once they are complete.
 
-    Errors name `place`, by default `folder`, in its stead.
+    Errors name `shown`, by default `folder`, instead of the temporary folder.
     """
     staged = folder / f"{WRITING}{secrets.token_hex(4)}"
     try:
         staged.mkdir()
         yield staged
     except LidarError as error:
-        raise LidarError(str(error).replace(str(staged), str(place or folder))) from error
+        raise LidarError(str(error).replace(str(staged), str(shown or folder))) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 
 
 def _lock(folder: Path) -> int:
-    """Lock a folder until the handle that is returned is closed, or this process ends."""
+    """Lock a folder until the returned handle is closed, or this process ends."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,7 +1,7 @@
-"""The table of formats: what writes and reads each, and what it needs; one row a format.
+"""The table of formats: modules that write and read each, and its requirements; a row a format.
 
-It is quick to import: help and completion of the command read it. Other packages add formats as
-plug-ins of the group `GROUP`, whose names are those of the formats.
+It is quick to import: help and completion of the command read it. Packages add formats as plug-ins
+of the group `GROUP`, whose names are the names of the formats.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GROUP = "lidarpool.clouds"
 
 @dataclass(frozen=True)
 class FormatRow:
-    """A format of clouds: its module, its files, and what it needs and holds.
+    """A format of clouds: its module and files, required and supported columns.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ class FormatRow:
         single sweeps of data sets.
     write
         Name of the function of the module that writes it, `write(path, cloud, sweeps)`, or with
-        `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which says what is in which
-        file.
+        `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which defines the content of
+        each file.
     in_pieces
         Whether it has many files, which workers can write.
     packages
@@ -45,9 +45,9 @@ class FormatRow:
     holds
         Columns that it can hold; None for all.
     named
-        Columns that it holds beside those if classes have names.
+        Columns that it holds in addition if classes have names.
     layouts
-        {layout: columns that it needs and holds beside those}, where there are layouts. The
+        {layout: columns that it needs and holds in addition}, where there are layouts. The
         function that writes it then takes `layout` and `compensated` as well.
     raw_or_compensated
         Whether it has an option for points at the start of the sweep.
@@ -58,15 +58,15 @@ class FormatRow:
     laser_scans
         Whether it has a LaserScan of 2D scanners.
     inside
-        Of a folder: pattern of the names of its files.
+        Pattern of the names of the files in its folder.
     data_set
-        Name of the data sets whose jobs are written in it; empty if there are none, as of plug-ins.
+        Name of the data sets whose jobs are written in it; empty without data sets, as of plug-ins.
     of_job
-        There: path of a job's file or folder, if it has one, by `Entry`.
+        In data sets: path of a job's file or folder, if it has one, by `Entry`.
     boxes
-        There: whether its pieces are sweeps, and each comes with its boxes of actors.
+        In data sets: whether its pieces are sweeps, and each comes with its boxes of actors.
     raw
-        There: whether a sweep has files of its own, which hold rows of numbers.
+        In data sets: whether a sweep has files of its own, which hold rows of numbers.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -94,7 +94,7 @@ class FormatRow:
 
     @property
     def missing_packages(self) -> list[str]:
-        """The packages that write it and are not installed here."""
+        """Packages that write the format and are not installed in this environment."""
         return [package for package in self.packages if find_spec(package) is None]
 
     def provides(self, name: str) -> Any:
@@ -103,7 +103,7 @@ class FormatRow:
         Raises
         ------
         LidarError
-            If it is that of a plug-in and cannot be imported, or lacks the name.
+            If the module is of a plug-in and cannot be imported, or lacks the name.
         """
         if self.plugin is None:
             return getattr(import_module(self.module), name)
@@ -271,7 +271,7 @@ def row_of(name: str) -> FormatRow:
     Raises
     ------
     LidarError
-        If there is none of that name, or its plug-in cannot be used.
+        If there is no format of that name, or its plug-in cannot be used.
     """
     return FORMATS[name] if name in FORMATS else _row_of_plugin(name)
 
@@ -291,7 +291,7 @@ def _row_of_plugin(name: str) -> FormatRow:
             f"{plugin} has data sets, {row.data_set!r}, which plug-ins cannot have: leave out "
             "data_set."
         )
-    if "/" in row.file or row.file in [known.file for known in FORMATS.values()]:
+    if "/" in row.file or row.file in [built_in.file for built_in in FORMATS.values()]:
         raise LidarError(
             f"{plugin} writes {row.file!r}: name a file or folder that no other format has, and no "
             "folder above it."
@@ -300,7 +300,7 @@ def _row_of_plugin(name: str) -> FormatRow:
 
 
 def plugin_rows(files: Collection[str]) -> list[FormatRow]:
-    """Return the rows of plug-ins whose file or folder is among some names.
+    """Return the rows of plug-ins whose file or folder is in `files`.
 
     Plug-ins that cannot be used are left out.
     """
@@ -312,7 +312,7 @@ def plugin_rows(files: Collection[str]) -> list[FormatRow]:
 
 
 def check_whole(needs: Iterable[str], keep_every: int) -> None:
-    """Refuse to thin out the returns for a format that shows which rays had none."""
+    """Raise LidarError if returns are thinned out for a format of range images."""
     if "ray" in needs and keep_every > 1:
         raise LidarError(
             f"Range images need every return, and keep_every is {keep_every}: set cloud.keep_every "

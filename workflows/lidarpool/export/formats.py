@@ -58,8 +58,8 @@ class Format:
             )
 
     @classmethod
-    def of(cls, entry: str | Mapping[str, Any]) -> Format:
-        """Return what an entry of a scenario's `output.write` names."""
+    def from_entry(cls, entry: str | Mapping[str, Any]) -> Format:
+        """Return the format of an entry of a scenario's `output.write`."""
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
@@ -83,24 +83,24 @@ class Format:
         return self.row.needs + self._laid_out
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
-        """Names of the cloud's columns that it cannot hold."""
-        held = self.row.holds
-        there = (column.name for column in cloud.table)
-        more = self._laid_out + (self.row.named if sweeps.classes else ())
+        """Return the names of the cloud's columns that the format cannot hold."""
+        held_columns = self.row.holds
+        names = (column.name for column in cloud.table)
+        optional_columns = self._laid_out + (self.row.named if sweeps.classes else ())
         if self.row.laser_scans and has_laser_scans(sweeps):
-            more += LASER_SCAN_COLUMNS
-        if held is None:
-            return [name for name in there if name == "time" and self.compensated]
-        return [name for name in there if name not in held + more]
+            optional_columns += LASER_SCAN_COLUMNS
+        if held_columns is None:
+            return [name for name in names if name == "time" and self.compensated]
+        return [name for name in names if name not in held_columns + optional_columns]
 
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
-        """Return a note for the user on the cloud in this format, or none."""
-        left = ", ".join(self.left_out(cloud, sweeps))
-        notes = [f"{self.format} does not hold {left}"] if left else []
+        """Return notes for the user on the cloud in this format."""
+        left_out = ", ".join(self.left_out(cloud, sweeps))
+        notes = [f"{self.format} does not hold {left_out}"] if left_out else []
         return [*notes, *self.contradictions(sweeps.coordinates)]
 
     def contradictions(self, coordinates: str) -> list[str]:
-        """Return a note if the cloud's coordinates are not what readers of the format expect."""
+        """Return a note if readers of the format expect different coordinates than the cloud's."""
         if coordinates != "sensor":
             return []
         if self.row.one_system:
@@ -117,11 +117,11 @@ class Format:
 
     @property
     def installed(self) -> bool:
-        """Whether the packages that write it are installed here."""
+        """True if the packages that write the format are installed in this environment."""
         return not self.row.missing_packages
 
     def check_installed(self) -> None:
-        """Check that it can be written here; LidarError if a package is missing."""
+        """Raise LidarError if a package that writes the format is missing in this environment."""
         if missing := self.row.missing_packages:
             extra = f'"lidarpool[{self.row.extra}]"' if self.row.extra else " ".join(missing)
             raise LidarError(
@@ -131,7 +131,7 @@ class Format:
             self.row.provides(self.row.write)
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
-        """Check the needs of `write` before anything is written, or raise LidarError."""
+        """Raise LidarError unless all requirements of `write` are met, before a file is written."""
         self.check_installed()
         if not path.parent.is_dir():
             raise LidarError(f"The folder {path.parent} does not exist: make it first.")
@@ -142,9 +142,9 @@ class Format:
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
-        """Check that a cloud has the columns that the format needs, or raise LidarError."""
-        there = {column.name for column in cloud.table}
-        if missing := [name for name in self.needs if name not in there]:
+        """Raise LidarError if a cloud lacks columns that the format needs."""
+        cloud_columns = {column.name for column in cloud.table}
+        if missing := [name for name in self.needs if name not in cloud_columns]:
             laid_out = f"with the layout {self.layout} " if self.row.layouts else ""
             lacks = ", ".join(missing)
             raise LidarError(
@@ -164,60 +164,60 @@ class Format:
     ) -> None:
         """Write a cloud to a file or folder completely, or not at all.
 
-        Points are read in order a piece at a time. Workers write a format of many files, as far as
+        Points are read in order, a chunk at a time. Workers write a multi-file format, as far as
         they see its folder.
 
         Raises
         ------
         LidarError
-            If a package or column is missing, if something is there, or if it cannot be written.
+            If a package or column is missing, the file exists, or it cannot be written.
         """
-        more: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         if self.row.layouts:
-            more = {"layout": self.layout, "compensated": self.compensated}
+            options = {"layout": self.layout, "compensated": self.compensated}
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
-            with staging(path.parent) as beside:
-                staged = beside / path.name  # bags contain the name of their file
+            with staging(path.parent) as staging_folder:
+                staged = staging_folder / path.name  # bags contain the name of their file
                 if self.row.in_pieces:
-                    place = Storage(str(staged), durable=False)
-                    self._range_writer(cloud, sweeps, place).write(workers)
+                    storage = Storage(str(staged), durable=False)
+                    self._range_writer(cloud, sweeps, storage).write(workers)
                 else:
                     write = self.row.provides(self.row.write)
-                    write(staged, cloud, sweeps, **more)
+                    write(staged, cloud, sweeps, **options)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     Storage.at(path.parent).discard(path.name)
                 staged.replace(path)
                 flush(path.parent)
 
-    def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, place: Storage) -> RangeWriter:
-        return RangeWriter(self.format, cloud, sweeps, place, self.compensated)
+    def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, storage: Storage) -> RangeWriter:
+        return RangeWriter(self.format, cloud, sweeps, storage, self.compensated)
 
-    def put(
+    def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
-        """Have workers write a format of many files into a storage; LidarError leaves none."""
-        place = Storage(storage.path(self.row.file))
-        with explained(f"{place} cannot be written"):
+        """Write a multi-file format into a storage through workers; LidarError leaves no file."""
+        folder = Storage(storage.path(self.row.file))
+        with explained(f"{folder} cannot be written"):
             try:
-                self._range_writer(cloud, sweeps, place).write(workers)
+                self._range_writer(cloud, sweeps, folder).write(workers)
             except BaseException:
                 with suppress(OSError):
                     storage.discard(self.row.file)
                 raise
 
 
-def refuse_strangers(place: Storage, rows: Iterable[FormatRow]) -> None:
-    """Refuse to replace those folders of some formats that hold files of others."""
+def refuse_strangers(storage: Storage, rows: Iterable[FormatRow]) -> None:
+    """Raise LidarError if folders of formats, which would be replaced, hold foreign files."""
     for row in rows:
         if not row.inside:
             continue
-        own = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
-        for name in place.tree(row.file):
-            if not own.fullmatch(name):
+        own_names = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
+        for name in storage.tree(row.file):
+            if not own_names.fullmatch(name):
                 raise LidarError(
-                    f"{place.path(name)} is not a file of lidarpool, and {row.file} would be "
+                    f"{storage.path(name)} is not a file of lidarpool, and {row.file} would be "
                     "replaced: move it elsewhere, or give another folder with --out."
                 )
 
@@ -274,16 +274,16 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
-    one = Format(name, layout, compensated)
+    file_format = Format(name, layout, compensated)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):
         if path.is_dir():
             raise LidarError(f"{path} is a folder: remove it, or give another path.")
-    if cloud.sweeps is None and "scan" in one.needs:
+    if cloud.sweeps is None and "scan" in file_format.needs:
         raise LidarError(
             f"{name} stores single sweeps, but this cloud has none: save the cloud of a "
             "Result, or one that was read from the folder of a result."
         )
-    one.write(path, cloud, sweeps, overwrite=True)
-    return one.left_out(cloud, sweeps)
+    file_format.write(path, cloud, sweeps, overwrite=True)
+    return file_format.left_out(cloud, sweeps)

@@ -19,7 +19,7 @@ from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Data, Entry, as_data
 
-INSTANCES_MOST = 65_535
+MAX_INSTANCES = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -28,23 +28,23 @@ _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 class Pieces(pieces.Pieces):
     """A sequence for each sensor: `sequences/00`, `01`, ...
 
-    In a data set the first sensor of job 7 has `sequences/07`, others `07_NAME`.
+    In a data set the first sensor of job 7 has `sequences/07`, further sensors `07_NAME`.
 
-    In each are `velodyne/000000.bin` (float32 x, y, z in the sensor's axes when the sweep began,
-    and reflectivity by 255, 0 to 1), `labels/000000.label` (uint32: instance << 16 | class; the
-    instance is the object's number + 1), where there are actors `label_2/000000.txt` (boxes of
-    those that have points), `poses.txt` (3 x 4, from the first), `times.txt` in seconds and
-    `calib.txt`. Poses and boxes are in axes of a camera as KITTI's are, which sits where the sensor
-    does; `Tr` leads to them.
-    The camera is level where the sensor is tilted, in the mean over its sweeps, because KITTI turns
-    boxes about its vertical axis alone. KITTI's own tools look for the poses in `poses/00.txt`.
+    In each are `velodyne/000000.bin` (float32 x, y, z in the sensor frame at the start of the
+    sweep, and reflectivity by 255, 0 to 1), `labels/000000.label` (uint32: instance << 16 | class;
+    the instance is the object's number + 1), where there are actors `label_2/000000.txt` (boxes of
+    the actors that have points), `poses.txt` (3 x 4, from the first), `times.txt` in seconds and
+    `calib.txt`. Poses and boxes are in the frame of a camera as KITTI's, at the position of the
+    sensor; `Tr` leads to this frame. The camera is level where the sensor is tilted, in the mean
+    over its sweeps, because KITTI turns boxes about its vertical axis alone. KITTI's own tools look
+    for the poses in `poses/00.txt`.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
-        if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
-            raise LidarError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
+        if len(sweeps.objects) + len(sweeps.actors) > MAX_INSTANCES:
+            raise LidarError(f"KITTI labels hold {MAX_INSTANCES:,} objects at most.")
         super().__init__(cloud, sweeps, entry)
         self.names = _names(sweeps, entry)
         self.sequences = [f"sequences/{name}" for name in self.names]
@@ -67,26 +67,27 @@ class Pieces(pieces.Pieces):
         }
         if not sweeps.actors:
             return files, None
-        boxes = Boxes.of(sweeps, number, points)
+        boxes = Boxes.from_points(sweeps, number, points)
         camera = self.cameras[sweeps.sensor[number]]
         files[f"{folder}/label_2/{name}.txt"] = _labels(sweeps, number, boxes, camera).encode()
         return files, boxes
 
-    def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
+    def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
         """Return poses, times and calibrations."""
         sweeps = self.sweeps
         files: dict[str, bytes] = {}
         for sensor, (folder, camera) in enumerate(zip(self.sequences, self.cameras, strict=True)):
-            own = sweeps.sensor == sensor
-            turns = matrices(sweeps.pose.quaternions[own])
-            places = sweeps.pose.positions[own]
-            first = camera @ turns[0].T
+            sweep_mask = sweeps.sensor == sensor
+            rotations = matrices(sweeps.pose.quaternions[sweep_mask])
+            positions = sweeps.pose.positions[sweep_mask]
+            first = camera @ rotations[0].T
             rows = np.concatenate(
-                [first @ turns @ camera.T, ((places - places[0]) @ first.T)[..., None]], axis=2
+                [first @ rotations @ camera.T, ((positions - positions[0]) @ first.T)[..., None]],
+                axis=2,
             )
             poses = _table(rows.reshape(-1, 12))
             files |= {f"{folder}/poses.txt": poses, f"poses/{self.names[sensor]}.txt": poses}
-            files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
+            files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[sweep_mask] / 1e9)
             lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
             files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
         if sweeps.classes and self.entry is None:  # else all jobs share a file
@@ -95,7 +96,7 @@ class Pieces(pieces.Pieces):
 
 
 def intensity_of(points: Cloud) -> Floats32:
-    """Return what KITTI calls intensity (n,): reflectivity from 0 to 1, whatever the range."""
+    """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
@@ -124,19 +125,19 @@ class Reader(reading.Reader):
 
 
 def labels_file(classes: Mapping[int, str]) -> bytes:
-    """Return names of classes, and colours (blue, green, red), as semantic-kitti-api reads them."""
+    """Return the names of classes, and colours (blue, green, red), for semantic-kitti-api."""
     labels = {0: "unlabeled", **classes}
     colours = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
     return yaml.safe_dump({"labels": labels, "color_map": colours}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
-    """Names of the sequences of all sensors."""
+    """Return the names of the sequences of all sensors."""
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
     first = f"{entry.number:02}"
-    others = plain_names(name or "lidar" for name in sweeps.sensors)[1:]
-    return [first, *(f"{first}_{name}" for name in others)]
+    names = plain_names(name or "lidar" for name in sweeps.sensors)[1:]
+    return [first, *(f"{first}_{name}" for name in names)]
 
 
 def _table(rows: Floats) -> bytes:
@@ -145,37 +146,48 @@ def _table(rows: Floats) -> bytes:
     return memory.getvalue()
 
 
-def _row(turn: Floats) -> str:
-    """Write a rotation as a 3 x 4 matrix."""
-    return " ".join(f"{value:.9e}" for value in np.column_stack([turn, np.zeros(3)]).ravel())
+def _row(rotation: Floats) -> str:
+    """Return a rotation (3, 3) as a 3 x 4 matrix in words."""
+    return " ".join(f"{value:.9e}" for value in np.column_stack([rotation, np.zeros(3)]).ravel())
 
 
 def _camera(sweeps: Sweeps, sensor: int) -> Floats:
-    """Rotation (3, 3) from a sensor's axes to those of a level camera that looks where it does."""
+    """Return the rotation (3, 3) from a sensor's frame to a level camera with the same heading."""
     up = matrices(sweeps.pose.quaternions[sweeps.sensor == sensor])[:, 2].sum(axis=0)
-    left = np.cross(up, [1, 0, 0])
-    if not left.any():  # it looks straight up or down, or turned over
+    leftward = np.cross(up, [1, 0, 0])
+    if not leftward.any():  # the sensor looks straight up or down, or is upside down
         return _CAMERA
-    axes = np.stack([np.cross(left, up), left, up])
+    axes = np.stack([np.cross(leftward, up), leftward, up])
     return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))
 
 
 def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
-    """Lines of label_2, without a picture; truncation and occlusion are not computed.
+    """Return the lines of label_2, without a picture; truncation and occlusion are not computed.
 
-    The place is the middle of the underside; boxes are turned about the camera's y alone.
+    The position is the middle of the underside; boxes are turned about the camera's y alone.
     """
-    turn = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
-    ahead = (turn @ matrices(boxes.quaternions))[:, :, 0]  # of the actors
-    places = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
-    places[:, 1] += boxes.sizes[:, 2] / 2
-    around = np.arctan2(-ahead[:, 2], ahead[:, 0])
-    seen = around - np.arctan2(places[:, 0], places[:, 2])
-    seen = np.angle(np.exp(1j * seen))  # between -pi and pi
+    rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
+    forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # of the actors
+    positions = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
+    positions[:, 1] += boxes.sizes[:, 2] / 2
+    rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
+    alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])
+    alpha = np.angle(np.exp(1j * alpha))  # between -pi and pi
     lines = []
     for actor in np.flatnonzero(boxes.points):
         length, width, height = boxes.sizes[actor]
-        values = (seen[actor], 0, 0, 0, 0, height, width, length, *places[actor], around[actor])
+        values = (
+            alpha[actor],
+            0,
+            0,
+            0,
+            0,
+            height,
+            width,
+            length,
+            *positions[actor],
+            rotation_y[actor],
+        )
         numbers = " ".join(f"{value:.4f}" for value in values)
         lines.append(f"{sweeps.actor_types[actor]} 0.00 3 {numbers}\n")
     return "".join(lines)

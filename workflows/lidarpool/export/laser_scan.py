@@ -14,13 +14,13 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from .images import Image
 
-COLUMNS = "ray", "range"  # that a LaserScan needs, and every return
+COLUMNS = "ray", "range"  # columns that a LaserScan needs, with every return
 _BAGS = frozenset({"mcap", "rosbag2"})
-_UNEVEN = 1e-6  # radians by which steps between rays may differ
+_MAX_STEP_DIFFERENCE = 1e-6  # radians by which steps between rays may differ
 
 
 def is_planar(sensor: Sensor) -> bool:
-    """Whether a sensor is a 2D scanner: one beam, which turns in the plane of its x and y axes.
+    """Return True if a sensor is a 2D scanner: a beam that turns in the plane of x and y.
 
     Its rays start at its centre, and follow each other in even steps.
     """
@@ -33,9 +33,10 @@ def is_planar(sensor: Sensor) -> bool:
 
 
 def with_laser_scans(survey: Survey, formats: Collection[str]) -> Survey:
-    """Return a survey with the columns of LaserScan messages, if bags of it have such messages.
+    """Return a survey with the columns of LaserScan messages, if its bags have such messages.
 
-    `formats` are those that its cloud is written in. Surveys that thin out returns have none.
+    `formats` are the formats that its cloud is written in. Surveys that thin out returns have no
+    such messages.
     """
     if _BAGS.isdisjoint(formats) or survey.keep_every > 1 or not has_planar_sensors(survey):
         return survey
@@ -43,20 +44,20 @@ def with_laser_scans(survey: Survey, formats: Collection[str]) -> Survey:
 
 
 def has_planar_sensors(survey: Survey) -> bool:
-    """Whether a survey has 2D scanners."""
+    """Return True if a survey has 2D scanners."""
     return any(is_planar(carried.sensor) for carried in survey.carried)
 
 
 def has_laser_scans(sweeps: Sweeps) -> bool:
-    """Whether bags of a survey have LaserScan messages, if its cloud has ranges."""
+    """Return True if bags of a survey have LaserScan messages, provided its cloud has ranges."""
     return sweeps.fired is not None and any(map(is_planar, sweeps.fired.sensors))
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRays:
-    """The rays of a sweep of a 2D scanner, as LaserScan has them."""
+    """The rays of a sweep of a 2D scanner, with the fields of a LaserScan."""
 
-    angles: Floats  # (n,): first, last and step make those of the message; radians, continuous
+    angles: Floats  # (n,): radians, continuous, in even steps
     time_increment_s: float  # between rays
     scan_time_s: float  # between sweeps
     range_limits_m: tuple[float, float]
@@ -64,28 +65,28 @@ class ScanRays:
     intensities: Floats32  # (n,): of the first return; 0 where there is none
 
     @classmethod
-    def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> ScanRays | None:
-        """Return the rays of a sweep; None if its sensor is no 2D scanner, or rays are unknown."""
+    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> ScanRays | None:
+        """Return the rays of a sweep, or None without a 2D scanner or with unknown rays."""
         fired = sweeps.fired
         if fired is None or "range" not in points.columns:
             return None
         sensor = fired.sensors[sweeps.sensor[sweep]]
         if not is_planar(sensor):
             return None
-        image = Image.of(sweeps, sweep, points)
+        image = Image.from_points(sweeps, sweep, points)
         x, y, _ = sensor.directions(image.firings)[:, 0].T
         angles = np.unwrap(np.arctan2(y, x))
         steps = np.diff(angles)
-        if len(steps) == 0 or np.ptp(steps) > _UNEVEN:
+        if len(steps) == 0 or np.ptp(steps) > _MAX_STEP_DIFFERENCE:
             return None
         begins_ns = sensor.begins_ns(image.firings)
         time_increment_s = float(begins_ns[-1] - begins_ns[0]) / len(steps) / 1e9
         rate_hz = getattr(sensor.head, "rate_hz", None)
         ranges = image.filled(points["range"].astype(np.float32))[0, 0]
-        light = points.columns.get("intensity", points.columns.get("signal"))
+        intensity = points.columns.get("intensity", points.columns.get("signal"))
         intensities = np.zeros(len(ranges), np.float32)
-        if light is not None:
-            intensities = np.nan_to_num(image.filled(light.astype(np.float32))[0, 0])
+        if intensity is not None:
+            intensities = np.nan_to_num(image.filled(intensity.astype(np.float32))[0, 0])
         return cls(
             angles,
             time_increment_s,

@@ -22,28 +22,32 @@ _IMU = (
     *(f"angular_velocity_{axis}_rad_s" for axis in "xyz"),
     *(f"specific_force_{axis}_m_s2" for axis in "xyz"),
 )
-_PLACE = ("time_ns", "x_m", "y_m", "z_m")
+_POSITION = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
-# of a sample, at most: in its file, and in a bag
-_ROW_BYTES = 120
-_MESSAGE_BYTES = 500
+# Largest sizes of a sample.
+_ROW_BYTES = 120  # in its file
+_MESSAGE_BYTES = 500  # in a bag
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:
-    """Disk that the files of a survey's instruments need at most, with so many bags."""
+    """Return the largest size of a survey's instrument files and their bags, in bytes."""
     navigation = survey.navigation
     if navigation is None:
         return 0
-    rates = [one.rate_hz for one in (navigation.imu, navigation.gnss) if one is not None]
+    rates = [
+        instrument.rate_hz
+        for instrument in (navigation.imu, navigation.gnss)
+        if instrument is not None
+    ]
     samples = sum(rates) * survey.duration_ns / 1e9
     return int(samples * (_ROW_BYTES + bags * _MESSAGE_BYTES))
 
 
 def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
-    """Write the files of a survey's instruments, so many samples at a time.
+    """Write the files of a survey's instruments, a block of samples at a time.
 
-    `origin` is that of the scene, (3,). OSError if one cannot be written.
+    `origin` is the origin of the scene, (3,). OSError if a file cannot be written.
     """
     instruments = Instruments.from_survey(survey)
     for name in () if instruments is None else instruments.files:
@@ -62,32 +66,32 @@ def _imu_lines(survey: Survey) -> Iterator[str]:
 
 def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
     to_geodetic = _to_geodetic(survey)
-    yield ",".join(_PLACE if to_geodetic is None else (*_PLACE, *_GEODETIC)) + "\n"
+    yield ",".join(_POSITION if to_geodetic is None else (*_POSITION, *_GEODETIC)) + "\n"
     form = "%d" + ",%.4f" * 3
     form += ("" if to_geodetic is None else ",%.9f,%.9f,%.4f") + "\n"
     for times, positions in fixes(survey):
-        places = positions + origin
-        columns = [*places.T, *(() if to_geodetic is None else to_geodetic(places).T)]
+        world = positions + origin
+        columns = [*world.T, *(() if to_geodetic is None else to_geodetic(world).T)]
         rows = zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
         yield "".join(form % row for row in rows)
 
 
 def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
-    """Return what makes latitudes, longitudes and heights of world coordinates, if they are known.
+    """Return a function from world coordinates to latitude, longitude and height, or None.
 
-    Heights are taken for ellipsoidal ones.
+    Heights are taken for ellipsoidal heights.
     """
     gnss = survey.navigation and survey.navigation.gnss
     if gnss and gnss.origin is not None:
-        at = gnss.origin
-        return lambda places: geodetic(places, at)
+        origin = gnss.origin
+        return lambda world: geodetic(world, origin)
     if survey.epsg is None:
         return None
     transform = import_module("rasterio.warp").transform
     system = f"EPSG:{survey.epsg}"
 
-    def by_code(places: Floats) -> Floats:
-        x, y, z = places.T
+    def by_code(world: Floats) -> Floats:
+        x, y, z = world.T
         longitude, latitude = transform(system, "EPSG:4326", x.tolist(), y.tolist())
         return np.column_stack([latitude, longitude, z])
 

@@ -38,14 +38,15 @@ _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of 
 
 
 class Pieces(pieces.Pieces):
-    """A data set: `NuScenes("v1.0-lidarpool", path)` of nuscenes-devkit opens it.
+    """A data set that nuscenes-devkit opens with `NuScenes("v1.0-lidarpool", path)`.
 
-    Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor's axes when it
-    began, intensity (0 to 255), ring. NAME is that of the sensor, LIDAR_TOP where it has none. The
-    first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
-    sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
-    sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean time of
-    their points in its key frames. Classes with names, below 256, are labels of nuScenes-lidarseg.
+    Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor frame at the start of
+    the sweep, intensity (0 to 255), ring. NAME is the name of the sensor, or LIDAR_TOP without a
+    name. The first sensor's sweeps are the samples; of another sensor, the first sweep that begins
+    in a sample is its key frame, and further sweeps are in `sweeps/NAME`. The ego vehicle's pose is
+    the sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean
+    time of their points in its key frames. Classes with names, below 256, are labels of
+    nuScenes-lidarseg.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -66,46 +67,46 @@ class Pieces(pieces.Pieces):
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
         inside = self.sweeps.compensated(number, points)
-        light = np.clip(points["intensity"], 0, 1) * 255
+        intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3] = inside
-        rows[:, 3] = light
+        rows[:, 3] = intensity
         rows[:, 4] = points["channel"]
         files = {self.names[number]: as_data(rows)}
         if self.labels:
             named = np.isin(points["class"], [n for n in self.sweeps.classes if n < 256])
             labels = np.where(named, points["class"], 0).astype("u1")
             files[self.labels[number]] = as_data(labels)
-        return files, Boxes.of(self.sweeps, number, points)
+        return files, Boxes.from_points(self.sweeps, number, points)
 
-    def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
+    def shared_files(self, boxes: Sequence[Boxes]) -> dict[str, bytes]:
         """Return the tables of a survey by itself, and its map."""
         if self.entry is not None:
             return {}
         files = {
             f"{VERSION}/{name}.json": json.dumps(rows, indent=1).encode()
-            for name, rows in self._tables(made).items()
+            for name, rows in self._tables(boxes).items()
         }
         return files | {_MAP: _no_map()}
 
-    def summary(self, made: Sequence[Boxes]) -> dict[str, Any]:
+    def summary(self, boxes: Sequence[Boxes]) -> dict[str, Any]:
         """Return the tables of a job, for `merge`."""
-        return {"tables": self._tables(made)}
+        return {"tables": self._tables(boxes)}
 
-    def _tables(self, made: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
+    def _tables(self, boxes: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
         tables = _Tables(self.sweeps, self.entry)
         tables.add_frames(self.channels, self.sample, self.names)
         keys: list[list[Boxes]] = [[] for _ in range(int((self.sweeps.sensor == 0).sum()))]
         for sweep in np.flatnonzero(self.first):
-            keys[self.sample[sweep]].append(made[int(sweep)])
+            keys[self.sample[sweep]].append(boxes[int(sweep)])
         tables.add_actors(keys)
         if self.labels:
             tokens = [row["token"] for row in tables.rows["sample_data"]]
             tables.rows["lidarseg"] = [
-                {"token": one, "sample_data_token": one, "filename": file}
-                for one, file in zip(tokens, self.labels, strict=True)
+                {"token": token, "sample_data_token": token, "filename": file}
+                for token, file in zip(tokens, self.labels, strict=True)
             ]
-        if self.labels and self.entry is None:  # else `merge` knows all
+        if self.labels and self.entry is None:  # `merge` adds the classes of all jobs
             tables.rows["category"] = _categories(tables.rows["category"], self.sweeps.classes)
         return tables.rows
 
@@ -127,23 +128,23 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         file, *labels = self.files(sweep)
         rows = self.rows(file, np.dtype("<f4")).reshape(-1, 5)
-        light, channel = np.ascontiguousarray(rows[:, 3:].T)
-        light /= 255
-        columns = {"intensity": light, "channel": channel.astype("u2")}
+        intensity, channel = np.ascontiguousarray(rows[:, 3:].T)
+        intensity /= 255
+        columns = {"intensity": intensity, "channel": channel.astype("u2")}
         if labels:
             columns["class"] = self.rows(labels[0], np.dtype("u1"), len(rows)).astype("u2")
         return rows[:, :3], columns
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
-    """Sample of each sweep, and whether the sweep is its sensor's first in that."""
-    begins = sweeps.begins_ns[sweeps.sensor == 0]
-    sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
+    """Return the sample of each sweep, and whether the sweep is its sensor's first in there."""
+    sample_starts = sweeps.begins_ns[sweeps.sensor == 0]
+    sample = np.clip(np.searchsorted(sample_starts, sweeps.begins_ns, "right") - 1, 0, None)
     return sample, np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
 
 
 def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry | None) -> list[str]:
-    """Names of the files of all sweeps."""
+    """Return the names of the files of all sweeps."""
     below = "" if entry is None else f"{entry.name}/"
     return [
         f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
@@ -152,24 +153,24 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
 
 
 def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Rows of all classes and of kinds of actors, numbered without gaps as lidarseg needs it."""
-    known = {row["name"]: row for row in kinds}
+    """Return rows of all classes and types of actors, numbered without gaps for lidarseg."""
+    rows_by_name = {row["name"]: row for row in kinds}
     last = max((number for number in classes if number < 256), default=0)
     names = [classes.get(n, f"class {n}" if n else "none") for n in range(last + 1)]
     return [
-        {"token": name, "name": name, "description": "", **known.get(name, {}), "index": n}
-        for n, name in enumerate([*names, *(name for name in known if name not in names)])
+        {"token": name, "name": name, "description": "", **rows_by_name.get(name, {}), "index": n}
+        for n, name in enumerate([*names, *(name for name in rows_by_name if name not in names)])
     ]
 
 
-def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
-    """Write the tables of a data set, from the summaries of its jobs in turn."""
+def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
+    """Write the tables of a data set from the summaries of its jobs."""
     shared: set[str] = set()  # tokens of rows that several jobs have
     with ExitStack() as stack:
         files = {
-            name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
+            name: stack.enter_context(storage.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
-        before: dict[str, bytes] = {}  # what comes before the next row
+        separators: dict[str, bytes] = {}  # {table: bytes before its next row}
         kinds = dict[str, dict[str, Any]]()
         classes = dict[int, str]()
 
@@ -181,9 +182,9 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
                             continue
                         shared.add(row["token"])
                     if name not in files:  # lidarseg
-                        files[name] = stack.enter_context(place.writing(f"{VERSION}/{name}.json"))
-                    files[name].write(before.get(name, b"[\n") + json.dumps(row).encode())
-                    before[name] = b",\n"
+                        files[name] = stack.enter_context(storage.writing(f"{VERSION}/{name}.json"))
+                    files[name].write(separators.get(name, b"[\n") + json.dumps(row).encode())
+                    separators[name] = b",\n"
 
         for job in jobs:
             kinds |= {row["token"]: row for row in job["tables"].pop("category")}
@@ -192,20 +193,20 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
         rows = kinds.values()
         write({"category": _categories(rows, classes) if "lidarseg" in files else rows})
         for name, file in files.items():
-            file.write(b"\n]\n" if name in before else b"[]\n")
-    with place.writing(_MAP) as file:
+            file.write(b"\n]\n" if name in separators else b"[]\n")
+    with storage.writing(_MAP) as file:
         file.write(_no_map())
 
 
 def _no_map() -> bytes:
-    """Return a picture of no map: the devkit looks whether there is one."""
+    """Return an empty picture, because the devkit requires a map."""
     image = io.BytesIO()
     Image.new("L", (1, 1)).save(image, "png")
     return image.getvalue()
 
 
 class _Tables:
-    """Tables of a survey; what its rows are called by follows from the survey, and from the job."""
+    """Tables of a survey; tokens of rows are derived from the survey and the job."""
 
     def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
         self.sweeps = sweeps
@@ -217,16 +218,16 @@ class _Tables:
         logs = [self._token("log", _LOG)]
         self._add("map", _MAP, category="semantic_prior", filename=_MAP, log_tokens=logs)
 
-    def _token(self, table: str, what: object) -> str:
+    def _token(self, table: str, key: object) -> str:
         salt = self._salt if self._entry is None or table not in _SHARED else ""
-        return md5(f"{salt} {table} {what}".encode(), usedforsecurity=False).hexdigest()
+        return md5(f"{salt} {table} {key}".encode(), usedforsecurity=False).hexdigest()
 
-    def _add(self, table: str, what: object, **fields: Any) -> None:
-        self.rows.setdefault(table, []).append({"token": self._token(table, what), **fields})
+    def _add(self, table: str, key: object, **fields: Any) -> None:
+        self.rows.setdefault(table, []).append({"token": self._token(table, key), **fields})
 
-    def _chain(self, table: str, whats: list[Any]) -> list[dict[str, str]]:
-        """Tokens of the rows before and after each."""
-        tokens = ["", *(self._token(table, what) for what in whats), ""]
+    def _chain(self, table: str, keys: list[Any]) -> list[dict[str, str]]:
+        """Return the tokens of the rows before and after each row."""
+        tokens = ["", *(self._token(table, key) for key in keys), ""]
         return [{"prev": a, "next": b} for a, b in zip(tokens, tokens[2:], strict=False)]
 
     def add_frames(self, channels: list[str], sample: Any, names: list[str]) -> None:
@@ -241,53 +242,59 @@ class _Tables:
         # nuscenes-devkit sorts scenes by time, and fails where two have the same.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
-        for number, beside in enumerate(self._chain("sample", list(range(count)))):
+        for number, neighbours in enumerate(self._chain("sample", list(range(count)))):
             scene = self._token("scene", self._scene)
-            self._add("sample", number, timestamp=times[number], scene_token=scene, **beside)
+            self._add("sample", number, timestamp=times[number], scene_token=scene, **neighbours)
         for sensor, channel in enumerate(channels):
             self._add("sensor", channel, channel=channel, modality="lidar")
             self._add(
                 "calibrated_sensor", channel, sensor_token=self._token("sensor", channel),
                 translation=[0.0] * 3, rotation=[1.0, 0.0, 0.0, 0.0], camera_intrinsic=[],
             )  # fmt: skip
-            own = np.flatnonzero(sweeps.sensor == sensor).tolist()
-            for sweep, beside in zip(own, self._chain("sample_data", own), strict=True):
+            sweeps_of_sensor = np.flatnonzero(sweeps.sensor == sensor).tolist()
+            for sweep, neighbours in zip(
+                sweeps_of_sensor, self._chain("sample_data", sweeps_of_sensor), strict=True
+            ):
                 x, y, z, w = sweeps.pose.quaternions[sweep].tolist()
-                place = sweeps.pose.positions[sweep].tolist()
-                when = times[sweep]
+                position = sweeps.pose.positions[sweep].tolist()
+                timestamp = times[sweep]
                 self._add(
-                    "ego_pose", sweep, timestamp=when, rotation=[w, x, y, z], translation=place
+                    "ego_pose",
+                    sweep,
+                    timestamp=timestamp,
+                    rotation=[w, x, y, z],
+                    translation=position,
                 )
                 self._add(
                     "sample_data", sweep, sample_token=self._token("sample", sample[sweep]),
                     ego_pose_token=self._token("ego_pose", sweep),
                     calibrated_sensor_token=self._token("calibrated_sensor", channel),
-                    timestamp=when, fileformat="pcd", height=0, width=0, filename=names[sweep],
-                    is_key_frame=names[sweep].startswith("samples/"), **beside,
+                    timestamp=timestamp, fileformat="pcd", height=0, width=0, filename=names[sweep],
+                    is_key_frame=names[sweep].startswith("samples/"), **neighbours,
                 )  # fmt: skip
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
-        """Add what actors are, and where they were in the key frames of each sample."""
+        """Add the actors, and their boxes in the key frames of each sample."""
         kinds = self.sweeps.actor_types
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")
         for actor, kind in enumerate(kinds):
-            there = [k for k, keys in enumerate(boxes) if any(box.there[actor] for box in keys)]
-            if not there:
+            samples = [k for k, keys in enumerate(boxes) if any(box.present[actor] for box in keys)]
+            if not samples:
                 continue
-            whats = [(actor, number) for number in there]
+            annotation_keys = [(actor, number) for number in samples]
             self._add(
                 "instance", actor, category_token=self._token("category", kind),
-                nbr_annotations=len(there),
-                first_annotation_token=self._token("sample_annotation", whats[0]),
-                last_annotation_token=self._token("sample_annotation", whats[-1]),
+                nbr_annotations=len(samples),
+                first_annotation_token=self._token("sample_annotation", annotation_keys[0]),
+                last_annotation_token=self._token("sample_annotation", annotation_keys[-1]),
             )  # fmt: skip
-            chain = self._chain("sample_annotation", whats)
-            for number, beside in zip(there, chain, strict=True):
-                box = max(boxes[number], key=lambda one: one.points[actor])
-                counts = [one.points[actor] for one in boxes[number]]
-                centres = [one.centres[actor] for one in boxes[number]]
+            chain = self._chain("sample_annotation", annotation_keys)
+            for number, beside in zip(samples, chain, strict=True):
+                box = max(boxes[number], key=lambda candidate: candidate.points[actor])
+                counts = [key_boxes.points[actor] for key_boxes in boxes[number]]
+                centres = [key_boxes.centres[actor] for key_boxes in boxes[number]]
                 centre = np.average(centres, 0, counts) if any(counts) else box.centres[actor]
                 x, y, z, w = box.quaternions[actor].tolist()
                 length, width, height = box.sizes[actor].tolist()

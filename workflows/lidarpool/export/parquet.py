@@ -27,13 +27,13 @@ _GROUP_ROWS = 65_536
 class Pieces(pieces.Pieces):
     """A file for each million points; units and meanings are in the metadata of the fields.
 
-    In a data set it is a partition, `points/job=7`, in groups of rows of which readers of single
-    sweeps read one or two.
+    In a data set it is a partition, `points/job=7`, in groups of rows; readers of single sweeps
+    read one or two groups.
     """
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
-        self.folders = [] if entry is None else [entry.place("parquet")]
+        self.folders = [] if entry is None else [entry.path_of("parquet")]
         fields = [
             pa.field(
                 c.in_files, pa.from_numpy_dtype(kind), True, {"unit": c.unit, "meaning": c.meaning}
@@ -54,19 +54,19 @@ class Pieces(pieces.Pieces):
         return -(-len(self.cloud) // CHUNK_POINTS)
 
     def read(self, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield so many million points."""
+        """Yield the points of pieces, a million each."""
         return islice(self.cloud.chunks(CHUNK_POINTS, first * CHUNK_POINTS), stop - first)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
-        """Return a file."""
+        """Return the file of a piece."""
         table = self.cloud.table
         arrays = [*points.positions.T.astype(np.float64), *(points[c.name] for c in table)]
         filled = [pa.array(np.ascontiguousarray(array)) for array in arrays]
         return self._file(number, pa.Table.from_arrays(filled, schema=self.schema)), None
 
-    def others(self, made: Sequence[None]) -> dict[str, bytes]:
-        """Return a file without rows if there is no other."""
-        return {} if made else self._file(0, self.schema.empty_table())
+    def shared_files(self, pieces: Sequence[None]) -> dict[str, bytes]:
+        """Return a file without rows if there are no pieces."""
+        return {} if pieces else self._file(0, self.schema.empty_table())
 
     def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
         memory = pa.BufferOutputStream()
@@ -82,19 +82,19 @@ class Reader(reading.Reader):
 
     def files(self, sweep: int) -> list[str]:
         """Return the name of the job's partition."""
-        return [self.entry.place("parquet")]
+        return [self.entry.path_of("parquet")]
 
     @cached_property
     def _table(self) -> Any:
-        if self.place.is_local:
-            return pyarrow.dataset.dataset(self.place.path(self.files(0)[0]), format="parquet")
-        system, folder = self.place.file_system()
+        if self.storage.is_local:
+            return pyarrow.dataset.dataset(self.storage.path(self.files(0)[0]), format="parquet")
+        system, folder = self.storage.file_system()
         return pyarrow.dataset.dataset(
             f"{folder}/{self.files(0)[0]}", format="parquet", filesystem=system
         )
 
     def _group(self, fragment: Any) -> Any:
-        """Read a group of rows; neighbouring sweeps share some."""
+        """Read a group of rows, cached because neighbouring sweeps share groups."""
         key = fragment.path, fragment.row_groups[0].id
         if key not in self._held:
             # Threads of their own would be many beside those of the workers that load data.
@@ -103,12 +103,14 @@ class Reader(reading.Reader):
         return self._held[key]
 
     def read(self, sweep: int) -> reading.PointColumns:
-        """Return the points of a sweep, of which only groups of rows with its scans are read."""
+        """Return the points of a sweep; only groups of rows with its scans are read."""
         first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")
-        near = (scan >= first) & (scan < stop)
-        files = self._table.get_fragments(near)
-        groups = [self._group(one) for file in files for one in file.split_by_row_group(near)]
+        in_range = (scan >= first) & (scan < stop)
+        files = self._table.get_fragments(in_range)
+        groups = [
+            self._group(group) for file in files for group in file.split_by_row_group(in_range)
+        ]
         rows = pa.concat_tables(groups or [self._table.schema.empty_table()])
         begin, end = np.searchsorted(rows["scan"].to_numpy(), (first, stop))
         rows = rows.slice(begin, end - begin)

@@ -1,4 +1,4 @@
-"""Formats of many files: ranges of their files are written by threads here, or by workers."""
+"""Multi-file formats: ranges of their files are written by threads or by workers of a cluster."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from .format_table import row_of
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
-# of a range at most: what a killed worker costs
+# Largest range, which a killed worker loses.
 RANGE_POINTS = 1_000_000
 RANGE_PIECES = 100
-_MARK = ".writing"  # a file in the folder while ranges are written
+_MARK = ".writing"  # file in the folder while ranges are written
 
 
 Data = bytes | memoryview
 PieceRange = tuple[int, int]  # a range of pieces
-# Points of a range, and what `Pieces.others` needs of its pieces.
+# Number of points of a range, and the details of its pieces.
 WrittenRange = tuple[int, list[Any]]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A job in a data set of many: its number and name make its files differ from others'.
+    """A job in a data set; number and name distinguish its files from files of further jobs.
 
-    `values` are those that were varied, by name.
+    `values` are the varied values, by name.
     """
 
     number: int
@@ -45,15 +45,16 @@ class Entry:
     split: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
 
-    def place(self, format: str) -> str:  # noqa: A002
-        """Name of its file or folder in data sets whose jobs are written in a format."""
+    def path_of(self, format: str) -> str:  # noqa: A002
+        """Return the path of the job's file or folder in data sets of a format."""
         return row_of(format).of_job.format(number=self.number, name=self.name)
 
 
 class Pieces:
-    """The files of a cloud in a format of many: those of each piece, a sweep or other, and more.
+    """Output of a multi-file format: files of each piece, often a sweep, and shared files.
 
-    `folders` are those of the files of the pieces. With an `entry` they are a job's in a data set.
+    `folders` are the folders of the files of the pieces. With an `entry` the files are those of a
+    job in a data set.
     """
 
     folders: Sequence[str] = ()
@@ -68,71 +69,71 @@ class Pieces:
         return len(self.sweeps)
 
     def read(self, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield the points of some pieces."""
+        """Yield the points of pieces from `first` to `stop`."""
         return self.sweeps.points(self.cloud, first, stop)
 
     def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
-        """Return the files of a piece, and what `others` needs of it."""
+        """Return the files of a piece, and its details for `shared_files`."""
         raise NotImplementedError
 
-    def others(self, made: Sequence[Any]) -> Mapping[str, bytes]:
-        """Return the files that are not of one piece."""
+    def shared_files(self, details: Sequence[Any]) -> Mapping[str, bytes]:
+        """Return the files that all pieces share, from the details of the pieces."""
         return {}
 
-    def summary(self, made: Sequence[Any]) -> dict[str, Any]:
-        """Return what the data set's own files need of this job, as JSON holds it."""
+    def summary(self, details: Sequence[Any]) -> dict[str, Any]:
+        """Return a summary of this job for the data set's own files, as plain data for JSON."""
         return {}
 
-    def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
+    def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
+        """Write the files of pieces, a piece in memory at a time; OSError on failure."""
         count = 0
-        made = []
+        details = []
         for number, points in enumerate(self.read(first, stop), first):
-            files, more = self.files(number, points)
+            files, detail = self.files(number, points)
             for name, data in files.items():
-                place.write(name, data)
+                storage.write(name, data)
             count += len(points)
-            made.append(more)
-        return count, made
+            details.append(detail)
+        return count, details
 
     def spans(self, parts: int = 1) -> list[PieceRange]:
-        """Divide all pieces into ranges, at least so many if there are as many pieces."""
+        """Divide all pieces into ranges, at least `parts` if there are as many pieces."""
         count = len(self)
         by_points = RANGE_POINTS * count // max(1, len(self.cloud))
         size = max(1, min(RANGE_PIECES, by_points, count // parts))
         return [(first, min(first + size, count)) for first in range(0, count, size)]
 
-    def finish(self, place: Storage, written: Iterable[WrittenRange]) -> list[Any]:
-        """Write the files that are not of one piece; returns what was made of the pieces.
+    def finish(self, storage: Storage, written: Iterable[WrittenRange]) -> list[Any]:
+        """Write the shared files; return the details of all pieces.
 
         LidarError if the cloud is not of these sweeps, or not in order; OSError.
         """
         counts, ranges = zip(*written, strict=True) if self else ((), ())
         if sum(counts) != len(self.cloud):
             raise LidarError(MIXED_UP)
-        made = [more for one in ranges for more in one]
-        for name, data in self.others(made).items():
-            place.prepare(Path(name).parent)
-            place.write(name, data)
-        return made
+        details = [detail for details_of_range in ranges for detail in details_of_range]
+        for name, data in self.shared_files(details).items():
+            storage.prepare(Path(name).parent)
+            storage.write(name, data)
+        return details
 
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writes ranges of the pieces of a cloud, in any process that sees the folder `place`.
+    """Writes ranges of the pieces of a cloud, in any process that sees the folder `storage`.
 
-    The class `Pieces` of the `format` says what is in which file.
+    The class `Pieces` of the `format` defines the content of each file.
     """
 
     format: str
     cloud: CloudLike
     sweeps: Sweeps
-    place: Storage
+    storage: Storage
     compensated: bool = False
     _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
 
     def __call__(self, span: PieceRange) -> WrittenRange | None:
-        """Write the files of a range; OSError if that fails.
+        """Write the files of a range; OSError on failure.
 
         Returns
         -------
@@ -142,9 +143,9 @@ class RangeWriter:
             pieces = self._pieces()
         except ImportError:
             return None
-        if not self.place.sees(_MARK, self._mark):
+        if not self.storage.sees(_MARK, self._mark):
             return None
-        return pieces.write(self.place, *span)
+        return pieces.write(self.storage, *span)
 
     def _pieces(self) -> Pieces:
         pieces = pieces_of(self.format, self.cloud, self.sweeps)
@@ -153,16 +154,16 @@ class RangeWriter:
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
-        """The plug-in of the format, which processes that write ranges need, or none."""
+        """The plug-in of the format, which processes that write ranges need, or an empty tuple."""
         plugin = row_of(self.format).plugin
         return () if plugin is None else (plugin,)
 
     def stop(self) -> None:
-        """Let no further range be written."""
-        self.place.remove([_MARK])
+        """Prevent further ranges from being written."""
+        self.storage.remove([_MARK])
 
     def write(self, workers: RangeWorkers | None = None) -> None:
-        """Write all files, in threads those that workers do not; OSError if that fails.
+        """Write all files, in threads the ranges that workers have not written; OSError on failure.
 
         Raises
         ------
@@ -171,16 +172,17 @@ class RangeWriter:
         """
         pieces = self._pieces()
         for folder in ("", *pieces.folders):
-            self.place.prepare(folder)
+            self.storage.prepare(folder)
         spans = pieces.spans()
-        self.place.write(_MARK, self._mark)
-        made = workers(self, spans) if workers else {}
-        left = [span for span in spans if span not in made]
-        with ThreadPoolExecutor(THREADS, "write") as pool:  # ends when all its threads have
-            made |= {span: it for span, it in zip(left, pool.map(self, left), strict=True) if it}
+        self.storage.write(_MARK, self._mark)
+        written = workers(self, spans) if workers else {}
+        remaining = [span for span in spans if span not in written]
+        with ThreadPoolExecutor(THREADS, "write") as pool:  # waits for its threads
+            results = zip(remaining, pool.map(self, remaining), strict=True)
+            written |= {span: result for span, result in results if result}
         self.stop()
-        pieces.finish(self.place, (made.get(span, (0, [])) for span in spans))
-        self.place.tidy()
+        pieces.finish(self.storage, (written.get(span, (0, [])) for span in spans))
+        self.storage.tidy()
 
 
 def pieces_of(
@@ -189,16 +191,16 @@ def pieces_of(
     sweeps: Sweeps,
     entry: Entry | None = None,
 ) -> Pieces:
-    """Return the pieces of a cloud in a format of many files, as a job's with an `entry`."""
+    """Return the pieces of a cloud in a multi-file format, of a job with an `entry`."""
     row = row_of(format)
     pieces: Pieces = row.provides(row.write)(cloud, sweeps, entry)
     return pieces
 
 
 def as_data(array: AnyArray) -> Data:
-    """Return the bytes of an array, without a copy of them."""
+    """Return the bytes of an array without a copy."""
     return array.data.cast("B") if array.size else b""
 
 
-# Writes ranges on workers; returns what was written of those whose workers see the folder.
+# Writes ranges on workers; returns the results of ranges whose workers see the folder.
 RangeWorkers = Callable[[RangeWriter, Sequence[PieceRange]], dict[PieceRange, WrittenRange]]

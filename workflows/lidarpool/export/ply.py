@@ -29,16 +29,16 @@ _ROUNDING_SHARE = 0.05
 def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
-    About a million points are in memory at a time: Open3D writes the first of these to a file of
-    their own, whose rows and header show its layout, and the others follow as such rows. The
+    About a million points are in memory at a time: Open3D writes the first chunk to a temporary
+    file, whose rows and header show its layout, and the further chunks follow as such rows. The
     bytes are the same as if Open3D wrote all points at once, which would need memory for all.
     float64 positions are stored in single precision if the error is below a twentieth of the
     precision of the sweeps, else in double. Names of classes and materials are comments: `class 40
-    road`, `material 0 Brick`. A comment says if points are not in the axes of the world.
+    road`, `material 0 Brick`. A comment says if points are not in the world frame.
     """
     check_names((*POSITION, *cloud.table))
-    real = real_type(cloud.bounds, sweeps.precision_m)
-    row = row_type(real, cloud.table)
+    position_type = real_type(cloud.bounds, sweeps.precision_m)
+    row = row_type(position_type, cloud.table)
     comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
     comments += "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
     if any(column.name == "material" for column in cloud.table):
@@ -51,12 +51,12 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
                 file.write(_rows(chunk, row).data)
                 continue
             piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
-            _write_open3d(piece, chunk, real)
+            _write_open3d(piece, chunk, position_type)
             start, row = _layout(piece, path, len(chunk))
             written = piece.read_bytes()
-            own = b"element vertex %d\n" % len(chunk)
+            vertex_line = b"element vertex %d\n" % len(chunk)
             all_points = f"{comments}element vertex {len(cloud)}\n".encode()
-            file.write(written[:start].replace(own, all_points))
+            file.write(written[:start].replace(vertex_line, all_points))
             file.write(memoryview(written)[start:])
             piece.unlink()
         if not file.tell():  # which Open3D refuses to write
@@ -67,7 +67,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 def read_cloud(path: str | Path) -> Cloud:
     """Read a point cloud that a run or `save_cloud` wrote as .ply, with all its columns.
 
-    From the folder of a result it has sweeps, and can be saved in all formats.
+    A cloud from the folder of a result has sweeps, and can be saved in all formats.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def read_cloud(path: str | Path) -> Cloud:
 
 
 def _comment(name: str) -> str:
-    """Name for a comment, whose characters are ASCII."""
+    """Return a name for a comment, in ASCII."""
     return printable(name).encode("ascii", "backslashreplace").decode()
 
 
@@ -95,7 +95,7 @@ class Reader(reading.Reader):
 
     def files(self, sweep: int) -> list[str]:
         """Return the name of the job's cloud."""
-        return [self.entry.place("ply")]
+        return [self.entry.path_of("ply")]
 
     @cached_property
     def _cloud(self) -> CloudFile:
@@ -112,7 +112,7 @@ class Reader(reading.Reader):
 
 
 def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
-    """Least precise type that is precise enough for positions between these bounds."""
+    """Return the smallest type that is precise enough for positions between these bounds."""
     if bounds.dtype == np.float32:
         return bounds.dtype
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
@@ -121,7 +121,7 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
 
 
 def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
-    """Check that the disk has room for a file of so many points, and for a piece beside it."""
+    """Check that the disk has room for a file of `count` points, and for a temporary chunk."""
     size = len(head) + count * row_bytes
     piece = min(count, CHUNK_POINTS) * row_bytes
     free = shutil.disk_usage(path.parent).free
@@ -133,7 +133,7 @@ def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
 
 
 def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
-    """Write `cloud`, its positions of type `real`; reading back shows whether it worked."""
+    """Write a cloud with positions of a type; LidarError if Open3D reports an error."""
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))
@@ -157,7 +157,7 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
 
 
 def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
-    """Rows of a file, of the types and in the order of `row`."""
+    """Return the rows of a file, of the types and in the order of `row`."""
     rows = np.empty(len(cloud), row)
     for axis, values in zip(AXES, cloud.positions.T, strict=True):
         rows[axis] = values
@@ -167,11 +167,14 @@ def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
 
 
 def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
-    """Start and type of the rows of a piece; checks them, because Open3D ignores a full disk."""
+    """Return start and type of the rows of a written chunk.
+
+    LidarError if rows are missing, because Open3D ignores a full disk.
+    """
     try:
-        start, found, row = layout(piece)
-        if found != count:
-            raise ValueError(f"{found:,} of {count:,} points")
+        start, stored_count, row = layout(piece)
+        if stored_count != count:
+            raise ValueError(f"{stored_count:,} of {count:,} points")
     except ValueError as error:
         free = shutil.disk_usage(path.parent).free
         raise LidarError(

@@ -1,4 +1,4 @@
-"""What reads single sweeps of a job in a data set; each format has a `Reader` of its own."""
+"""Readers of single sweeps of a job in a data set; each format has a `Reader` of its own."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 
 class Reader:
-    """Reads the points of a job's sweeps in any order, in one thread."""
+    """Reads the points of a job's sweeps in any order, in a single thread."""
 
-    def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
-        self.place = place
+    def __init__(self, storage: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
+        self.storage = storage
         self.sweeps = sweeps
         self.entry = entry
         self.layout = layout
         self._copies: Path | None = None
-        self.last = ""  # file of rows that was read last, for errors
+        self.last = ""  # name of the file of rows that was read last, for errors
 
     def files(self, sweep: int) -> list[str]:
-        """Return the names of the files that a sweep is read from, that of its points first."""
+        """Return the names of the files of a sweep, the file of its points first."""
         raise NotImplementedError
 
     def read(self, sweep: int) -> PointColumns:
@@ -44,10 +44,11 @@ class Reader:
         raise NotImplementedError
 
     def expect(self, sweep: int) -> None:
-        """Have the system read the files of a sweep that are not in its memory, for `read` soon."""
-        with suppress(OSError, AttributeError):  # `read` will raise it; Linux alone has all of it
+        """Have the system load the files of a sweep into its memory, for `read` soon."""
+        # `read` will raise any OSError; only Linux has all of these functions.
+        with suppress(OSError, AttributeError):
             for name in self.files(sweep):
-                with io.FileIO(self.place.path(name)) as file:
+                with io.FileIO(self.storage.path(name)) as file:
                     try:
                         os.preadv(file.fileno(), [bytearray(1)], 0, os.RWF_NOWAIT)
                         return
@@ -55,46 +56,46 @@ class Reader:
                         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
 
     def close(self) -> None:
-        """Close and remove what the reader has opened."""
+        """Close opened files, and remove local copies."""
         if self._copies is not None:
             _remove(self._copies, os.getpid())
 
     def local(self, name: str) -> Path:
-        """Return the path of a file: of a copy until `close`, if the place is a URL."""
-        if self.place.is_local:
-            return Path(self.place.path(name))
+        """Return the path of a file: of a copy until `close`, if the storage is remote."""
+        if self.storage.is_local:
+            return Path(self.storage.path(name))
         if self._copies is None:
             self._copies = Path(tempfile.mkdtemp(prefix="lidarpool-"))
             weakref.finalize(self, _remove, self._copies, os.getpid())
         path = self._copies / Path(name).name
-        self.place.get(name, path)
+        self.storage.get(name, path)
         return path
 
     def rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
-        """Read a file of rows; ValueError if it ends within one, or has not `count`."""
-        before = self.last
+        """Read a file of rows; ValueError for a partial row, or another number than `count`."""
+        points_file = self.last
         self.last = name
-        if self.place.is_local:
-            with io.FileIO(self.place.path(name)) as file:
+        if self.storage.is_local:
+            with io.FileIO(self.storage.path(name)) as file:
                 data = np.empty(os.fstat(file.fileno()).st_size, np.uint8)
                 data = data[: file.readinto(data.data)]
         else:
-            data = np.frombuffer(bytearray(self.place.read(name)), np.uint8)
+            data = np.frombuffer(bytearray(self.storage.read(name)), np.uint8)
         if len(data) % row.itemsize:
             raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
         rows = data.view(row)
         if count not in (None, len(rows)):
-            raise ValueError(f"it has {len(rows):,} points, and {before} {count:,}")
-        return rows  # PyTorch wants arrays that it may write to
+            raise ValueError(f"it has {len(rows):,} points, and {points_file} {count:,}")
+        return rows  # PyTorch requires writable arrays
 
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
-        """Return points of the cloud's coordinates and all their columns."""
-        places = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
+        """Return the points of a cloud in the sensor frame, and all their columns."""
+        positions = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
         columns = self.sweeps.columns_in_sensor(sweep, cloud)
-        return places, {name: np.array(array) for name, array in columns.items()}
+        return positions, {name: np.array(array) for name, array in columns.items()}
 
 
 def _remove(folder: Path, process: int) -> None:
-    """Remove a folder, unless this is a fork of the process that made it."""
+    """Remove a folder, unless this process is a fork of its creator."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)

@@ -43,15 +43,15 @@ Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
 # Types of returns of Autoware's sensor drivers.
 UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
-_OF_ONE_RETURN = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
+_SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
 # frames
 WORLD = "map"
 CARRIER = "base_link"
 _INSTRUMENTS = "imu", "gnss"
-# Of a survey without a date: at time 0, tf2 would take the newest frames for all times.
+# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
 START_NS = 1_000_000_000_000_000_000
-# As `ros2 bag play` must offer it, so that late listeners get the frames, too.
+# Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
 _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
@@ -72,14 +72,14 @@ _LAYOUTS = {
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
 _ONCE = ("/tf_static", "/label_info", "/material_info")  # topics of one message, kept for readers
-# Points that are compensated for motion have no times; Autoware's are then PointXYZIRC.
+# Points that are compensated for motion have no times; in Autoware's layout, PointXYZIRC.
 _TIMES = ("time", "t", "time_stamp")
 _COMPENSATED = {
     "velodyne": _LAYOUTS["velodyne"].descr[:-1],
     "images": _LAYOUTS["images"].descr[:-1],
     "autoware": _LAYOUTS["autoware"].descr[:6],
 }
-# Fields behind those of a layout: {name: type, columns that it needs}.
+# Additional fields after the layout: {name: (type, columns that the field needs)}.
 _EXTRA = {
     "rgb": ("<f4", {*COLOURS}),
     VELOCITY: ("<f4", {VELOCITY}),
@@ -87,7 +87,7 @@ _EXTRA = {
     **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
     "material": ("<i4", {"material"}),
 }
-# Of vision_msgs, which rosbags lacks.
+# Messages of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
@@ -98,7 +98,7 @@ def write_rosbag2(
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
-    # Readers of Humble take no later version: from 9 on, its profiles are lists.
+    # Readers of Humble accept no later version: from 9 on, profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.set_custom_data("lidarpool", COMPENSATED if compensated else AS_FIRED)
         topics: dict[str, Any] = {}
@@ -118,12 +118,12 @@ def write_mcap(
 ) -> None:
     """Write an MCAP file.
 
-    Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
-    are in the sensor's axes at their own firing, as drivers publish them, and have times; or
-    compensated, in the sensor's axes at the start of the sweep, without times. `/tf` has the frames
+    Each sweep is a PointCloud2 on `/NAME/points`, NAME from its sensor, or on `/points`. Points are
+    in the sensor frame at their own firing, as drivers publish them, and have times; or
+    compensated, in the sensor frame at the start of the sweep, without times. `/tf` has the frames
     of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
     `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
-    those of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
+    names of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
     without one. `/actors` has a MarkerArray of the boxes of actors where their points of the sweep
     are.
 
@@ -134,15 +134,14 @@ def write_mcap(
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
     PointStamped in `map`.
 
-    Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
-    `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from where the head
-    starts, time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes) and `ouster`
-    (48 bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
-    signal).
-    Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
+    Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began), `autoware`
+    (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from the start of the head,
+    time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes) and `ouster` (48
+    bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
+    signal). Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
     blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, where its
-    classes have names, `label`, and then normals, `incidence_deg` and origins of rays, of which the
-    cloud has some, and `material`; each makes points of `velodyne` and `autoware` 4 bytes longer.
+    classes have names, `label`, and then any columns of normals, `incidence_deg` and origins of
+    rays, and `material`; each makes points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -162,7 +161,7 @@ class PointLayout:
 
     @property
     def fields(self) -> np.dtype[np.void]:
-        """Type of a point, without columns that may follow."""
+        """Type of a point, without additional fields."""
         row = _LAYOUTS[self.name]
         if not self.compensated:
             return row
@@ -177,7 +176,7 @@ class PointLayout:
         })  # fmt: skip
 
     def row(self, extra: Sequence[str]) -> np.dtype[np.void]:
-        """Type of a point in the layout, with fields behind it."""
+        """Return the type of a point in the layout, followed by additional fields."""
         row = self.fields
         if not extra:
             return row
@@ -194,98 +193,135 @@ class PointLayout:
 
 
 def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any) -> Iterator[Sent]:
-    """Messages of a cloud, sweep by sweep."""
-    held = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
-    row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= held])
-    field = types["sensor_msgs/msg/PointField"]
-    fields = [
-        field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
-        for name, (kind, offset, *_) in (row.fields or {}).items()
-    ]
-    make = _Messages(types)
-    frames = _frames(sweeps)
-    actors = frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
-    poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
-    moving = [(CARRIER, sweeps.carrier), *zip(actors, poses, strict=True)]
+    """Yield the messages of a cloud, sweep by sweep."""
+    columns = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
+    row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= columns])
+    sweep_messages = _SweepMessages(_Messages(types), sweeps, layout, row)
     start_ns = _start_ns(sweeps)
-    measured = make.measured(sweeps, start_ns)
+    measured = sweep_messages.make.instrument_messages(sweeps, start_ns)
     waiting = next(measured, None)
-    on_carrier = [
-        (CARRIER, frame, sweeps.mounts, number)
-        for number, frame in enumerate(frames[: len(sweeps.sensors)])
-    ]
-    on_carrier += _instruments(sweeps)
-    yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
-    if sweeps.classes:
-        info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
-        told = [named(number, name) for number, name in sweeps.classes.items()]
-        yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
-    if "material" in held and sweeps.materials:
-        info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
-        listed = [named(number, name) for number, name in enumerate(sweeps.materials)]
-        yield "/material_info", info(make.header("", start_ns), listed, 0.0), start_ns
+    yield from sweep_messages.static_messages(columns)
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
-        stamp_ns = start_ns + sweeps.stamp_ns(sweep)
         while waiting is not None and waiting[2] <= time_ns:
             yield waiting
             waiting = next(measured, None)
-        frame = frames[sweeps.sensor[sweep]]
-        topic = _topic(sweeps, frames, sweep)
-        rows = _rows(layout, row, points, sweeps, sweep)
-        in_world = [
-            (WORLD, name, placed, sweep)
-            for (name, placed), there in zip(
-                moving, [True, *sweeps.actor_there[:, sweep]], strict=True
-            )
-            if there
-        ]
-        yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
-        yield "/tf", make.transforms(in_world, time_ns), time_ns
-        message = types["sensor_msgs/msg/PointCloud2"](
-            make.header(frame, stamp_ns), 1, len(rows), fields, False, row.itemsize,
-            rows.nbytes, rows.view(np.uint8).ravel(), True,
-        )  # fmt: skip
-        yield topic, message, time_ns
-        if (rays := ScanRays.of(sweeps, sweep, points)) is not None:
-            name = f"{topic.removesuffix('points')}scan"
-            yield name, make.laser_scan(rays, frame, stamp_ns), time_ns
-        if layout.name == "images":
-            ranges = Image.of(sweeps, sweep, points).filled(points["range"])
-            ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
-            for plane, image in enumerate(ranges, 1):
-                name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
-                yield name, make.image(image[::-1], frame, stamp_ns), time_ns
-        if actors:
-            boxes = Boxes.of(sweeps, sweep, points)
-            yield "/actors", make.markers(boxes, actors, time_ns), time_ns
+        yield from sweep_messages.messages(sweep, points, time_ns)
     while waiting is not None:
         yield waiting
         waiting = next(measured, None)
 
 
+class _SweepMessages:
+    """Makes the messages of a survey, and of its single sweeps."""
+
+    def __init__(
+        self, make: _Messages, sweeps: Sweeps, layout: PointLayout, row: np.dtype[np.void]
+    ) -> None:
+        self.make = make
+        self._sweeps = sweeps
+        self._layout = layout
+        self._row = row  # of a point
+        (field,) = make.types_of("sensor_msgs", "PointField")
+        self._fields = [
+            field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
+            for name, (kind, offset, *_) in (row.fields or {}).items()
+        ]
+        self._frames = _frames(sweeps)
+        self._actors = self._frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
+        poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
+        # Carrier and actors: frame and poses.
+        self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
+        self._start_ns = _start_ns(sweeps)
+
+    def static_messages(self, columns: set[str]) -> Iterator[Sent]:
+        """Yield the messages that are sent once; `columns` are the names of the cloud's columns."""
+        sweeps = self._sweeps
+        start_ns = self._start_ns
+        on_carrier = [
+            (CARRIER, frame, sweeps.mounts, number)
+            for number, frame in enumerate(self._frames[: len(sweeps.sensors)])
+        ]
+        on_carrier += _instruments(sweeps)
+        yield "/tf_static", self.make.transforms(on_carrier, start_ns), start_ns
+        info, named = self.make.types_of("vision_msgs", "LabelInfo", "VisionClass")
+        header = self.make.header("", start_ns)
+        if sweeps.classes:
+            classes = [named(number, name) for number, name in sweeps.classes.items()]
+            yield "/label_info", info(header, classes, 0.0), start_ns
+        if "material" in columns and sweeps.materials:
+            materials = [named(number, name) for number, name in enumerate(sweeps.materials)]
+            yield "/material_info", info(header, materials, 0.0), start_ns
+
+    def messages(self, sweep: int, points: Cloud, time_ns: int) -> Iterator[Sent]:
+        """Yield the messages of a sweep, which are sent at a time."""
+        sweeps = self._sweeps
+        stamp_ns = self._start_ns + sweeps.stamp_ns(sweep)
+        frame = self._frames[sweeps.sensor[sweep]]
+        topic = _topic(sweeps, self._frames, sweep)
+        (clock,) = self.make.types_of("rosgraph_msgs", "Clock")
+        yield "/clock", clock(self.make.stamp(time_ns)), time_ns
+        yield "/tf", self.make.transforms(self._frames_in_world(sweep), time_ns), time_ns
+        yield topic, self._point_cloud(sweep, points, self.make.header(frame, stamp_ns)), time_ns
+        if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
+            name = f"{topic.removesuffix('points')}scan"
+            yield name, self.make.laser_scan(rays, frame, stamp_ns), time_ns
+        if self._layout.name == "images":
+            ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
+            for plane, image in enumerate(ranges, 1):
+                name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
+                yield name, self.make.image(image[::-1], frame, stamp_ns), time_ns
+        if self._actors:
+            boxes = Boxes.from_points(sweeps, sweep, points)
+            yield "/actors", self.make.markers(boxes, self._actors, time_ns), time_ns
+
+    def _frames_in_world(self, sweep: int) -> list[tuple[str, str, SweepPoses, int]]:
+        """Return the frames of the carrier and of the actors that are present during a sweep."""
+        present = [True, *self._sweeps.actor_there[:, sweep]]
+        return [
+            (WORLD, name, poses, sweep)
+            for (name, poses), is_present in zip(self._moving, present, strict=True)
+            if is_present
+        ]
+
+    def _point_cloud(self, sweep: int, points: Cloud, header: Any) -> Any:
+        """Return the PointCloud2 of a sweep."""
+        rows = _rows(self._layout, self._row, points, self._sweeps, sweep)
+        (message,) = self.make.types_of("sensor_msgs", "PointCloud2")
+        return message(
+            header, 1, len(rows), self._fields, False, self._row.itemsize,
+            rows.nbytes, rows.view(np.uint8).ravel(), True,
+        )  # fmt: skip
+
+
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
-    """Frames of the instruments on the carrier."""
-    there = sweeps.instruments
-    if there is None or there.folder is None:
+    """Return the frames of the instruments on the carrier."""
+    instruments = sweeps.instruments
+    if instruments is None or instruments.folder is None:
         return []
-    found = zip(_frames(sweeps)[-2:], (there.imu, there.gnss), strict=True)
+    frames = zip(_frames(sweeps)[-2:], (instruments.imu, instruments.gnss), strict=True)
     return [
-        (CARRIER, frame, SweepPoses(np.array([one.position]), np.array([one.quaternion])), 0)
-        for frame, one in found
-        if one is not None
+        (
+            CARRIER,
+            frame,
+            SweepPoses(np.array([instrument.position]), np.array([instrument.quaternion])),
+            0,
+        )
+        for frame, instrument in frames
+        if instrument is not None
     ]
 
 
-_FULL = {"autoware": 255, "ouster": COUNTS}  # of an intensity of 1
+_FULL_INTENSITY = {"autoware": 255, "ouster": COUNTS}  # values of an intensity of 1
 
 
 class Reader(reading.Reader):
-    """Reads sweeps of a data set: intensity, as far as it is kept, channel and named class."""
+    """Reads sweeps of a data set: intensity, limited by the layout, channel and named class."""
 
     def files(self, sweep: int) -> list[str]:
         """Return the name of the job's bag."""
-        return [self.entry.place("mcap")]
+        return [self.entry.path_of("mcap")]
 
     @cached_property
     def _bag(self) -> Bag:
@@ -296,35 +332,39 @@ class Reader(reading.Reader):
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
-        topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
-        connections = [one for one in self._bag.connections if one.topic == topic]
-        time_ns = _start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
-        found = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
-        if found is None:  # rosbags 0.11.2 misses some by their time
-            every = self._bag.messages(connections)
-            found = next((message for message in every if message[1] == time_ns), None)
-        if found is None:
-            raise ValueError(f"it has no message on {topic} at {time_ns} ns")
-        connection, _, data = found
-        message: Any = message_types().deserialize_cdr(data, connection.msgtype)
-        held = {field.name for field in message.fields}
-        extra = [name for name in _EXTRA if name in held]
-        compensated = not held & {*_TIMES}
-        rows = message.data.view(PointLayout(self.layout, compensated).row(extra))
-        light = rows["intensity"].astype(np.float32) / _FULL.get(self.layout, 1)
+        message = self._point_cloud(sweep)
+        names = {field.name for field in message.fields}
+        compensated = not names & {*_TIMES}
+        row = PointLayout(self.layout, compensated).row([name for name in _EXTRA if name in names])
+        rows = message.data.view(row)
+        intensity = rows["intensity"].astype(np.float32) / _FULL_INTENSITY.get(self.layout, 1)
         channel = rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16)
         if self.layout == "ouster":
             channel = np.uint16(_traits(self.sweeps, sweep).channels - 1) - channel
-        columns = {"intensity": light, "channel": channel}
-        if "label" in held:
+        columns = {"intensity": intensity, "channel": channel}
+        if "label" in names:
             columns["class"] = rows["label"].astype(np.uint16)
         points = np.stack([rows[axis] for axis in "xyz"], axis=1)
         if not compensated and self.sweeps.coordinates == "world":
             points = self._at_start(sweep, points, rows)
         return points, columns
 
+    def _point_cloud(self, sweep: int) -> Any:
+        """Return the PointCloud2 of a sweep; ValueError if the bag lacks the message."""
+        topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
+        connections = [opened for opened in self._bag.connections if opened.topic == topic]
+        time_ns = _start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
+        record = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
+        if record is None:  # rosbags 0.11.2 misses some messages by their time
+            records = self._bag.messages(connections)
+            record = next((candidate for candidate in records if candidate[1] == time_ns), None)
+        if record is None:
+            raise ValueError(f"it has no message on {topic} at {time_ns} ns")
+        connection, _, data = record
+        return message_types().deserialize_cdr(data, connection.msgtype)
+
     def _at_start(self, sweep: int, points: Floats32, rows: Records) -> Floats32:
-        """Return points (n, 3) as fired in the sensor's axes at the start of the sweep."""
+        """Return points (n, 3) as fired in the sensor frame at the start of the sweep."""
         (field,) = (name for name in rows.dtype.names or () if name in _TIMES)
         since_ns = rows[field].astype(np.float64) * (1e9 if field == "time" else 1)
         stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
@@ -341,13 +381,13 @@ class Reader(reading.Reader):
 
 
 def _frames(sweeps: Sweeps) -> list[str]:
-    """Frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
+    """Return the frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
     return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2:]
 
 
 def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
-    """Topic of the points of a sweep."""
+    """Return the topic of the points of a sweep."""
     sensor = sweeps.sensor[sweep]
     return f"/{frames[sensor]}/points" if sweeps.sensors[sensor] else "/points"
 
@@ -359,7 +399,7 @@ def _start_ns(sweeps: Sweeps) -> int:
 def _rows(
     layout: PointLayout, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Points of a sweep in a layout, of the type of its `row`."""
+    """Return the points of a sweep in a layout, of the type of its `row`."""
     if layout.compensated:
         positions = sweeps.compensated(sweep, points).astype(np.float32)
         columns = sweeps.columns_compensated(sweep, points)
@@ -401,7 +441,7 @@ def _rows(
 def _timed(
     layout: str, positions: Floats32, since_ns: AnyArray, sweeps: Sweeps, sweep: int
 ) -> dict[str, AnyArray]:
-    """Return the fields of points in the sensor's axes at their firings, `since_ns` the stamp."""
+    """Return fields of points in the sensor frame at their firings, `since_ns` the stamp."""
     if layout in ("velodyne", "images"):
         return {"time": since_ns / 1e9}
     stamps = np.clip(since_ns, 0, 2**32 - 1)
@@ -419,14 +459,14 @@ def _timed(
 
 
 def _return_types(points: Cloud, mode: str) -> AnyArray:
-    """Return Autoware's types of the returns of a sweep, whose returns follow their pulses: (n,).
+    """Return Autoware's types of the returns of a sweep, (n,); returns follow their pulses.
 
-    Of two returns of a pulse the nearer is first, and the brighter is strong, the farther of two
-    that are alike. A return that is all of its pulse is each at once.
+    Of two returns of a pulse the nearer is first, and the brighter is strong; of two equally bright
+    returns, the farther. A single return of a pulse is all of these.
     """
     count = len(points)
-    if mode in _OF_ONE_RETURN:
-        return np.full(count, _OF_ONE_RETURN[mode])
+    if mode in _SINGLE_RETURN_TYPES:
+        return np.full(count, _SINGLE_RETURN_TYPES[mode])
     number = points["return_number"]
     returns = points["returns"]
     types = np.full(count, UNKNOWN)
@@ -451,78 +491,80 @@ def _traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
 
 
 class _Messages:
-    """Common parts of messages."""
+    """Makes messages and their common parts."""
 
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def kinds(self, package: str, *names: str) -> list[Any]:
-        """Types of messages of a package."""
+    def types_of(self, package: str, *names: str) -> list[Any]:
+        """Return types of messages of a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
-        """Time of a message."""
+        """Return the time of a message."""
         return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
 
     def header(self, frame: str, time_ns: int) -> Any:
-        """Header of a message."""
+        """Return the header of a message."""
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
     def transforms(self, frames: list[tuple[str, str, SweepPoses, int]], time_ns: int) -> Any:
-        """Frames in others: parent, name, poses, and which of them."""
-        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
-        transform, stamped = self.kinds("geometry_msgs", "Transform", "TransformStamped")
+        """Return frames in their parents: (parent, name, poses, index of the pose)."""
+        vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
+        transform, stamped = self.types_of("geometry_msgs", "Transform", "TransformStamped")
         return self._types["tf2_msgs/msg/TFMessage"]([
             stamped(
                 self.header(parent, time_ns), name,
                 transform(
-                    vector(*placed.positions[which].tolist()),
-                    turn(*placed.quaternions[which].tolist()),
+                    vector(*placed.positions[index].tolist()),
+                    quaternion(*placed.quaternions[index].tolist()),
                 ),
             )
-            for parent, name, placed, which in frames
+            for parent, name, placed, index in frames
         ])  # fmt: skip
 
-    def measured(self, sweeps: Sweeps, start_ns: int) -> Iterator[Sent]:
-        """Messages of what instruments measured, in the order of time."""
-        there = sweeps.instruments
-        if there is None:
+    def instrument_messages(self, sweeps: Sweeps, start_ns: int) -> Iterator[Sent]:
+        """Return the messages of IMU and GNSS receiver, in order of time."""
+        instruments = sweeps.instruments
+        if instruments is None:
             return iter(())
         *_, imu, gnss = _frames(sweeps)
-        both = self._imu(there, imu, start_ns), self._gnss(there, gnss, start_ns)
-        return merge(*both, key=lambda one: one[2])
+        streams = self._imu(instruments, imu, start_ns), self._gnss(instruments, gnss, start_ns)
+        return merge(*streams, key=lambda sent: sent[2])
 
-    def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
-        (imu,) = self.kinds("sensor_msgs", "Imu")
+    def _imu(self, instruments: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
+        vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
+        (imu,) = self.types_of("sensor_msgs", "Imu")
         unknown = np.zeros(9)
         unknown[0] = -1  # there is no orientation
         rate, force = (
             np.zeros((2, 9))
-            if there.imu is None
-            else [np.eye(3).ravel() * variance for variance in there.imu.variances]
+            if instruments.imu is None
+            else [np.eye(3).ravel() * variance for variance in instruments.imu.variances]
         )
-        for time, *numbers in there.rows(IMU_FILE):
+        for time, *numbers in instruments.rows(IMU_FILE):
             time_ns = start_ns + int(time)
             values = [*map(float, numbers)]
             message = imu(
-                self.header(frame, time_ns), turn(0.0, 0.0, 0.0, 1.0), unknown,
+                self.header(frame, time_ns), quaternion(0.0, 0.0, 0.0, 1.0), unknown,
                 vector(*values[:3]), rate, vector(*values[3:]), force,
             )  # fmt: skip
             yield "/imu/data_raw", message, time_ns
 
-    def _gnss(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        point, stamped = self.kinds("geometry_msgs", "Point", "PointStamped")
-        fix, status = self.kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
-        variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
-        known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
-        for time, x, y, z, *place in there.rows(GNSS_FILE):
+    def _gnss(self, instruments: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
+        point, stamped = self.types_of("geometry_msgs", "Point", "PointStamped")
+        fix, status = self.types_of("sensor_msgs", "NavSatFix", "NavSatStatus")
+        variances = (
+            np.zeros(3) if instruments.gnss is None else np.array(instruments.gnss.variances)
+        )
+        covariance_type = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
+        for time, x, y, z, *geodetic in instruments.rows(GNSS_FILE):
             time_ns = start_ns + int(time)
-            if place:
+            if geodetic:
                 message = fix(
                     self.header(frame, time_ns),
                     status(status.STATUS_FIX, status.SERVICE_GPS),
-                    *map(float, place), np.diag(variances).ravel(), known,
+                    *map(float, geodetic), np.diag(variances).ravel(), covariance_type,
                 )  # fmt: skip
                 yield "/gnss/fix", message, time_ns
             else:
@@ -530,10 +572,10 @@ class _Messages:
                 yield "/gnss/position", message, time_ns
 
     def laser_scan(self, rays: ScanRays, frame: str, time_ns: int) -> Any:
-        """LaserScan of a sweep of a 2D scanner."""
+        """Return the LaserScan of a sweep of a 2D scanner."""
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
-        (scan,) = self.kinds("sensor_msgs", "LaserScan")
+        (scan,) = self.types_of("sensor_msgs", "LaserScan")
         return scan(
             self.header(frame, time_ns), first, last, (last - first) / (len(rays.angles) - 1),
             rays.time_increment_s, rays.scan_time_s, *rays.range_limits_m, rays.ranges,
@@ -541,7 +583,7 @@ class _Messages:
         )  # fmt: skip
 
     def image(self, values: Floats32, frame: str, time_ns: int) -> Any:
-        """Image of numbers (height, width)."""
+        """Return an image of numbers (height, width)."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
         header = self.header(frame, time_ns)
@@ -549,11 +591,11 @@ class _Messages:
         return image(header, height, width, "32FC1", 0, 4 * width, data)
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
-        """Boxes of actors as a sensor saw them, in place of those that another saw before."""
+        """Return the boxes of actors in a sweep as markers, which replace earlier markers."""
         types = self._types
         names = ("Point", "Quaternion", "Pose", "Vector3")
-        point, turn, pose, vector = self.kinds("geometry_msgs", *names)
-        marker, mesh = self.kinds("visualization_msgs", "Marker", "MeshFile")
+        point, quaternion, pose, vector = self.types_of("geometry_msgs", *names)
+        marker, mesh = self.types_of("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
         header = self.header(WORLD, time_ns)
         none = np.empty(0, np.uint8)
@@ -562,9 +604,9 @@ class _Messages:
         return types["visualization_msgs/msg/MarkerArray"]([
             marker(
                 header, "actors", number, marker.CUBE,
-                marker.ADD if boxes.there[number] else marker.DELETE,
+                marker.ADD if boxes.present[number] else marker.DELETE,
                 pose(point(*boxes.centres[number].tolist()),
-                     turn(*boxes.quaternions[number].tolist())),
+                     quaternion(*boxes.quaternions[number].tolist())),
                 vector(*boxes.sizes[number].tolist()), orange, always, False, [], [], "",
                 image(header, "", none), [], name, "", mesh("", none), False,
             )

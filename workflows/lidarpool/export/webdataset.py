@@ -22,19 +22,19 @@ from . import pieces, reading
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
 
-SHARD_MOST = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
-_OWN = ("points", "pose", "boxes")  # arrays that are no columns
+MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
+_RESERVED = ("points", "pose", "boxes")  # arrays that are no columns
 
 
 class Pieces(pieces.Pieces):
     """A tar file for a hundred sweeps or a million points each, such as `shards/000000.tar`.
 
-    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, metres in the sensor's axes when
-    it began), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4, from these axes
-    to the world's), `boxes.npy` (float32 k x 7: `SweepBoxes.rows`), and `json`, about sweep and
-    boxes. In a data set it is JOB/SENSOR-000000 in `shards/SPLIT/JOB-000000.tar`; `json` has what
-    was varied, too, and `offsets/JOB.npz`, int64 (sweeps, 3), the first sweep of the tar file of
-    each, the sample's first byte there, and its end.
+    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, metres in the sensor frame at
+    the start of the sweep), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4,
+    from this frame to the world frame), `boxes.npy` (float32 k x 7: `SweepBoxes.rows`), and `json`,
+    about sweep and boxes. In a data set it is JOB/SENSOR-000000 in `shards/SPLIT/JOB-000000.tar`;
+    `json` has the varied values, too, and `offsets/JOB.npz`, int64 (sweeps, 3), for each sweep the
+    first sweep of its tar file, the first byte of the sample in that file, and its end.
 
     Aizman et al., High performance I/O for large scale deep learning, 2019.
     """
@@ -44,77 +44,79 @@ class Pieces(pieces.Pieces):
         self.folders = ["shards"]
         self.names = plain_names(name or "lidar" for name in sweeps.sensors)
         self.offsets = np.zeros((len(sweeps), 3), np.int64)
-        if clash := [column.name for column in cloud.table if column.name in _OWN]:
+        if clash := [column.name for column in cloud.table if column.name in _RESERVED]:
             raise LidarError(f"WebDataset has other {clash[0]!r}: rename the column.")
 
     def spans(self, parts: int = 1) -> list[PieceRange]:
-        """Divide all sweeps into ranges, which begin a tar file each, wherever they are written."""
+        """Divide all sweeps into ranges with tar files of their own, wherever they are written."""
         return super().spans()
 
-    def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the tar files of some ranges, one in memory at a time; OSError if that fails."""
+    def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
+        """Write the tar files of ranges, a single file in memory at a time; OSError on failure."""
         count = 0
-        made = []
+        boxes_of_sweeps = []
         for begin, end in self.spans():
             tar = io.BytesIO()
             start = begin
             inside = self.read(begin, end) if first <= begin < stop else ()
             for number, points in enumerate(inside, begin):
-                boxes = Boxes.of(self.sweeps, number, points) if self.sweeps.actors else None
+                boxes = (
+                    Boxes.from_points(self.sweeps, number, points) if self.sweeps.actors else None
+                )
                 sample = b"".join(self._members(number, points, boxes))
-                if tar.tell() and tar.tell() + len(sample) > SHARD_MOST:
-                    self._put(place, start, tar)
+                if tar.tell() and tar.tell() + len(sample) > MAX_SHARD_BYTES:
+                    self._put(storage, start, tar)
                     tar = io.BytesIO()
                     start = number
                 self.offsets[number] = start, tar.tell(), tar.tell() + len(sample)
                 tar.write(sample)
                 count += len(points)
-                made.append(boxes)
+                boxes_of_sweeps.append(boxes)
             if tar.tell():
-                self._put(place, start, tar)
-        return count, made
+                self._put(storage, start, tar)
+        return count, boxes_of_sweeps
 
-    def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
-        """Return where the sweeps of a job are."""
+    def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
+        """Return the offsets of the sweeps of a job."""
         if self.entry is None:
             return {}
         return {f"offsets/{self.entry.name}.npz": packed({"at": self.offsets})}
 
-    def _put(self, place: Storage, start: int, tar: io.BytesIO) -> None:
+    def _put(self, storage: Storage, start: int, tar: io.BytesIO) -> None:
         tar.write(bytes(tarfile.RECORDSIZE - tar.tell() % tarfile.RECORDSIZE))  # two blocks end it
         name = _shard(self.entry, start)
-        place.prepare(name.rpartition("/")[0])
-        place.write(name, tar.getbuffer())
+        storage.prepare(name.rpartition("/")[0])
+        storage.write(name, tar.getbuffer())
 
     def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
-        """Yield the files of a sample, each behind its header."""
+        """Yield the files of a sample, each with its header."""
         sweeps = self.sweeps
         entry = self.entry
-        there = SweepBoxes.of(sweeps, boxes and boxes.inward(sweeps.pose, number))
+        present = SweepBoxes.select(sweeps, boxes and boxes.inward(sweeps.pose, number))
         columns = sweeps.columns_in_sensor(number, points)
         arrays = {
             "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
             **{column.name: columns[column.name] for column in self.cloud.table},
             "pose": sweeps.pose.matrix(number),
-            "boxes": there.rows,
+            "boxes": present.rows,
         }
         folder, job = ([], {}) if entry is None else ([entry.name], asdict(entry))
-        about = job | {
+        description = job | {
             "sensor": sweeps.sensors[sweeps.sensor[number]],
             "sweep": int(sweeps.numbers[number]),
             "time_ns": round(sweeps.begins_ns[number]),
             "frame": AS_FIRED if sweeps.coordinates == "sensor" else COMPENSATED,
-            "box_names": there.names,
-            "box_types": there.types,
-            "box_objects": there.objects.tolist(),
-            "box_points": there.points.tolist(),
+            "box_names": present.names,
+            "box_types": present.types,
+            "box_objects": present.objects.tolist(),
+            "box_points": present.points.tolist(),
         }
         if "material" in columns:
-            about["materials"] = sweeps.materials
+            description["materials"] = sweeps.materials
         if faults := sweeps.faults_in(number):
-            about["faults"] = [one.words() for one in faults]
+            description["faults"] = [fault.words() for fault in faults]
         files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
-        files["json"] = json.dumps(about).encode()
+        files["json"] = json.dumps(description).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"
         for name, data in files.items():
             head = tarfile.TarInfo("/".join([*folder, f"{key}.{name}"]))  # of 1970, and of nobody
@@ -128,7 +130,7 @@ class Reader(reading.Reader):
     @cached_property
     def _offsets(self) -> Ints:
         name = f"offsets/{self.entry.name}.npz"
-        with open_archive(self.place.path(name), partial(self.place.read, name)) as arrays:
+        with open_archive(self.storage.path(name), partial(self.storage.read, name)) as arrays:
             return arrays["at"]
 
     def files(self, sweep: int) -> list[str]:
@@ -136,9 +138,9 @@ class Reader(reading.Reader):
         return [_shard(self.entry, int(self._offsets[sweep, 0]))]
 
     def read(self, sweep: int) -> reading.PointColumns:
-        """Return the points of a sweep, of which alone bytes are read."""
+        """Return the points of a sweep; only the bytes of the sweep are read."""
         _, first, stop = self._offsets[sweep].tolist()
-        sample = self.place.read(self.files(sweep)[0], first, stop)
+        sample = self.storage.read(self.files(sweep)[0], first, stop)
         if len(sample) < stop - first:
             raise ValueError(f"it ends {stop - first - len(sample)} bytes before the sweep does")
         data = io.BytesIO(sample)
@@ -159,7 +161,7 @@ def _npy(array: AnyArray) -> bytes:
 
 
 def _shard(entry: Entry | None, start: int) -> str:
-    """Name of the tar file that begins with a sweep."""
+    """Return the name of the tar file that starts with a sweep."""
     if entry is None:
         return f"shards/{start:06}.tar"
     return "/".join(filter(None, ("shards", entry.split, f"{entry.name}-{start:06}.tar")))

@@ -49,7 +49,7 @@ from ..plan import best
 from ..report.charts import draw_results, draw_varied
 from ..report.picture_content import planning_picture
 from ..run.pipeline.messages import Receipt, ScanFrame
-from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
+from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, waiting_reason
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobUnderWay
@@ -108,7 +108,7 @@ class LivePage(RunPage):
 
     def begun(self, job: JobUnderWay) -> None:
         """Show the only job: what is committed from now on, and the scans of an earlier run."""
-        if job.kept:
+        if job.committed_in_words:
             self._progress = job.progress()
         self._jobs = {0: LiveJob(job)}
         self._state = "starting: workers, each with its own Python"
@@ -116,8 +116,8 @@ class LivePage(RunPage):
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
         """Show the jobs under way, the busy slots of partitions, and jobs that were written."""
         self._partitions = partitions
-        if dataset is not None and dataset.format == "folder" and dataset.place.is_local:
-            self._written = dataset.place
+        if dataset is not None and dataset.format == "folder" and dataset.storage.is_local:
+            self._written = dataset.storage
         self._state = "starting: workers read the scene and make their trees"
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
@@ -144,7 +144,7 @@ class LivePage(RunPage):
         if rate := self._pace.rate(progress.seconds, counts[0]):
             each, rate = ("min", 60 * rate) if unit and rate < 1 else ("s", rate)
             self._rate = f"{in_words(rate)}{unit}/{each}"
-            self._left = self._pace.left(progress.seconds, *counts)
+            self._left = self._pace.time_left(progress.seconds, *counts)
         over = 0 < progress.jobs == progress.jobs_done
         if now >= self._list_at or over:
             self._list_at = now + LIST_EVERY_S
@@ -260,7 +260,7 @@ class LivePage(RunPage):
             if self.stopped.is_set():
                 state = "stopping"
             elif progress is not None:
-                state = standing_still(progress) or state
+                state = waiting_reason(progress) or state
         return dict(self._sums) | {
             "title": self._title,
             "names": list(self._names),

@@ -18,7 +18,7 @@ from lidarsim.base.words import listed, plural
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
-from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet, manifest_file
+from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
@@ -44,7 +44,8 @@ _RECORDED: dict[str, type] = {
 
 # With what `write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
-    OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
+    JOB_FILES.pattern
+    + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
 )
 # The run, results of single jobs, and what writers that have not heard of their end may add.
@@ -79,7 +80,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
         """Refuse or remove a finished data set, or look at it; its sums if nothing is left."""
-        out = self.dataset.place
+        out = self.dataset.storage
         options = run.options
         kept = out.below(RUN_FOLDER)
         there = out.entries()
@@ -125,7 +126,7 @@ class DataSetOutput(Output[CampaignRun]):
         for row in self._rows:
             run.page.ended(row)
         notes = tuple(run.warn_of_empty_jobs(self._rows))
-        sums = CampaignRun.of(self._rows, time.monotonic() - run.started, notes=notes)
+        sums = CampaignRun.from_rows(self._rows, time.monotonic() - run.started, notes=notes)
         run.page.finish(sums.seconds)
         return sums
 
@@ -133,7 +134,7 @@ class DataSetOutput(Output[CampaignRun]):
         """Compare what is there with what the store says is done; take over what it lacks."""
         store = run.store
         options = run.options
-        out = self.dataset.place
+        out = self.dataset.storage
         if self._made is not None:
             store.cast_with(self._made["backend"], self._made["casting"])
             rows = [row for row in self._rows if row.number in self.campaign.numbers]
@@ -141,10 +142,12 @@ class DataSetOutput(Output[CampaignRun]):
         elif run.resume:
             store.notes += [self._lost_record] * bool(self._lost_record)
             self._take_over(store)
-        dataset_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
+        dataset_files(
+            out, begun=store.begun or bool(store.committed_in_words)
+        )  # some were perhaps taken over
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
-        if not store.kept:
+        if not store.committed_in_words:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*self._wrong, *retried])
@@ -157,7 +160,7 @@ class DataSetOutput(Output[CampaignRun]):
         """Take over jobs that are there and the database does not know, if it was lost."""
         known = {row.name for row in store.rows()}
         rows: list[JobRow] = []
-        with explained(f"{self.dataset.place} cannot be read"):
+        with explained(f"{self.dataset.storage} cannot be read"):
             for row, made in self.dataset.rows(known):
                 if made.get("identity") != store.made_with["identity"]:
                     continue
@@ -178,16 +181,18 @@ class DataSetOutput(Output[CampaignRun]):
         warnings = run.warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
             more["notes"] = (*more["notes"], *warnings)
-        sums = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
+        sums = CampaignRun.from_rows(
+            store.rows(), seconds, store.resumed, sensors=store.sensors, **more
+        )
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": sums.sensors}
         record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
         record |= {"shards": [str(self.campaign.shard)], "notes": [*sums.notes]}
-        write_record(self.dataset.place, record)  # before anything that it tells whose it is
+        write_record(self.dataset.storage, record)  # before anything that it tells whose it is
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         sums, _ = write_shared(self.dataset, record, sums, store.rows)
         if sums.failed:
-            store.save(now=True)
+            store.save(force=True)
             store.db.close()
         else:
             store.remove()
@@ -263,7 +268,7 @@ def write_shared(
     from .charts import draw_sweep
 
     campaign = record["campaign"]
-    place = dataset.place
+    place = dataset.storage
     with explained(f"{place} cannot be written"):
         place.remove([INDEX_FILE])  # it has the checksum of the table
     write_table(place, campaign["names"], rows)
@@ -289,15 +294,15 @@ def _look(
     whole = 0
     wrong = dict[int, str]()
     made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
-    with explained(f"{dataset.place} cannot be read"):
+    with explained(f"{dataset.storage} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
                 share = (
                     "" if campaign.shard == ALL else f", of which this is shard {campaign.shard}"
                 )
                 raise LidarError(
-                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}{share}: "
-                    "a campaign can only grow. Give another folder with --out."
+                    f"{dataset.storage} has job {row.name}, and count is {campaign.count:,}"
+                    f"{share}: a campaign can only grow. Give another folder with --out."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
@@ -309,7 +314,7 @@ def _look(
     for (name, digest), jobs in made.items():
         if (name, digest) not in now and name in dict(now):
             raise LidarError(
-                f"Jobs of {dataset.place} were made of another {name} than there is now: "
+                f"Jobs of {dataset.storage} were made of another {name} than there is now: "
                 f"{listed(jobs)}. Bring that back, or give another folder with --out."
             )
     return whole, wrong
@@ -372,7 +377,7 @@ def dataset_files(out: Storage, *, begun: bool) -> list[str]:
     LidarError if there is a link, or a file that neither jobs nor `write_shared` write.
     """
     files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
-    own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS
+    own = _FINISHED if CAMPAIGN_FILE in files else JOB_FILES
     for name in sorted(files):
         if not begun or not own.fullmatch(name):
             raise LidarError(

@@ -137,7 +137,7 @@ def campaign_report(
         "totals": figures.totals,
         "seconds": {
             "run": round(run.seconds, 3),
-            "casting": round(float(figures.each("seconds").sum()), 3),
+            "casting": round(float(figures.per_job("seconds").sum()), 3),
         },
         "of_a_job": {name: figures.spread(name) for name in ("points", "rays", "hits", "seconds")},
         "splits": {

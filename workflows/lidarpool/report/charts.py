@@ -58,7 +58,7 @@ def draw_varied(figures: Figures) -> Page | None:
     Jobs have the colours of the quantity of few labels that tells most about their points. None
     where nothing was varied or no job has run.
     """
-    there = [varied for varied in figures.varied if len(varied.there)]
+    there = [varied for varied in figures.varied if len(varied.known_values)]
     if not there:
         return None
     scales = [varied.folded() for varied in there[:MOST_VARIED]]
@@ -68,7 +68,7 @@ def draw_varied(figures: Figures) -> Page | None:
     below = BELOW + SLANTED * any(scale.slanted(wide) for scale in scales)
     high = COUNTS + GAP + AGAINST + below
     page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
-    points = figures.each("points")
+    points = figures.per_job("points")
     failures = figures.failures
     limits = _limits(points[~failures])
     telling = _most_telling(scales, points, ~failures)
@@ -138,7 +138,7 @@ def draw_results(figures: Figures) -> Page | None:
     if not done.any():
         return None
     points, rays, hits, seconds = (
-        figures.each(name)[done] for name in ("points", "rays", "hits", "seconds")
+        figures.per_job(name)[done] for name in ("points", "rays", "hits", "seconds")
     )
     with np.errstate(invalid="ignore"):
         quantities = (
@@ -155,8 +155,10 @@ def draw_results(figures: Figures) -> Page | None:
         _draw_counts(axes, quantity, np.zeros(len(points), np.bool_), [BAR])
         _set_labels(page, axes, quantity, wide)
         axes.set_xlabel(quantity.name)
-        if len(quantity.there):
-            axes.axvline(float(np.median(quantity.there)), color=theme.INK, lw=1.1 * page.unit)
+        if len(quantity.known_values):
+            axes.axvline(
+                float(np.median(quantity.known_values)), color=theme.INK, lw=1.1 * page.unit
+            )
     page.figure.axes[0].set_ylabel("jobs")
     page.title("What came of it", "Jobs by points, hits and time; the line is the median.")
     return page
@@ -186,7 +188,7 @@ def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colours: Iterable[A
     wide = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
     edges = scale.edges.tolist()
     failed = scale.values[failures & np.isfinite(scale.values)]
-    counts, *_ = axes.hist(scale.there, edges, rwidth=wide)
+    counts, *_ = axes.hist(scale.known_values, edges, rwidth=wide)
     for bar, colour in zip(axes.patches, cycle(colours)):
         bar.set_facecolor(colour)
     axes.hist(failed, edges, rwidth=wide, color=theme.SENSOR)

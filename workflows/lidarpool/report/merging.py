@@ -23,7 +23,7 @@ from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..columns.parts import part_name
-from ..datasets.dataset import INDEX_FILE, DataSet, ahead, manifest_file
+from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table
 from ..datasets.loader import read_index
 from ..export.folder import LAST_FILE, output_place, result_folder
@@ -85,7 +85,7 @@ class _Part:
         found |= {f"the file {name}": digest for name, digest in record["files"]}
         if record["casting"]:  # else it has cast nothing
             found |= {f"{name} of workers": value for name, value in record["casting"].items()}
-        return found | ({"the number of shards": self.shards[0].of} if self.shards else {})
+        return found | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
 @checked
@@ -216,7 +216,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
                 scans = shard.scans(scan_count)
                 job = CommittedJob(0, scans)
                 db.read(job)
-                if job.left:
+                if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
                 return _Part(place, record, [shard], scan_count, parts, job.trials)
@@ -265,7 +265,7 @@ def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> l
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
     """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    of = parts[-1].shards[0].of
+    of = parts[-1].shards[0].total
     parts = sorted(parts, key=lambda part: part.whole)
     have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
@@ -279,7 +279,7 @@ def _merge_dataset(
     """Take the jobs of all parts into a data set, and write what all jobs share."""
     begun = CAMPAIGN_FILE in out.sizes()
     dataset_files(out, begun=begun)
-    own = _of_dataset(out, of=parts[0].shards[0].of) if begun else None
+    own = _of_dataset(out, of=parts[0].shards[0].total) if begun else None
     known = [own, *parts] if own else parts
     notes = _check(known, partial, own)
     sensors = dict[str, str]()
@@ -313,7 +313,7 @@ def _merge_dataset(
             screen.warn(notes[-1])
         record["notes"] = notes
         more = {"sensors": sensors, "notes": tuple(notes)}
-        run = CampaignRun.of(_merged(files), 0.0, 0, **more)
+        run = CampaignRun.from_rows(_merged(files), 0.0, 0, **more)
         report = write_shared(dataset, record, run, lambda: _merged(files))[1]
     if own:  # a run with failed jobs, which would go on with what it knows of them
         remove_run(out.below(RUN_FOLDER))
@@ -361,7 +361,7 @@ class _RowFile:
             with self._path.open("rb") as file:
                 for _, offset in sorted(self._offsets.items()):
                     file.seek(offset)
-                    yield JobRow.of(json.loads(file.readline()))
+                    yield JobRow.from_json(json.loads(file.readline()))
 
 
 def _taken(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
@@ -458,7 +458,7 @@ class _Merged(SurveyOutput):
         """Take all points into the run's store; LidarError names damaged files."""
         store = run.store
         damaged = list[str]()
-        only = store.only
+        only = store.only_job
         mark = store.db.meta["mark"]
         assert only is not None, "of a survey"
 
@@ -480,7 +480,7 @@ class _Merged(SurveyOutput):
                 store.db.add_trials(only, part.trials)
             source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
             left = (one for one in part.points if only.parts.missing(one.first, one.stop))
-            for one, receipt in ahead(partial(take, source), left):
+            for one, receipt in read_ahead(partial(take, source), left):
                 if receipt is None or not store.db.commit([(only, receipt)]):
                     damaged.append(source.path(one.name))
         if damaged:

@@ -71,7 +71,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
     def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
-        if not run.goes_on:
+        if not run.continues_run:
             self.refuse(lambda: run.jobs.identity, overwrite=run.options.overwrite)
 
     def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:
@@ -187,7 +187,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 file = one.row.file
                 if storage and workers and one.row.in_pieces:
                     clear()
-                    one.put(storage, points(file), sweeps, workers)
+                    one.write_to_storage(storage, points(file), sweeps, workers)
                 else:
                     there = None if storage else workers
                     one.write(staged / file, points(file), sweeps, workers=there)

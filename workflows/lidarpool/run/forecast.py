@@ -1,4 +1,4 @@
-"""What a run would do and need, estimated without starting anything."""
+"""Estimate of a run's scans, memory and disk, without starting a worker."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ from .cluster.checks import check_memory, check_workers, find_workers, gpu_note,
 from .cluster.connection import default_workers
 from .options import RunOptions
 from .pipeline.names import GPU, LIDAR, OTHER
-from .pipeline.policies import most_scans
+from .pipeline.policies import max_scans_per_batch
 from .store.database import FILE
 from .store.run_store import RUN_FOLDER
 
-# Measured on Linux: a process of ours with Dask loaded.
-PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
-PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
-PART_BYTES = 2500  # of a part's head, and of its row in the database
-FIRST_PARTS = 60  # parts of a scan or a few, written before batches become large
-SCAN_BYTES = 64  # of a scan in the driver
-SUMMARY_BYTES = 28  # of a scan in the database
-FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
-ROOM_BYTES = 32 << 20  # for pictures and report
-TRAJECTORY_POSES = 1000  # by which the length of a trajectory is measured
-_FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
+# Measured on Linux: a worker process with Dask loaded.
+PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles the calls of Embree
+PARTICLE_BYTES = 140  # memory of a particle of the swarm, for each corner of its path
+PART_BYTES = 2500  # disk of a part's head, and of its row in the database
+FIRST_PARTS = 60  # parts of one or a few scans, written before batches become large
+SCAN_BYTES = 64  # memory of a scan in the driver
+SUMMARY_BYTES = 28  # disk of a scan in the database
+FORMAT_BYTES = 30  # largest size of a point in an exported file without its columns: LAS
+REPORT_BYTES = 32 << 20  # disk of pictures and report
+TRAJECTORY_POSES = 1000  # for measuring the length of a trajectory
+_FINE_SHARE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 
 def forecast(
@@ -79,14 +79,14 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    out = options.out
+    folder = options.out
     formats = job.outputs
-    assert out is not None, "commands write"
+    assert folder is not None, "commands write"
     mistakes = Mistakes()
     notes: list[str] = []
     warnings: list[str] = []
     with mistakes.noted():
-        notes += _folder_notes(out)
+        notes += _folder_notes(folder)
     occupied = bool(notes)  # an unfinished run
     if refuse is not None:
         try:
@@ -100,7 +100,7 @@ def forecast(
     cluster = _cluster_of(job, options, client, mistakes, notes)
     backend = cluster.backend
     estimate = None
-    # Casting here needs as much memory as on a worker: it would fail or be killed.
+    # Casting in this process needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
@@ -109,29 +109,21 @@ def forecast(
         notes += _fine_triangle_notes(job.scene)
     # Without an estimate every ray may hit.
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
-    # Scans of the largest batches; small ones take less.
-    fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=backend == "cuda")
-    batch = most_scans(fit, job.survey.scan_count, max(1, cluster.slots[GPU]["there"]))
-    disk = _disk(job, points, batch, len(formats), out)
-    stored = isinstance(out, Storage)
-    disk_needed = disk["result"] + (0 if stored else disk["parts"])
-    if disk["free"] < disk_needed:
-        mistakes.lines.append(
-            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
-            f"needs about {format_bytes(disk_needed)}: make room, name another folder with "
-            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
-        )
-    needed = _bytes_needed(job, points, batch, cluster, local=options.own and client is None)
-    if cluster.memory and cluster.memory < needed:
-        mistakes.lines.append(
-            f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "
-            f"{format_bytes(needed)}: take a smaller scene, fewer casting workers (pool.gpu), a "
-            "smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
-        )
+    # Scans of the largest batches; small batches take less memory.
+    scans_per_batch = max_scans_per_batch(
+        scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=backend == "cuda"),
+        job.survey.scan_count,
+        max(1, cluster.slots[GPU]["there"]),
+    )
+    disk = _disk(job, points, scans_per_batch, len(formats), folder)
+    mistakes.lines += _disk_mistakes(disk, stored=isinstance(folder, Storage))
+    local = options.starts_workers and client is None
+    required_bytes = _bytes_needed(job, points, scans_per_batch, cluster, local=local)
+    mistakes.lines += _memory_mistakes(cluster.memory, required_bytes)
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
-        "occupied": occupied,  # whether the place of the result holds another one
+        "occupied": occupied,  # True if the folder of the result holds another result
         "notes": notes,
         "warnings": warnings,
         "objects": len(job.scene.all_names),
@@ -148,13 +140,13 @@ def forecast(
         "backend": backend,
         "casters": cluster.casters,
         "slots": cluster.slots,
-        "memory": {"needed": needed, "there": cluster.memory or None},
+        "memory": {"needed": required_bytes, "there": cluster.memory or None},
         "disk": disk,
     }
 
 
 class _Cluster(NamedTuple):
-    """The cluster of a run, as far as the cluster is known."""
+    """The cluster of a run, as far as it is known."""
 
     slots: dict[str, dict[str, int]]  # {partition: {"needed": …, "there": …}}
     casters: int  # casting workers
@@ -178,10 +170,10 @@ def _cluster_of(
         held = [worker.resources for worker in Pool.from_client(client)]
         present = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
         with mistakes.noted():
-            everybody, casting, backend, _ = find_workers(client, required, options.backend)
+            pool, casting, backend, _ = find_workers(client, required, options.backend)
             check_workers(job, options, backend, casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
-            notes += filter(None, [gpu_note(everybody, casting, backend)])
+            notes += filter(None, [gpu_note(pool, casting, backend)])
     else:
         workers = default_workers(CPU_COUNT, len(visible_gpus()))
         present = {
@@ -198,42 +190,74 @@ def _cluster_of(
             worker_memory = MEMORY_LIMIT / CPU_COUNT
             check_memory(job, options, backend, worker_memory, "a casting worker of this machine")
     slots = {
-        name: {"needed": needed, "there": present.get(name, 0)} for name, needed in required.items()
+        name: {"needed": required_slots, "there": present.get(name, 0)}
+        for name, required_slots in required.items()
     }
     casters = slots[GPU]["there"] if casting is None else len(casting)
     return _Cluster(slots, casters, backend, memory)
 
 
-def _bytes_needed(job: Job, points: int, batch: int, cluster: _Cluster, *, local: bool) -> int:
+def _bytes_needed(
+    job: Job, points: int, scans_per_batch: int, cluster: _Cluster, *, local: bool
+) -> int:
     """Return the memory of a casting worker, or of all processes of a local cluster, in bytes."""
     on_device = cluster.backend == "cuda"
-    worker = _worker_bytes(job) + cast_bytes(job.scene, job.survey, batch, on_device=on_device)
+    worker = _worker_bytes(job) + cast_bytes(
+        job.scene, job.survey, scans_per_batch, on_device=on_device
+    )
     if not local:
         return worker
     return worker * cluster.casters + _rest_bytes(job, points, cluster.slots)
 
 
-def _disk(job: Job, points: int, batch: int, exports: int, out: Path | Storage) -> dict[str, Any]:
+def _disk(
+    job: Job, points: int, scans_per_batch: int, exports: int, result: Path | Storage
+) -> dict[str, Any]:
     """Return the disk that a run and its result need, and the free disk, in bytes.
 
-    A run needs disk for parts and database. Large parts are of `batch` scans.
+    A run needs disk for parts and database. Large parts are of `scans_per_batch` scans.
     """
     survey = job.survey
     faces = job.scene.kept_triangles
-    point = _point_bytes(job)
-    full = -(-survey.scan_count // batch)
-    parts = min(survey.scan_count, full + FIRST_PARTS)
+    point_bytes = _point_bytes(job)
+    large_parts = -(-survey.scan_count // scans_per_batch)
+    parts = min(survey.scan_count, large_parts + FIRST_PARTS)
     # Each part names the triangles that its rays hit.
-    tally = 12 * min(faces, survey.ray_count // full // 10) * full
-    run = point * points + PART_BYTES * parts + tally + SUMMARY_BYTES * survey.scan_count
-    # A row of the PLY has doubles for coordinates at most; one piece exists twice.
-    cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
-    result = cloud + (point + FORMAT_BYTES) * points * exports + ROOM_BYTES + 36 * faces
-    result += instrument_bytes(survey, exports)
-    # What goes into storage is made in a folder for temporary files, but for the parts.
-    folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
+    tally_bytes = 12 * min(faces, survey.ray_count // large_parts // 10) * large_parts
+    run_bytes = point_bytes * points + PART_BYTES * parts + tally_bytes
+    run_bytes += SUMMARY_BYTES * survey.scan_count
+    # A row of the PLY has doubles for coordinates at most; a chunk exists twice.
+    cloud_bytes = (point_bytes + 16) * (points + min(points, CHUNK_POINTS))
+    export_bytes = (point_bytes + FORMAT_BYTES) * points * exports
+    result_bytes = cloud_bytes + export_bytes + REPORT_BYTES + 36 * faces
+    result_bytes += instrument_bytes(survey, exports)
+    # Files for a remote storage, but no parts, are first written to a temporary folder.
+    folder = Path(tempfile.gettempdir()) if isinstance(result, Storage) else result
     free = shutil.disk_usage(_existing(folder)).free
-    return {"parts": run, "result": result, "free": free, "folder": str(folder)}
+    return {"parts": run_bytes, "result": result_bytes, "free": free, "folder": str(folder)}
+
+
+def _disk_mistakes(disk: dict[str, Any], *, stored: bool) -> list[str]:
+    """Return a message if the disk is too small for the result, `stored` or in a folder."""
+    required_bytes = disk["result"] + (0 if stored else disk["parts"])
+    if disk["free"] >= required_bytes:
+        return []
+    return [
+        f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
+        f"needs about {format_bytes(required_bytes)}: make room, name another folder with "
+        f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
+    ]
+
+
+def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
+    """Return a message if the memory is too small; 0 available bytes are unknown."""
+    if not available_bytes or available_bytes >= required_bytes:
+        return []
+    return [
+        f"There are {format_bytes(available_bytes)} of memory, and the run needs about "
+        f"{format_bytes(required_bytes)}: take a smaller scene, fewer casting workers (pool.gpu), "
+        "a smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
+    ]
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
@@ -258,35 +282,35 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     return {"seconds": seconds, "metres": metres, "sensors": sensors}
 
 
-def _existing(out: Path) -> Path:
+def _existing(folder: Path) -> Path:
     """Return a folder, or its innermost existing parent."""
-    return next(path for path in (out, *out.absolute().parents) if path.exists())
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def _fine_triangle_notes(scene: Scene) -> list[str]:
     """Return a note on triangles too small for Embree, which tests in float32; perhaps none."""
     count = 0
-    shortest = _FINE * np.ptp(scene.bounds, axis=0).max()
+    shortest = _FINE_SHARE * np.ptp(scene.bounds, axis=0).max()
     parts = scene.instances.parts if scene.instances else ()
     for points, faces in ((scene.vertices, scene.faces), *((p.vertices, p.faces) for p in parts)):
         corners = points[faces.T]
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
-        # Without an area no backend hits them.
+        # No backend hits triangles without an area.
         count += int(((edges > 0) & (edges < shortest)).sum())
     note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
     return [f"{plural(count, 'triangle')} {note}"] if count else []
 
 
-def _folder_notes(out: Path | Storage) -> list[str]:
+def _folder_notes(location: Path | Storage) -> list[str]:
     """Return notes on the folder of a result; LidarError if the folder cannot be written."""
-    if isinstance(out, Storage):
-        out.claim()  # leaves nothing
-    elif not (folder := _existing(out)).is_dir():
+    if isinstance(location, Storage):
+        location.claim()  # leaves nothing
+    elif not (folder := _existing(location)).is_dir():
         raise LidarError(f"{folder} is a file: give a folder for the results with --out.")
     elif not os.access(folder, os.W_OK | os.X_OK):
         raise LidarError(f"Cannot write to the folder {folder}: give another with --out.")
-    unfinished = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
-    note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
+    unfinished = FILE in Storage.at(location).below(RUN_FOLDER).sizes()
+    note = f"{location} holds an unfinished run: --resume continues it, --fresh deletes it"
     return [note] if unfinished else []
 
 
@@ -300,12 +324,13 @@ def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
     scene = job.scene
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     planning = PROCESS_BYTES + PARTICLE_BYTES * swarm
-    piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    shown = scene.kept_triangles + DRAWN_TRIANGLES
-    if not scene.masked:  # which is cut into more
-        shown = min(scene.triangles, shown)
-    driver = 2 * SCENE_TRIANGLE * shown + INSTANCE * len(scene.instances or ()) + piece
-    driver += SCAN_BYTES * job.survey.scan_count
+    # A chunk of points is merged, written and read back.
+    chunk_bytes = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)
+    shown_triangles = scene.kept_triangles + DRAWN_TRIANGLES
+    if not scene.masked:  # masked triangles are cut into more triangles
+        shown_triangles = min(scene.triangles, shown_triangles)
+    driver = 2 * SCENE_TRIANGLE * shown_triangles + INSTANCE * len(scene.instances or ())
+    driver += chunk_bytes + SCAN_BYTES * job.survey.scan_count
     return planning * slots.get(OTHER, {"there": 0})["there"] + driver + 2 * PROCESS_BYTES
 
 

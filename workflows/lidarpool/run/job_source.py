@@ -1,4 +1,4 @@
-"""The jobs of a run: the only one of a survey, or those of a campaign, made a few ahead."""
+"""The jobs of a run: the single job of a survey, or the jobs of a campaign, made a few ahead."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ..scenario.build import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
 
-READY = 16  # jobs that are made ahead: small ones are cast several at a time,
-SCENES = 2  # and they have so many scenes at most
-STOP_S = 10.0  # for a job that is being made when the run ends
+MAX_READY = 16  # jobs that are made ahead, since small jobs are cast several at a time
+MAX_SCENES = 2  # scenes of the jobs that are made ahead
+STOP_S = 10.0  # wait for a job that is being made when the run ends
 CONTENT = ("scene", "survey", "planning")  # the fields of a job that its result depends on
 
 
 def identity_of(job: Job) -> dict[str, str]:
-    """Fingerprints of the inputs of a job: those with the same ones give the same bytes.
+    """Return fingerprints of the inputs of a job; equal fingerprints give equal bytes.
 
     JobError if a sensor, column or trajectory has a field without a fingerprint.
     """
@@ -67,11 +67,11 @@ class Jobs(Protocol):
 
     @property
     def identity(self) -> Mapping[str, str]:
-        """Hashes of what the results depend on, by name."""
+        """Hashes of all inputs that the results depend on, by name."""
         ...
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job with some further columns; `cache` has scenes that jobs share."""
+        """Make a job with additional columns; `cache` has scenes that jobs share."""
         ...
 
     def name(self, number: int) -> str:
@@ -89,7 +89,7 @@ class Jobs(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class OneJob:
-    """A survey as the only job of its run, of which the run does the scans of a shard."""
+    """A survey as the only job of its run, which does the scans of a shard."""
 
     survey_job: Job
     shard: Shard = ALL
@@ -99,7 +99,7 @@ class OneJob:
 
     @cached_property
     def only_job(self) -> Job:
-        """The job as this shard does it: the first shard alone plans the path."""
+        """The job as this shard does it: only the first shard plans the path."""
         job = self.survey_job
         return job if self.shard.number == 1 else replace(job, planning=None)
 
@@ -126,9 +126,9 @@ class OneJob:
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
-    """Return the row of a job that has failed, perhaps because it cannot be made."""
+    """Return the row of a job that has failed, and perhaps cannot be made."""
     values: Mapping[str, Value] = {}
-    with suppress(Exception):  # which is what has failed
+    with suppress(Exception):  # the values themselves may be the cause
         values = jobs.values(number)
     return JobRow(number, jobs.name(number), jobs.split(number), dict(values), str(error))
 
@@ -136,8 +136,8 @@ def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
 class JobMaker:
     """Makes jobs with their sweeps in a thread, a few ahead.
 
-    `numbers` are those of the jobs that are left, and `columns` names of the columns that the data
-    set needs.
+    `numbers` are the numbers of the remaining jobs, and `columns` names of the columns that the
+    data set needs.
     """
 
     def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str]) -> None:
@@ -145,41 +145,41 @@ class JobMaker:
         self._numbers = numbers
         self._columns = columns
         self._cache = SceneCache()
-        self._ready: Queue[Job | JobRow | BaseException | None] = Queue(READY)
+        self._ready: Queue[Job | JobRow | BaseException | None] = Queue(MAX_READY)
         self._stopped = Event()
-        self._full = False  # whether it waits because of the memory of scenes
-        self.ended = False  # whether the last was taken
+        self._full = False  # True while the thread waits because of the memory of scenes
+        self.ended = False  # True after the last job was taken
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
     def take(self, *, wait: bool = False) -> Job | JobRow | None:
-        """Return the next job, or the row of one that cannot be made.
+        """Return the next job, or the row of a job that cannot be made.
 
-        None if there is none yet, unless it is to `wait`, and after the last.
+        None after the last job; without `wait`, also if no job is ready.
         """
         try:
-            taken = None if self.ended else self._ready.get(block=wait)
+            entry = None if self.ended else self._ready.get(block=wait)
         except Empty:
             return None
-        self.ended |= taken is None
-        if isinstance(taken, BaseException):
-            raise taken
-        return taken
+        self.ended |= entry is None
+        if isinstance(entry, BaseException):
+            raise entry
+        return entry
 
     def has(self, jobs: int) -> bool:
-        """Return True if so many jobs are ready, or no more will be until some are taken."""
+        """Return True if `jobs` jobs are ready, or the thread waits until jobs are taken."""
         waits = self._full or not self._thread.is_alive()
-        return waits or self._ready.qsize() >= min(jobs, READY)
+        return waits or self._ready.qsize() >= min(jobs, MAX_READY)
 
     def _work(self) -> None:
-        last: BaseException | None = None
+        end_marker: BaseException | None = None
         try:
             for number in self._numbers:
                 if not self._put(self._make(number)):
                     return
         except BaseException as error:
-            last = error
-        self._put(last)
+            end_marker = error
+        self._put(end_marker)
 
     def _make(self, number: int) -> Job | JobRow:
         try:
@@ -193,20 +193,20 @@ class JobMaker:
             reason = str(error) if isinstance(error, LidarError) else repr(error)
             return failed_row(self._jobs, number, reason)
 
-    def _put(self, made: Job | JobRow | BaseException | None) -> bool:
-        """Put what was made into the queue; returns False if the maker was stopped before."""
+    def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
+        """Put a job, row or error into the queue; return False if the maker was stopped before."""
         while not self._stopped.is_set():
             scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
-            self._full = len({id(scene.vertices) for scene in scenes}) > SCENES
+            self._full = len({id(scene.vertices) for scene in scenes}) > MAX_SCENES
             if self._full:
                 time.sleep(0.05)
                 continue
             with suppress(Full):
-                self._ready.put(made, timeout=0.1)
+                self._ready.put(entry, timeout=0.1)
                 return True
         return False
 
     def close(self) -> None:
-        """Make no more jobs."""
+        """Stop making jobs."""
         self._stopped.set()
         self._thread.join(STOP_S)

@@ -1,4 +1,4 @@
-"""How jobs are run: the options of the command line and of Python."""
+"""Options of a run, of the command line and of Python."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from .cluster.connection import TlsFiles
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
 class RunOptions(TaskOptions):
-    """How jobs are run, on what cluster, and what happens to an earlier run.
+    """Options of casting, of the cluster, and of the treatment of an earlier run.
 
     In Python they are the `RunKeywords` of `simulate`, `Campaign.run` and `Campaign.stream`, which
-    describe them; the same are options of commands. The defaults are those of all.
+    describe them; the same are options of commands. The defaults are valid for all.
     """
 
     out: Path | Storage | None = None  # of the result or data set; None if nothing is written
-    # Of what the run keeps until its result is complete; None for a temporary folder that goes with
-    # the last user of the points.
+    # Folder of the run's store until the result is complete; None for a temporary folder that is
+    # deleted with the last user of the points.
     folder: str | Path | Storage | None = None
     parts: str | Path | None = None
     resume: bool = False
@@ -51,20 +51,20 @@ class RunOptions(TaskOptions):
     wait_s: Annotated[float, Field(ge=0)] = WAIT_S
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: bool = False
-    stay: bool = True  # of the live page, at the end
+    stay: bool = True  # False if the live page ends with the run
 
     def with_pool(
-        self, pool: PoolSection, given: Mapping[str, Any] = MappingProxyType({})
+        self, pool: PoolSection, overrides: Mapping[str, Any] = MappingProxyType({})
     ) -> RunOptions:
-        """Fill in a scenario's section `pool`; options that are `given`, and not None, stay."""
+        """Fill in a scenario's section `pool`; options in `overrides` that are not None stay."""
         options = declared(pool, TaskOptions)
-        options |= {name: given[name] for name in options if given.get(name) is not None}
+        options |= {name: overrides[name] for name in options if overrides.get(name) is not None}
         options["gpu_workers"] = self.gpu_workers or pool.gpu
         options["other_workers"] = self.other_workers or pool.other
         return replace(self, **options)
 
     @property
-    def own(self) -> bool:
+    def starts_workers(self) -> bool:
         """True if a cluster of this machine is started for the run."""
         return self.client is None and self.scheduler is None and self.cluster is None
 
@@ -72,8 +72,8 @@ class RunOptions(TaskOptions):
 class RunKeywords(TypedDict, total=False):
     """`RunOptions` as keywords of Python.
 
-    The place of a result is a parameter there, and a client stands for the ways to a cluster that
-    commands have.
+    The destination of a result is a parameter there, and a client replaces the options for clusters
+    that commands have.
     """
 
     collectors: int
@@ -96,17 +96,17 @@ class RunKeywords(TypedDict, total=False):
     live: bool
 
 
-def given_options(
+def options_of_call(
     call: str, keywords: RunKeywords, without: Collection[str] = ()
 ) -> dict[str, Any]:
     """Return the keywords of a call that are not None.
 
-    TypeError, as Python's, for a keyword that is no option, or is meaningless in this call: those
-    are named in `without`.
+    TypeError, as Python's, for a keyword that is no option, or is meaningless in this call: such
+    keywords are in `without`.
     """
     accepted = RunKeywords.__annotations__.keys() - set(without)
     for name in keywords:
         if name not in accepted:
-            near = did_you_mean(name, accepted)
-            raise TypeError(f"{call}() got an unexpected keyword argument {name!r}.{near}")
+            suggestion = did_you_mean(name, accepted)
+            raise TypeError(f"{call}() got an unexpected keyword argument {name!r}.{suggestion}")
     return {name: value for name, value in keywords.items() if value is not None}

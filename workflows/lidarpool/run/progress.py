@@ -1,4 +1,4 @@
-"""Progress of a run, its texts, and what is shown of it at a terminal or in a notebook."""
+"""Progress of a run, its texts, and its display at a terminal or in a notebook."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SURE_S = 20.0
 
 @dataclass(frozen=True)
 class Progress:
-    """Counts of a run at one moment."""
+    """Counts of a run at a moment."""
 
     seconds: float = 0.0  # since the start
     scans: int = 0
@@ -54,12 +54,12 @@ Show = Callable[[Progress], None]
 
 
 def in_words(rate: float) -> str:
-    """Rate with two significant digits at least: 0.25, 3.1, 52, 1,234."""
+    """Return a rate with two significant digits at least: 0.25, 3.1, 52, 1,234."""
     return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
 def time_in_words(seconds: float) -> str:
-    """Time in words: 8 s, 3 min, 2 h 05 min."""
+    """Return a time in words: 8 s, 3 min, 2 h 05 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -67,38 +67,38 @@ def time_in_words(seconds: float) -> str:
 
 
 class Pace:
-    """Rate of a count since it was first seen, and the time left."""
+    """Rate of a count since its first value, and the remaining time."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
 
     def rate(self, seconds: float, count: int) -> float:
-        """Rate, 1/s; 0 until something has been counted."""
-        begin, before = self._first = self._first or (seconds, count)
-        return (count - before) / (seconds - begin) if seconds > begin else 0.0
+        """Return the rate, 1/s; 0 until the count has grown."""
+        start_s, first_count = self._first = self._first or (seconds, count)
+        return (count - first_count) / (seconds - start_s) if seconds > start_s else 0.0
 
-    def left(self, seconds: float, count: int, whole: int) -> str:
-        """Time that is left; empty until enough has been counted, and at the end."""
+    def time_left(self, seconds: float, count: int, total: int) -> str:
+        """Return the remaining time in words; empty until the estimate is good, and at the end."""
         rate = self.rate(seconds, count)
-        sure = rate and (count >= SURE_SHARE * whole or seconds >= SURE_S) and count < whole
-        return time_in_words((whole - count) / rate) if sure else ""
+        sure = rate and (count >= SURE_SHARE * total or seconds >= SURE_S) and count < total
+        return time_in_words((total - count) / rate) if sure else ""
 
-    def told(self, seconds: float, count: int, whole: int) -> str:
-        """Rate and time left; empty until something has been counted."""
+    def text(self, seconds: float, count: int, total: int) -> str:
+        """Return rate and remaining time; empty until the count has grown."""
         rate = self.rate(seconds, count)
-        left = self.left(seconds, count, whole)
-        return f"{in_words(rate)}/s{f'  {left} left' if left else ''}" if rate else ""
+        time_left = self.time_left(seconds, count, total)
+        return f"{in_words(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
-def standing_still(progress: Progress) -> str:
-    """Why the run waits; empty if it does not."""
+def waiting_reason(progress: Progress) -> str:
+    """Return why the run waits; empty if the run does not wait."""
     slots = progress.waits_for
     return f"waits for slots of {slots}, which other runs hold" if slots else ""
 
 
 @contextmanager
-def rows(console: Console) -> Iterator[Callable[..., None]]:
-    """Bars that appear when they are first moved; yields the function that moves one."""
+def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
+    """Progress bars, created on first update; yields `update(name, count, total, unit)`."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -106,39 +106,39 @@ def rows(console: Console) -> Iterator[Callable[..., None]]:
         TextColumn("{task.fields[unit]:<6}"),
         TextColumn("{task.fields[pace]}", style="progress.remaining"),
     )
-    with Bars(*columns, console=console) as shown:
+    with Bars(*columns, console=console) as display:
         lines: dict[str, TaskID] = {}
 
-        def move(label: str, done: int, total: int, unit: str, pace: str = "") -> None:
+        def move(label: str, count: int, total: int, unit: str, pace: str = "") -> None:
             if label not in lines:
-                lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
-            shown.update(lines[label], completed=done, pace=pace)
+                lines[label] = display.add_task(label, total=total, unit=unit, pace="")
+            display.update(lines[label], completed=count, pace=pace)
 
         yield move
 
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Bars by stage with rates and time left; yields the function that moves them."""
+    """Progress bars of the stages with rates and remaining time; yields their update function."""
     paces = {label: Pace() for label, _, _ in STAGES}
-    with rows(console) as move:
+    with progress_rows(console) as move:
 
         def show(progress: Progress) -> None:
-            for label, count, unit in STAGES:
-                done = getattr(progress, count)
-                total = getattr(progress, unit)
+            for label, count_name, total_name in STAGES:
+                count = getattr(progress, count_name)
+                total = getattr(progress, total_name)
                 if total:
-                    pace = paces[label].told(progress.seconds, done, total)
-                    if unit == "scans" and done < total:
-                        pace = standing_still(progress) or pace
-                    move(label, done, total, unit, pace)
+                    pace = paces[label].text(progress.seconds, count, total)
+                    if total_name == "scans" and count < total:
+                        pace = waiting_reason(progress) or pace
+                    move(label, count, total, total_name, pace)
 
         yield show
 
 
 @contextmanager
 def bars_here() -> Iterator[Show]:
-    """Bars in the cell of a notebook or at the terminal of a script; elsewhere nothing is shown."""
+    """Progress bars in a notebook cell or at a terminal; elsewhere, a function without effect."""
     console = Console(stderr=cell_display() is None)
     if console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal):
         with bars(console) as show:
@@ -151,7 +151,7 @@ logger = logging.getLogger(__name__)
 
 
 class Screen:
-    """Tells a caller of Python: notes go to the log, and bars are where they can be seen.
+    """Reports to a caller of Python: notes go to the log, and bars to a terminal or notebook.
 
     `on_progress` is called in place of bars.
     """
@@ -160,27 +160,30 @@ class Screen:
         self._on_progress = on_progress
 
     def tell(self, words: str) -> None:
-        """Tell something that the user should know."""
+        """Log a note for the user."""
         logger.info(words)
 
     def warn(self, words: str) -> None:
-        """Tell something that is probably a mistake."""
+        """Log a warning about a probable mistake."""
         logger.warning(words)
 
     def status(self, words: str) -> AbstractContextManager[None]:
-        """Show what is going on while the body runs."""
+        """Return a context that shows the current activity."""
         return nullcontext()
 
     def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
-        """Show what is being written while the body runs; give the function to call."""
+        """Return a context that shows the progress of writing; its value is the update function."""
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
-        """Show the progress while the body runs; gives the function that does."""
+        """Return a context that shows the progress of a run; its value is the update function."""
         return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
 
     def starting(
-        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+        self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> AbstractContextManager[Client]:
-        """Show that a cluster is being started; `own` if its workers share the terminal."""
+        """Return a context that starts a cluster and shows its start.
+
+        `shares_terminal` is True if the workers write to the same terminal.
+        """
         return cluster

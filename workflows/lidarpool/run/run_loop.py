@@ -1,4 +1,4 @@
-"""The loop of a run: jobs are cast several at a time, committed and written, paths are planned."""
+"""The loop of a run: jobs are cast several at a time, committed and written, and paths planned."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from .writer import JobFiles, JobWriter
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
-SPARE = 64  # jobs under way beside two for each GPU slot
+EXTRA_JOBS = 64  # jobs under way in addition to two for each GPU slot
 
 
 class RunLoop:
-    """Takes the jobs of a run through the pipeline: the first job, and those of `maker`.
+    """Takes the jobs of a run through the pipeline: the first job, and the jobs of `maker`.
 
-    Jobs are written into a `dataset`. Without a data set there is only one job: its parts are kept,
+    Jobs are written into a `dataset`. Without a data set there is a single job: its parts are kept,
     and `on_frame` is called with its frames.
     """
 
@@ -87,7 +87,7 @@ class RunLoop:
         self._scans_begun = 0
         self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
-        self._only_committed = False  # True once the only job is, whose parts are kept
+        self._only_committed = False  # True once the only job is committed
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
         self.stages: tuple[StageTotals, ...] = ()
 
@@ -101,9 +101,9 @@ class RunLoop:
         return self._maker.ended and not self._store.under_way
 
     def step(self) -> bool:
-        """Do what can be done now; return False if nothing was to be done.
+        """Step the pipeline and the writer once; return True if there were changes.
 
-        LidarError if what all jobs need fails.
+        LidarError if a failure concerns all jobs.
         """
         moved = self._admit()
         moved |= self._pipeline.step()
@@ -118,8 +118,10 @@ class RunLoop:
         error_of_all: LidarError | None = None
         # A stage whose worker has died gets its slot first.
         slots = 0 if self._pipeline.stages.lacks_slot else self._cluster.spare
-        more = bool(self._pipeline.jobs)
-        for files, outcome in () if self._writer is None else self._writer.step(slots, more=more):
+        more_to_come = bool(self._pipeline.jobs)
+        for files, outcome in (
+            () if self._writer is None else self._writer.step(slots, more_to_come=more_to_come)
+        ):
             moved = True
             if isinstance(outcome, JobError):
                 self._fail(files.row.number, outcome)
@@ -133,43 +135,43 @@ class RunLoop:
         return moved
 
     def _admit(self) -> bool:
-        """Take on jobs that are ready, if there is room for them; return False if none was."""
+        """Begin jobs that are ready, if there is room; return True if any was begun."""
         moved = False
-        max_under_way = SPARE + 2 * self._pipeline.workers.slot_count
+        max_under_way = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, and go on together: then they share messages and tasks.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
         if self._maker is None or not self._maker.has(together):
             return False
         while self._pipeline.has_room and len(self._store.under_way) < max_under_way:
-            if (made := self._maker.take()) is None:
+            if (entry := self._maker.take()) is None:
                 break
             moved = True
-            if isinstance(made, JobRow):
-                self._rows.append(made)
+            if isinstance(entry, JobRow):
+                self._rows.append(entry)
             else:
-                self._begin(made)
+                self._begin(entry)
         return moved
 
     def _begin(self, job: Job) -> None:
-        """Take a job on, unless its scans are too large for the workers."""
-        under_way = self._store.take_on(job)
+        """Begin a job, unless its scans are too large for the workers."""
+        under_way = self._store.open_job(job)
         try:
-            if self._writer is not None:  # else it was checked before anything was started
+            if self._writer is not None:  # the only job of a run was checked at the start
                 self._cluster.check(job)
             self._cast(under_way)
         except JobError as error:  # too large for the workers, or it cannot be pickled
             self._fail(job.number, error)
 
     def _cast(self, job: JobUnderWay) -> None:
-        """Give a job to the pipeline, and begin its planning."""
+        """Add a job to the pipeline, and begin its planning."""
         cluster = self._cluster
         is_only = self._writer is None
         planning = job.job.planning
         if is_only and planning is not None:
             self._trials = TrialPump(cluster.tasks(OTHER), planning, job.trials)
             self._trials.step()  # first: no slot of OTHER waits for the survey
-            self._trials.tasks.partition.want(0)  # from now on its trials wait for workers
-        # Of a campaign's job many follow, so that its batches need not be divided among all.
+            self._trials.tasks.partition.want(0)  # waiting trials request workers from now on
+        # Many jobs follow in a campaign, so that batches need not be divided among all slots.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
         self._pipeline.begin(
             job,
@@ -186,10 +188,10 @@ class RunLoop:
         self._jobs_begun += 1
         self._scans_begun += len(job.scans)
         to_come = max(0, jobs_left - len(self._store.under_way))
-        self._pipeline.later = to_come * self._scans_begun // self._jobs_begun
+        self._pipeline.scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
     def _files_of(self, under_way: JobUnderWay) -> JobFiles:
-        """Return what a job that is committed is written from."""
+        """Return the input of the writer for a committed job."""
         job = under_way.job
         row = JobRow(
             number=job.number,
@@ -205,25 +207,25 @@ class RunLoop:
         return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
-        """Note that a job has failed; if there is only one, so has the run."""
-        if self._store.only is not None:
+        """Record a failed job; raise the error if the run has a single job."""
+        if self._store.only_job is not None:
             raise error
         self._rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self) -> None:
-        """Commit that jobs have ended, and remove what is left of them."""
+        """Commit jobs that have ended, and remove their parts."""
         rows = self._rows
         self._rows = []
         if not rows:
             return
         under_way = self._store.under_way  # without jobs that could not be made
-        left = [(row, under_way[row.number]) for row in rows if row.number in under_way]
+        ended = [(row, under_way[row.number]) for row in rows if row.number in under_way]
         self._store.name_sensors(
             (
                 carried.name or "lidar",
                 f"{sensor.model}, {1e9 / sensor.revolution_start_ns(1):.3g} Hz",
             )
-            for row, job in left
+            for row, job in ended
             if row.done
             for carried in job.survey.carried
             for sensor in [carried.sensor]
@@ -231,19 +233,19 @@ class RunLoop:
         self._store.end(rows)
         for row in rows:
             self._page.ended(row)
-        self._remover.submit(self._remove, left)
+        self._remover.submit(self._remove, ended)
 
     def _remove(self, ended: Sequence[tuple[JobRow, JobUnderWay]]) -> None:
-        """Remove the parts of jobs that have ended, after the page has looked at them."""
+        """Remove the parts of jobs that have ended, after the page has read their points."""
         for row, job in ended:
-            with suppress(LidarError, OSError):  # what is left does no harm
+            with suppress(LidarError, OSError):  # remaining files do no harm
                 if row.done:
                     self._page.look(row, job)
             with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in job.parts.ordered])
 
     def under_way(self) -> list[dict[str, Any]]:
-        """Return the states of the jobs that are being cast, and then of those being written."""
+        """Return the states of the jobs that are being cast, then of the jobs being written."""
         writing = {row.number for row in self._writer.jobs} if self._writer else set()
         jobs = [*self._store.under_way.values()]
         states = [job.status(is_writing=job.number in writing) for job in jobs]
@@ -252,7 +254,7 @@ class RunLoop:
     # -- to the end --------------------------------------------------------------------------
 
     def cast(self, first: Job, show: Show) -> None:
-        """Do all jobs; on any error, everything has been stopped."""
+        """Do all jobs; on any error, all tasks have been stopped."""
         cluster = self._cluster
         pipeline = self._pipeline
         try:
@@ -265,19 +267,19 @@ class RunLoop:
                 self._writer.close()
             self._remover.shutdown()
         self._save()
-        self._store.save(now=True)
+        self._store.save(force=True)
         self._store.tidy()
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
         self.stages = tuple(totals for book in books for totals in book.stages.values())
         self._store.notes += pipeline.notes
         if self._writer is not None and self._writer.hidden:
-            place = self._writer.dataset.place
-            note = f"no worker of {LIDAR} sees {place}: the driver wrote the data set"
+            storage = self._writer.dataset.storage
+            note = f"no worker of {LIDAR} sees {storage}: the driver wrote the data set"
             self._store.notes.append(note)
 
     def _loop(self, first: Job, show: Show) -> None:
-        """Step everything until all have finished."""
+        """Step pipeline, writer and planning until all have finished."""
         pipeline = self._pipeline
         started = time.monotonic()
         pause_s = 0.0
@@ -298,15 +300,15 @@ class RunLoop:
                 if self._trials.finished:
                     self.times["planning"] = time.monotonic() - started
                     watch.forget([OTHER])
-            now = time.monotonic()
-            if now - saved_at >= SAVE_EVERY_S:
-                saved_at = now
+            now_s = time.monotonic()
+            if now_s - saved_at >= SAVE_EVERY_S:
+                saved_at = now_s
                 self._save()
             watch.look()
-            if now - shown_at >= PROGRESS_EVERY_S or self.finished:
-                shown_at = now
+            if now_s - shown_at >= PROGRESS_EVERY_S or self.finished:
+                shown_at = now_s
                 waits_for = LIDAR if pipeline.stages.waiting else ""
-                progress = replace(self._progress(), seconds=now - started, waits_for=waits_for)
+                progress = replace(self._progress(), seconds=now_s - started, waits_for=waits_for)
                 self._cluster.call(show, progress)
                 self._cluster.call(self._page.on_progress, progress, self.under_way)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
@@ -319,14 +321,14 @@ class RunLoop:
         self._store.notes += watch.notes
 
     def _save(self) -> None:
-        """Commit the trials that are done, and the number of frames that were handed out."""
-        if self._trials is not None and (only := self._store.only) is not None:
-            self._store.db.add_trials(only, self._trials.trials[len(only.trials) :])
+        """Commit finished trials, and the number of frames that were handed out."""
+        if self._trials is not None and (only_job := self._store.only_job) is not None:
+            self._store.db.add_trials(only_job, self._trials.trials[len(only_job.trials) :])
         self._store.save()
 
     def _progress(self) -> Progress:
         """Return the counts of the run, without its time."""
-        if (job := self._store.only) is None:
+        if (job := self._store.only_job) is None:
             numbers = self._store.jobs.numbers
             ended = self._store.db.ended_count
             return Progress(jobs=len(numbers), jobs_done=ended)
@@ -341,7 +343,7 @@ class RunLoop:
         return replace(progress, trials_done=len(self._trials.trials))
 
     def _stop(self, reason: str) -> None:
-        """Stop everything, as far as the cluster can be reached."""
+        """Stop all tasks, as far as the cluster can be reached."""
         client = self._cluster.client
         pipeline = self._pipeline
         trials = self._trials

@@ -1,4 +1,4 @@
-"""What a run tells a live page, see `lidarpool.live.live_page`."""
+"""Interface of a run to its live page, see `lidarpool.live.live_page`."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from .store.job_under_way import JobUnderWay
 
 
 class RunPage:
-    """What a run of one job or many tells its live page; this one shows nothing.
+    """Live page of a run; this base class shows no page.
 
     Methods are called in the run's thread and must return at once, `look` in a thread that removes
-    what is left of ended jobs.
+    the parts of ended jobs.
     """
 
     def begun(self, job: JobUnderWay) -> None:
-        """Show a job from now on, the only one of its run, and what an earlier run has left."""
+        """Show the only job of a run, and the results of an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Show what goes on from now on, on these partitions; jobs are written to the data set."""
+        """Show the work on these partitions from now on; jobs are written to the data set."""
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Show parts of the only job that were committed."""
@@ -44,13 +44,16 @@ class RunPage:
         """
 
     def ended(self, row: JobRow) -> None:
-        """Show a job that has ended, in this run or an earlier one."""
+        """Show a job that has ended, in this run or an earlier run."""
 
     def look(self, row: JobRow, job: JobUnderWay) -> None:
-        """Read points of a job that is done, before its parts are removed, if they are shown."""
+        """Read points of a finished job, if they are shown, before its parts are removed."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show that all is done, after so long, and the result of a survey; parts may then go."""
+        """Show the end of the run after `seconds`, and the result of a survey.
+
+        The parts may be removed afterwards.
+        """
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page until its user ends it; points are read from the written `cloud`."""
+        """Keep the page until its user ends the page; points are read from the written `cloud`."""

@@ -1,4 +1,4 @@
-"""What a run gives: the result of a survey, before anything is made of it, or the sums of many."""
+"""Result of a run: the points of a survey, or the totals of a campaign."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .pipeline.task_book import StageTotals
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """What a run gives, before anything is made of it; `lidarpool.api.result` adds to that.
+    """Result of a survey without files; `lidarpool.api.result` adds methods to its result.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class RunResult:
     backend
         Name of the ray-casting backend that was used.
     rays, hits
-        Rays fired, and those that hit something.
+        Rays fired, and rays that hit a surface.
     stages
         All tasks of each stage together.
     resumed
@@ -72,9 +72,11 @@ class RunResult:
 
     @property
     def thinned(self) -> str:
-        """Why there are fewer points than hits, for behind their number; empty if all are kept."""
-        every = self.survey.keep_every
-        return f", one of every {every:,} hits of a scan (keep_every)" if every > 1 else ""
+        """Clause on points that were thinned out, to follow their number; empty if all are kept."""
+        keep_every = self.survey.keep_every
+        return (
+            f", one of every {keep_every:,} hits of a scan (keep_every)" if keep_every > 1 else ""
+        )
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:
@@ -88,13 +90,13 @@ class RunResult:
 
     @cached_property
     def hit_counts(self) -> Ints:
-        """Hits by `counters` of the scene, read when first asked for."""
+        """Hits for each counter of the scene, read on first use."""
         return self._hit_counts()
 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """What `Campaign.run` returns.
+    """Result of `Campaign.run`.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ class CampaignRun:
     done, points, rays
         Jobs in the data set, their points, and the rays that were cast for them.
     casting_seconds
-        Of all casting tasks together.
+        Casting time of all tasks.
     resumed
         Jobs of an earlier run.
     seconds
@@ -129,22 +131,30 @@ class CampaignRun:
     __repr__ = one_line
 
     @classmethod
-    def of(
-        cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **more: Any
+    def from_rows(
+        cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Sum up the rows of a campaign, all of which are of an earlier run by default."""
+        """Sum up the rows of a campaign; by default all jobs are of an earlier run."""
         failed = []
-        done = 0
+        job_count = 0
         points = 0
         rays = 0
-        casting = 0.0
+        casting_seconds = 0.0
         for row in rows:
             if row.error:
                 failed.append(row)
             else:
-                done = done + 1
-                points = points + row.points
-                rays = rays + row.rays
-                casting += row.seconds
-        known = done if resumed is None else resumed
-        return cls(tuple(failed), done, points, rays, casting, known, seconds, **more)
+                job_count += 1
+                points += row.points
+                rays += row.rays
+                casting_seconds += row.seconds
+        return cls(
+            failed=tuple(failed),
+            done=job_count,
+            points=points,
+            rays=rays,
+            casting_seconds=casting_seconds,
+            resumed=job_count if resumed is None else resumed,
+            seconds=seconds,
+            **details,
+        )

@@ -1,4 +1,4 @@
-"""A run from its place to its result, of a survey or of many: for commands and for Python."""
+"""A run of one or many jobs, from its options to its result: for commands and for Python."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ R = TypeVar("R")
 
 
 class Output(Generic[R]):
-    """Where the results of a run go."""
+    """Destination of the results of a run."""
 
-    dataset: DataSet | None = None  # that jobs are written into; else the only job's parts stay
+    dataset: DataSet | None = None  # jobs are written into it; else the parts of the job stay
     casts = True  # False if missing scans are not to be cast
 
     def held(self) -> AbstractContextManager[object]:
-        """Lock the place while the body runs."""
+        """Return a context that locks the destination."""
         return nullcontext()
 
     def begin(self, run: Run[R]) -> R | None:
-        """Refuse files that must not be replaced; return the result if nothing is left to do."""
+        """Refuse files that must not be replaced; return the result if no work is left."""
         return None
 
     def look(self, run: Run[R]) -> None:
-        """Compare the files of the output with what the store says is done."""
+        """Compare the files of the output with the jobs that the store calls done."""
 
     def finish(self, run: Run[R]) -> R:
         """Write the last files, and return the result."""
@@ -56,8 +56,8 @@ class Output(Generic[R]):
 
 
 @dataclass(frozen=True, eq=False)
-class Kept(Output[RunResult]):
-    """Points that stay in the run's store, with a note of what they are `made_of`."""
+class StoredOutput(Output[RunResult]):
+    """Points that stay in the run's store, with the sources of the job in `made_of`."""
 
     made_of: Mapping[str, Any] | None = None
 
@@ -67,17 +67,18 @@ class Kept(Output[RunResult]):
         if self.made_of is not None:
             made_of, notes = map(json.dumps, (self.made_of, result.notes))
             run.store.db.set(made_of=made_of, notes=notes)
-            run.store.save(now=True)
+            run.store.save(force=True)
         run.page.finish(result.seconds, result)
         run.store.db.close()
         return result
 
 
 class Run(Generic[R]):
-    """Makes what is left of some jobs, and has their output written.
+    """Casts the remaining jobs of a run, and has their output written.
 
-    Call `execute` once. LidarError if the place holds something else, the cluster lacks
-    something, or a task fails; its notes, and those of an interrupt, say what was kept.
+    Call `execute` once. LidarError if the destination holds another result, the cluster lacks
+    workers or software, or a task fails; the notes of errors and interrupts name the committed
+    results.
     """
 
     def __init__(
@@ -101,12 +102,12 @@ class Run(Generic[R]):
         self.store: RunStore
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.loop: RunLoop | None = None
-        self._maker: JobMaker | None = None  # of all jobs but the first
+        self._maker: JobMaker | None = None  # makes all jobs after the first
 
     def execute(self) -> R:
-        """Make what is left, and return the result that the output gives."""
+        """Cast remaining jobs, and return the result of the output."""
         with self.stack:
-            self._hold_place()
+            self._lock_output()
             if (result := self.output.begin(self)) is not None:
                 return result
             self._open_store()
@@ -115,7 +116,7 @@ class Run(Generic[R]):
             return self.output.finish(self)
 
     def warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
-        """Warn if jobs of a campaign have no points; returns the warning, for notes."""
+        """Warn if jobs of a campaign have no points; return the warning as notes."""
         empty = [row for row in rows if row.done and not row.points]
         if not empty:
             return []
@@ -128,17 +129,17 @@ class Run(Generic[R]):
         return [warning]
 
     @property
-    def goes_on(self) -> bool:
-        """True if this run continues an unfinished one."""
-        place = self.options.folder
-        return bool(self.resume and place is not None and FILE in Storage.at(place).sizes())
+    def continues_run(self) -> bool:
+        """True if this run continues an unfinished run."""
+        folder = self.options.folder
+        return bool(self.resume and folder is not None and FILE in Storage.at(folder).sizes())
 
     @property
     def resume(self) -> bool:
-        """True if this run may continue an earlier one."""
+        """True if this run may continue an earlier run."""
         return self.options.resume or self.options.retry_failed or self.options.verify
 
-    def _hold_place(self) -> None:
+    def _lock_output(self) -> None:
         if (self.options.fresh or self.options.overwrite) and self.resume:
             raise LidarError(
                 "fresh and overwrite remove what resume, retry_failed and verify go on with."
@@ -150,25 +151,25 @@ class Run(Generic[R]):
         if options.fresh and options.folder is not None:
             remove_run(options.folder)
         checking = "checking the points of the earlier run"
-        with self.screen.status(checking) if self.goes_on else nullcontext():
+        with self.screen.status(checking) if self.continues_run else nullcontext():
             self.store = RunStore(
                 self.jobs, options.backend, options.folder, options.parts, resume=self.resume
             )
-        # The task of a queue resumes its shard whether it has begun or not.
-        explained = self.store.kept or self.store.notes or self.jobs.shard != ALL
-        if options.resume and self.store.only and not explained:
-            place = options.out or options.folder
-            self.store.notes.append(f"there was nothing to resume in {place}")
+        # A task of a batch queue resumes its shard whether the shard has begun or not.
+        explained = self.store.committed_in_words or self.store.notes or self.jobs.shard != ALL
+        if options.resume and self.store.only_job and not explained:
+            location = options.out or options.folder
+            self.store.notes.append(f"there was nothing to resume in {location}")
         self.stack.enter_context(self.store.kept_on_error())
-        if self.store.only is not None:
-            self.page.begun(self.store.only)
+        if self.store.only_job is not None:
+            self.page.begun(self.store.only_job)
         self.output.look(self)
         self.stack.enter_context(self.cluster_stack)
 
     def _first_job(self) -> Job | None:
-        """Return the first job that can be made; None if nothing is left to be cast."""
-        if (only := self.store.only) is not None:
-            return None if only.complete or not self.output.casts else only.job
+        """Return the first job that can be made; None if all scans are cast."""
+        if (only_job := self.store.only_job) is not None:
+            return None if only_job.complete or not self.output.casts else only_job.job
         jobs = self.jobs
         dataset = self.output.dataset
         db = self.store.db
@@ -176,17 +177,17 @@ class Run(Generic[R]):
         numbers = (number for number in jobs.numbers if not db.ended(number))
         self._maker = JobMaker(jobs, numbers, dataset.columns)
         self.stack.callback(self._maker.close)
-        while isinstance(made := self._maker.take(wait=True), JobRow):
-            self.store.end([made])
-            self.page.ended(made)
-        return made
+        while isinstance(entry := self._maker.take(wait=True), JobRow):
+            self.store.end([entry])
+            self.page.ended(entry)
+        return entry
 
     def _cast(self, first: Job) -> None:
-        """Cast what is left, on a cluster with the slots that the first job needs."""
+        """Cast the remaining jobs, on a cluster with the slots that the first job needs."""
         store = self.store
         options = self.options
         enter = self.cluster_stack.enter_context
-        if options.own:
+        if options.starts_workers:
             check_backend_here(store.backend or options.backend, store.advice)
         self.cluster = Cluster(first, store, options, self.screen, enter)
         dataset = self.output.dataset
@@ -204,13 +205,13 @@ class Run(Generic[R]):
 
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
-        only = self.store.only
+        only_job = self.store.only_job
         loop = self.loop
-        assert only is not None, "there is one"
-        job = only.job
-        trials = tuple(sorted(only.trials, key=lambda trial: trial.trial))
+        assert only_job is not None, "there is one"
+        job = only_job.job
+        trials = tuple(sorted(only_job.trials, key=lambda trial: trial.trial))
         times = loop.times if loop else {}
-        points = only.points()
+        points = only_job.points()
         if not len(points):
             self._warn_of_empty_cloud(job)
         return RunResult(
@@ -222,21 +223,21 @@ class Run(Generic[R]):
             trials=trials,
             backend=self.store.backend,
             rays=job.survey.ray_count,
-            hits=only.parts.hits,
+            hits=only_job.parts.hits,
             stages=loop.stages if loop else (),
-            resumed=only.resumed,
+            resumed=only_job.resumed,
             notes=tuple(self.store.notes),
             identity=self.store.identity,
-            _hit_counts=only.hit_counts,
-            sample_rays=only.sample_rays(),
+            _hit_counts=only_job.hit_counts,
+            sample_rays=only_job.sample_rays(),
             seconds=time.monotonic() - self.started if loop else 0.0,
             survey_seconds=times.get("survey", 0.0),
             planning_seconds=times.get("planning", 0.0),
-            replayed=only.offered_again,
+            replayed=only_job.offered_again,
         )
 
     def _warn_of_empty_cloud(self, job: Job) -> None:
-        """Warn that the only job has no points; a whole survey also has a note."""
+        """Warn that the only job has no points; add a note unless the run is a shard."""
         shard = self.jobs.shard
         scans = None if shard == ALL else shard.scans(job.survey.scan_count)
         reason = empty_cloud_reason(job.scene, job.survey, scans)
@@ -247,11 +248,11 @@ class Run(Generic[R]):
         self.store.notes.append(warning)
         self.screen.warn(warning)
 
-    def result_is_in(self, place: object) -> None:
-        """Have any later error or interrupt say that the result is complete."""
+    def result_is_in(self, location: object) -> None:
+        """Add a note that the result is complete to any later error or interrupt."""
 
         def note(_: object, error: BaseException | None, __: object) -> None:
             if error is not None:
-                error.add_note(f"The result in {place} is complete.")
+                error.add_note(f"The result in {location} is complete.")
 
         self.stack.push(note)

@@ -1,7 +1,8 @@
 """Sweeps of a campaign as they are cast: from the workers to the reader, without files.
 
-A stream plays stages 1 and 4 itself: it gives the scans of the next sweeps to a `Dispatcher`, which
-has them cast, again if workers die, and it fetches the columns from the workers that cast them.
+A stream takes the role of stages 1 and 4: it gives the scans of the next sweeps to a `Dispatcher`,
+which offers them to workers, again if workers die, and it fetches the columns from the workers that
+cast them.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SweepStream:
-    """The sweeps of some jobs of a campaign, which are cast while they are read.
+    """The sweeps of jobs of a campaign, which are cast while they are read.
 
     Each loop casts all sweeps again, with the same result. When a loop is over or left, its tasks
     are cancelled and the workers that it has started are stopped. A pickled copy connects to the
@@ -66,7 +67,7 @@ class SweepStream:
 
     campaign: CampaignSpec
     numbers: Sequence[int]  # of the jobs
-    ahead: int  # maximum of the sweeps that are being cast or wait to be read
+    ahead: int  # largest number of sweeps that are being cast or wait to be read
     options: RunOptions
 
     def __getstate__(self) -> dict[str, Any]:
@@ -77,13 +78,13 @@ class SweepStream:
         return self.__dict__ | {"options": options}
 
     def of_jobs(self, numbers: Sequence[int]) -> SweepStream:
-        """Return the stream of some of the jobs."""
+        """Return the stream of a subset of the jobs."""
         return replace(self, numbers=numbers)
 
     def __iter__(self) -> Generator[Sweep]:
         options = self.options
         screen = Screen()
-        if options.own:
+        if options.starts_workers:
             check_backend_here(options.backend)
         waiting = Waiting(options.wait_s, screen.tell)
         with client_of(options, {GPU: 1}, waiting, screen) as client:
@@ -114,19 +115,19 @@ class SweepStream:
 class StreamedJob(PipelineJob):
     """A job whose sweeps are cast, with the columns that wait to be read.
 
-    Columns are those of `data_format`, of the data set that a run of the campaign writes.
+    Columns as of `data_format`, the format of the data set that a run of the campaign writes.
     """
 
     def __init__(self, job: Job, data_format: str) -> None:
         super().__init__(job.number, job.scene, job.survey, range(job.survey.scan_count))
         self.job = job
         self.data_format = data_format
-        self.columns: dict[int, PartColumns] = {}  # {first scan: what was cast}
-        self.sweeps_begun = 0  # that were given to the dispatcher
+        self.columns: dict[int, PartColumns] = {}  # {first scan: columns of a batch}
+        self.sweeps_begun = 0  # sweeps that the dispatcher has or had
         self.points_read = 0
 
     def take(self, number: int) -> Sweep | None:
-        """Take a sweep; None if not all of it was cast."""
+        """Remove and return a sweep; None if scans of the sweep are not yet cast."""
         job = self.job
         survey = self.survey
         sweeps = self.job.sweeps
@@ -140,24 +141,24 @@ class StreamedJob(PipelineJob):
         for part in parts:
             del self.columns[part.first]
         origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
-        # As `StoredCloud` has it.
-        further = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
-        table = (SCAN, *further)
+        # The columns of a `StoredCloud`.
+        stored = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
+        table = (SCAN, *stored)
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
         self.points_read += len(cloud)
         positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
-        if self.data_format == "kitti":  # as its files have it
+        if self.data_format == "kitti":  # as in files of this format
             columns["intensity"] = intensity_of(cloud)
-        boxes = Boxes.of(sweeps, number, cloud) if sweeps.actors else None
+        boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
-        return Sweep.of(row, sweeps, number, (positions, columns), boxes)
+        return Sweep.from_points(row, sweeps, number, (positions, columns), boxes)
 
 
 class _Casting:
-    """Casts the sweeps of a stream; plays stages 1 and 4 for the dispatcher."""
+    """Casts the sweeps of a stream; takes the role of stages 1 and 4 for the dispatcher."""
 
     collector_count = 1
     collectors: Mapping[str, str] = MappingProxyType({"reader": ""})  # {name: address}
@@ -166,37 +167,39 @@ class _Casting:
         self._stream = stream
         self._client = client
         options = stream.options
-        _, self._workers, self._backend, software = find_workers(
-            client, {GPU: 1}, options.backend, waiting=waiting
-        )
+        workers = find_workers(client, {GPU: 1}, options.backend, waiting=waiting)
+        self._workers = workers.casting
+        self._backend = workers.backend
         partition = Partition(GPU, client)
         run = uuid.uuid4().hex[:8]
-        self._casting = CastingWorkers(partition, run, self._backend, software)
+        self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, self, "")
         self._watch = Watch(client, [GPU], (), options.patience_s)
         self._orders: list[CollectOrder] = []  # of columns to be fetched
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
-        self._jobs: dict[int, StreamedJob] = {}  # those that are cast
+        self._jobs: dict[int, StreamedJob] = {}  # jobs that are being cast
         self._next: StreamedJob | None = None  # the job whose sweeps are cast next
-        self._coming: deque[tuple[StreamedJob, int]] = deque()  # sweeps that are being cast
-        self._warned = False  # of a job without points
+        self._sweeps_under_way: deque[tuple[StreamedJob, int]] = (
+            deque()
+        )  # sweeps that are being cast
+        self._warned = False  # True after a warning of a job without points
 
     def send(self, name: str, orders: Sequence[CollectOrder]) -> None:
-        """Take orders of the dispatcher, for stage 4."""
+        """Accept orders of the dispatcher for stage 4."""
         self._orders += orders
 
     def advise(self, scans: int) -> None:
-        """Ignore the advice for stage 1: a batch is a sweep, or as much of it as fits."""
+        """Ignore the advice for stage 1: a batch is a sweep, or a part of a sweep that fits."""
 
     def sweeps(self) -> Generator[Sweep]:
-        """Give the sweeps in order."""
+        """Yield the sweeps in order."""
         pause_s = 0.0
-        while not (self._maker.ended and self._next is None and not self._coming):
+        while not (self._maker.ended and self._next is None and not self._sweeps_under_way):
             moved = self._step()
-            streamed, number = self._coming[0] if self._coming else (None, 0)
+            streamed, number = self._sweeps_under_way[0] if self._sweeps_under_way else (None, 0)
             if streamed is not None and (sweep := streamed.take(number)) is not None:
-                self._coming.popleft()
+                self._sweeps_under_way.popleft()
                 if number + 1 == len(streamed.job.sweeps):
                     self._end(streamed)
                     self._warn_if_empty(streamed)
@@ -206,7 +209,7 @@ class _Casting:
             time.sleep(pause_s)
 
     def close(self) -> None:
-        """Cast nothing more."""
+        """Stop casting, and release the workers."""
         self._maker.close()
         for streamed in [*self._jobs.values()]:
             self._end(streamed)
@@ -215,19 +218,21 @@ class _Casting:
             self._casting.release()
 
     def _step(self) -> bool:
-        """Do what can be done now; return False if nothing was to be done."""
+        """Step the dispatcher once; return True if there were changes."""
         moved = self._begin_sweeps()
         moved |= self._dispatcher.check()
-        if (seen := self._casting.look()) is not None:
-            left = sum(map(len, self._dispatcher.batches.values()))
-            self._casting.want(self._dispatcher.slots_wanted(left))
-            self._dispatcher.leave_workers(seen)
+        if (locations := self._casting.look()) is not None:
+            scan_count = sum(map(len, self._dispatcher.batches.values()))
+            self._casting.want(self._dispatcher.slots_wanted(scan_count))
+            self._dispatcher.leave_workers(locations)
         for job, error in [*self._dispatcher.failed.items()]:
             failed = self._jobs[job.number]
             self._end(failed)
-            self._coming = deque(coming for coming in self._coming if coming[0] is not failed)
+            self._sweeps_under_way = deque(
+                coming for coming in self._sweeps_under_way if coming[0] is not failed
+            )
             self._next = None if self._next is failed else self._next
-            self._leave_out(failed.job.name, error)
+            self._warn_of_failure(failed.job.name, error)
         self._dispatcher.hand_over()
         moved |= self._fetch()
         moved |= self._dispatcher.offer()
@@ -235,34 +240,36 @@ class _Casting:
         return moved
 
     def _begin_sweeps(self) -> bool:
-        """Begin further sweeps, at most `ahead` of the reader; return False if none was."""
-        begun_before = len(self._coming)
-        while len(self._coming) < self._stream.ahead and (self._next or self._begin_job()):
+        """Begin further sweeps, at most `ahead` of the reader; return True if any was begun."""
+        begun_before = len(self._sweeps_under_way)
+        while len(self._sweeps_under_way) < self._stream.ahead and (
+            self._next or self._begin_job()
+        ):
             if (streamed := self._next) is not None:  # else the job has failed
                 number = streamed.sweeps_begun
                 sweeps = streamed.job.sweeps
                 self._dispatcher.take(streamed, *sweeps.scans[number : number + 2].tolist())
-                self._coming.append((streamed, number))
+                self._sweeps_under_way.append((streamed, number))
                 streamed.sweeps_begun += 1
                 if streamed.sweeps_begun == len(sweeps):
                     self._next = None
-        return len(self._coming) > begun_before
+        return len(self._sweeps_under_way) > begun_before
 
     def _begin_job(self) -> bool:
-        """Take the next job, which may fail; return False if there is none now."""
-        if (made := self._maker.take()) is None:
+        """Take the next job, which may fail; return False if no job is ready."""
+        if (entry := self._maker.take()) is None:
             return False
-        if isinstance(made, JobRow):
-            self._leave_out(made.name, made.error)
+        if isinstance(entry, JobRow):
+            self._warn_of_failure(entry.name, entry.error)
             return True
-        job = made
+        job = entry
         options = self._stream.options
         streamed = StreamedJob(job, self._stream.campaign.keep.format)
         try:
             check_workers(job, options, self._backend, self._workers)
             packed, scene_name = self._casting.add(job.number, job.scene, job.survey)
         except JobError as error:
-            self._leave_out(job.name, error)
+            self._warn_of_failure(job.name, error)
             return True
         streamed.run = self._casting.run
         streamed.packed = packed
@@ -276,13 +283,13 @@ class _Casting:
         return True
 
     def _fetch(self) -> bool:
-        """Fetch the columns of casting tasks from their workers."""
+        """Fetch the columns of casting tasks from their workers; return True if any was ordered."""
         orders = self._orders
         self._orders = []
         for order in orders:
-            results = fetch_available(self._client, [order.key], at=order.worker)
+            results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
-                self._dispatcher.lost(ColumnsLost(order.key))
+                self._dispatcher.recast_columns(ColumnsLost(order.key))
                 continue
             batches = {(batch.job, batch.part.first): batch for batch in results[order.key]}
             receipts = []
@@ -290,19 +297,19 @@ class _Casting:
                 streamed = self._jobs[job]
                 batch = batches[job, first]
                 streamed.columns[first] = batch.part
-                receipt = Receipt.of_part(batch.part, job, name, 0, batch.record)
+                receipt = Receipt.from_part(batch.part, job, name, 0, batch.record)
                 receipts.append((streamed, receipt))
             self._dispatcher.release(receipts)
         return bool(orders)
 
     def _end(self, streamed: StreamedJob) -> None:
-        """Cast nothing more of a job."""
+        """Stop casting a job."""
         del self._jobs[streamed.job.number]
         self._dispatcher.drop(streamed)
         self._casting.remove(streamed.job.number)
 
     def _warn_if_empty(self, streamed: StreamedJob) -> None:
-        """Warn of the first job without points: to find the reason, rays are cast here."""
+        """Warn of the first job without points; this process casts rays to find the reason."""
         if streamed.points_read or self._warned:
             return
         self._warned = True
@@ -313,5 +320,5 @@ class _Casting:
             empty_cloud_reason(job.scene, job.survey),
         )
 
-    def _leave_out(self, name: str, error: object) -> None:
+    def _warn_of_failure(self, name: str, error: object) -> None:
         logger.warning("Job %s is left out of the stream: %s", name, error)

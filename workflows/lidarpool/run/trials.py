@@ -15,33 +15,37 @@ from .pipeline.failures import raise_if_failed, was_killed
 from .pipeline.placement import recorded
 
 TRIAL = "trial"
-ROUNDS_MOST = 3  # submissions of a trial whose workers die
+MAX_ROUNDS = 3  # submissions of a trial whose workers die
 LOOK_EVERY_S = 1.0
 
 
 class TrialPump:
     """Runs the trials of a planning; `step` it until `finished`.
 
-    `done` are trials that an earlier run has finished.
+    `earlier_trials` were finished by an earlier run.
     """
 
-    def __init__(self, tasks: Tasks[int], planning: Planning, done: Sequence[Trial] = ()) -> None:
+    def __init__(
+        self, tasks: Tasks[int], planning: Planning, earlier_trials: Sequence[Trial] = ()
+    ) -> None:
         self.tasks = tasks
         self.planning = planning
-        self.trials: list[Trial] = list(done)
+        self.trials: list[Trial] = list(earlier_trials)
         self._run_id = uuid.uuid4().hex[:8]
-        known = {trial.trial for trial in done}
-        self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
-        self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
+        finished_numbers = {trial.trial for trial in earlier_trials}
+        self._waiting = deque(
+            n for n in range(planning.trials) if n not in finished_numbers
+        )  # numbers
+        self._rounds: Counter[int] = Counter()  # {number: submissions of the trial}
         self._look()
 
     @property
     def finished(self) -> bool:
-        """Whether all trials have ended."""
+        """True if all trials have ended."""
         return len(self.trials) == self.planning.trials
 
     def step(self) -> bool:
-        """Take results and submit more; returns whether there was anything to do.
+        """Take results and submit more trials; return True if there were changes.
 
         LidarError if a trial has failed.
         """
@@ -51,16 +55,16 @@ class TrialPump:
         failed = self.tasks.take_failed()
         for number, future in failed:
             # Dask gives up tasks after several deaths of their workers, whatever the cause.
-            if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
+            if was_killed(future) and self._rounds[number] < MAX_ROUNDS:
                 self._waiting.append(number)
             else:
                 raise_if_failed(future, f"Planning trial {number}")
-        done = [trial for _, trial in self.tasks.take_done()]
-        self.trials += done
-        room = min(self._most - len(running), len(self._waiting))
+        finished = [trial for _, trial in self.tasks.take_done()]
+        self.trials += finished
+        room = min(self._max_running - len(running), len(self._waiting))
         for _ in range(room):
             self._submit(self._waiting.popleft())
-        return bool(failed or done or room > 0)
+        return bool(failed or finished or room > 0)
 
     def _submit(self, number: int, worker: str | None = None) -> None:
         self.tasks.submit(
@@ -78,19 +82,21 @@ class TrialPump:
 
     def _leave_silent_workers(self) -> None:
         """Rerun trials whose workers are silent or have gone."""
-        seen = self._look()
+        locations = self._look()
         running = self.tasks.running
-        heard = sorted(seen.members - seen.silent)
+        responding = sorted(locations.members - locations.silent)
         # A trial bound to a worker that has gone waits for ever.
-        waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}
-        lost = [f for f in running if f.key in waiting or seen.out_of_reach(f.key)]
-        for place, future in enumerate(lost if heard else []):
-            self._submit(running.pop(future), heard[place % len(heard)])
+        waiting = {
+            key for key, location in locations.tasks.items() if location.state == "no-worker"
+        }
+        lost = [f for f in running if f.key in waiting or locations.out_of_reach(f.key)]
+        for index, future in enumerate(lost if responding else []):
+            self._submit(running.pop(future), responding[index % len(responding)])
 
     def _look(self) -> TaskLocations:
         self._looked_at = time.monotonic()
-        seen = self.tasks.look()
-        # One waits behind each running trial: no slot idles, and a dying worker loses few. Trials
-        # that wait have more workers started, where their number adapts.
-        self._most = 2 * max(1, seen.most_slots)
-        return seen
+        locations = self.tasks.look()
+        # A trial waits behind each running trial: no slot idles, and a dying worker loses few.
+        # Waiting trials make an adaptive partition start workers.
+        self._max_running = 2 * max(1, locations.most_slots)
+        return locations

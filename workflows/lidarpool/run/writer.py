@@ -1,4 +1,4 @@
-"""LIDAR workers that write: jobs into a data set, and ranges of formats of many files."""
+"""LIDAR workers that write: jobs into a data set, and ranges of multi-file formats."""
 
 from __future__ import annotations
 
@@ -34,16 +34,15 @@ from .pipeline.placement import Recorder, TaskRecord
 from .run_result import RunResult
 from .store.run_store import RunStore
 
-WRITING = 2  # tasks that wait to be done, for each free slot of LIDAR
-# jobs that one task writes, and their points
-TOGETHER = 32
-TOGETHER_POINTS = 1_000_000
-GATHER_S = 0.25  # that a job waits for others to be written with
-BEGIN_S = 10.0  # for any job to begin to be written; then the driver writes one
+TASKS_PER_SLOT = 2  # submitted tasks for each free slot of LIDAR
+MAX_JOBS_PER_TASK = 32
+MAX_POINTS_PER_TASK = 1_000_000  # of all jobs of a task
+GATHER_S = 0.25  # time that a job waits for more jobs of its task
+MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
 class JobFiles(NamedTuple):
-    """What the files of a job are made of; `row` lacks what is counted of the points."""
+    """Input for writing a job; `row` lacks the counts of points."""
 
     row: JobRow
     cloud: StoredCloud
@@ -57,38 +56,38 @@ JobOutcome = JobRow | LidarError
 def write_jobs(
     dataset: DataSet, probes: tuple[Any, Any], jobs: Sequence[JobFiles]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
-    """Write the files of jobs on a LIDAR worker; a row of each, or why it cannot be made.
+    """Write the files of jobs on a LIDAR worker; return a row or an error of each job.
 
     None in place of the rows if the worker does not see the data set, or the parts.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(place.sees(*probe) for place, *probe in probes):
-        return None, recorder.done()
-    written = [_written(dataset, job) for job in jobs]
-    return written, recorder.done(sum(int(job.sweeps.scans[-1]) for job in jobs))
+    if not all(storage.sees(*probe) for storage, *probe in probes):
+        return None, recorder.finish()
+    written = [_write_job(dataset, job) for job in jobs]
+    return written, recorder.finish(sum(int(job.sweeps.scans[-1]) for job in jobs))
 
 
-def _written(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job; JobError if that fails, LidarError if it is because of the place."""
-    listing = Listing.of(dataset.place)
+def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
+    """Write a job; return its row, or a JobError, or a LidarError if the storage is the cause."""
+    listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
     except Exception as error:
-        why = error if isinstance(error, OSError) else error.__cause__
-        told = str(error) if isinstance(error, LidarError) else repr(error)
-        if isinstance(why, OSError):  # a full disk fails all jobs
+        cause = error if isinstance(error, OSError) else error.__cause__
+        message = str(error) if isinstance(error, LidarError) else repr(error)
+        if isinstance(cause, OSError):  # a full disk fails all jobs
             name = "" if isinstance(error, LidarError) else f"job {job.row.name}: "
-            return LidarError(f"{name}{told}")
+            return LidarError(f"{name}{message}")
         with suppress(OSError):
             listing.prune(listing.files)
-        return JobError(told)
+        return JobError(message)
 
 
 class JobWriter:
-    """Has LIDAR workers write jobs into a data set; what they cannot see is written here.
+    """Has LIDAR workers write jobs into a data set; the driver writes jobs that they cannot see.
 
-    `of_parts` is a file among the parts of the `store`, name and content: who does not see it, or
-    another in the data set, writes nothing.
+    `parts_probe` is a file among the parts of the `store`, name and content: a worker that does not
+    see this file, or a similar file in the data set, writes no job.
     """
 
     def __init__(
@@ -96,45 +95,49 @@ class JobWriter:
         tasks: Tasks[list[JobFiles]],
         dataset: DataSet,
         store: RunStore,
-        of_parts: tuple[str, bytes],
+        parts_probe: tuple[str, bytes],
     ) -> None:
         self.tasks = tasks
-        place = dataset.place
+        storage = dataset.storage
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
-        # What a killed run leaves of it is removed as that of any killed writer.
+        # The name of a temporary file: later writers remove the file of a killed run.
         probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
-        self._probes = (place, *probe), (store.storage, *of_parts)
-        with explained(f"{place} cannot be written"):
-            place.prepare()
-            place.write(*probe)
+        self._probes = (storage, *probe), (store.storage, *parts_probe)
+        with explained(f"{storage} cannot be written"):
+            storage.prepare()
+            storage.write(*probe)
         self._waiting = deque[JobFiles]()
-        self._due_at = 0.0  # when those that wait are to be written
-        self._here: dict[Future[JobOutcome], JobFiles] = {}
+        self._due_at = 0.0  # when the waiting jobs are to be written
+        self._driver_writes: dict[Future[JobOutcome], JobFiles] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
-        self.hidden = False  # whether a worker did not see the data set
+        self.hidden = False  # True if a worker did not see the data set
 
     @property
     def jobs(self) -> Iterator[JobRow]:
         """Jobs that wait or are being written."""
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
-        yield from (job.row for job in (*self._here.values(), *self._waiting))
+        yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
     def add(self, files: JobFiles) -> None:
-        """Have a job written soon."""
+        """Queue a job for writing."""
         if not self._waiting:
             self._due_at = time.monotonic() + GATHER_S
         self._waiting.append(files)
 
-    def step(self, slots: int, *, more: bool) -> list[tuple[JobFiles, JobOutcome]]:
-        """Submit what there is room for; returns the rows of jobs, or why they were not written.
+    def step(self, slots: int, *, more_to_come: bool) -> list[tuple[JobFiles, JobOutcome]]:
+        """Submit waiting jobs to free slots; return written jobs with their rows or errors.
 
-        Jobs wait a moment for others if there are `more` to come. Errors of single jobs are
-        JobErrors; others are of the place, or of a worker's software.
+        Jobs wait a moment for others of their task if there are `more_to_come`. Errors of single
+        jobs are JobErrors; other errors are of the storage, or of a worker's software.
         """
-        due = not more or len(self._waiting) >= TOGETHER or time.monotonic() >= self._due_at
-        while due and self._waiting and len(self.tasks.running) < WRITING * slots:
+        due = (
+            not more_to_come
+            or len(self._waiting) >= MAX_JOBS_PER_TASK
+            or time.monotonic() >= self._due_at
+        )
+        while due and self._waiting and len(self.tasks.running) < TASKS_PER_SLOT * slots:
             jobs = self._next()
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
@@ -153,52 +156,60 @@ class JobWriter:
                 raise_if_failed(future, "writing it")
             except LidarError as error:
                 ended += [(job, error) for job in jobs]
-        for result in [one for one in self._here if one.done()]:
-            ended.append((self._here.pop(result), result.result()))
+        for write in [write for write in self._driver_writes if write.done()]:
+            ended.append((self._driver_writes.pop(write), write.result()))
         self._relieve(bool(ended))
         return ended
 
     def _next(self) -> list[JobFiles]:
-        """Take the jobs of the next task."""
+        """Remove and return the jobs of the next task."""
         jobs = [self._waiting.popleft()]
         points = len(jobs[0].cloud)
-        while self._waiting and len(jobs) < TOGETHER:
+        while self._waiting and len(jobs) < MAX_JOBS_PER_TASK:
             points += len(self._waiting[0].cloud)
-            if points > TOGETHER_POINTS:
+            if points > MAX_POINTS_PER_TASK:
                 break
             jobs.append(self._waiting.popleft())
         return jobs
 
     def _relieve(self, moved: bool) -> None:
-        """Write jobs here if none has begun for long: all slots are held, or have gone."""
-        now = time.monotonic()
-        if moved or self._here or not self.tasks.running:
-            self._moved_at = now
-        elif now - self._moved_at > BEGIN_S:
-            self._moved_at = now
-            seen = self.tasks.look()
-            if any(at.started and not seen.out_of_reach(key) for key, at in seen.tasks.items()):
+        """Let the driver write jobs if no task has started for long.
+
+        All slots of LIDAR may be held, or have gone.
+        """
+        now_s = time.monotonic()
+        if moved or self._driver_writes or not self.tasks.running:
+            self._moved_at = now_s
+        elif now_s - self._moved_at > MAX_STALL_S:
+            self._moved_at = now_s
+            locations = self.tasks.look()
+            if any(
+                location.started and not locations.out_of_reach(key)
+                for key, location in locations.tasks.items()
+            ):
                 return
             future, jobs = self.tasks.running.popitem()
             future.cancel()
             self._write_here(jobs)
 
     def _write_here(self, jobs: Sequence[JobFiles]) -> None:
-        self._here |= {self._thread.submit(_written, self.dataset, job): job for job in jobs}
+        self._driver_writes |= {
+            self._thread.submit(_write_job, self.dataset, job): job for job in jobs
+        }
 
     def close(self) -> None:
-        """Write nothing more."""
+        """Cancel all writing."""
         with suppress(Exception):  # report the first error
             self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
-        place, name, _ = self._probes[0]
+        storage, name, _ = self._probes[0]
         with suppress(OSError):
-            place.remove([name])
+            storage.remove([name])
 
 
 LOOK_EVERY_S = 0.01
 FETCH_S = 1.0
-ENDS_S = 10.0  # for ranges that are being written when the others are stopped
+ENDS_S = 10.0  # time for ranges that are being written when the writer is stopped
 
 
 class LidarWorkers:
@@ -209,40 +220,44 @@ class LidarWorkers:
         self._tasks = cluster.tasks(LIDAR)
 
     def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
-        """Write ranges; returns what was written of those whose workers see the folder.
+        """Write ranges; return the results of ranges whose workers see the folder.
 
-        The range of a worker that dies is written by another. LidarError if one cannot write,
-        several die of a range, or there is none for too long.
+        The range of a worker that dies is written by another worker. LidarError if a worker cannot
+        write, several workers die of a range, or LIDAR has no worker for too long.
         """
         partition = self._tasks.partition
         running = self._tasks.running
         self._tasks.plugins = plugin_versions(writer.plugins)
         waiting = deque(spans)
-        most = 2 * partition.slots
+        max_tasks = 2 * partition.slots
         written: dict[PieceRange, Range] = {}
         watch = self._cluster.watch([LIDAR])
-        # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask
-        # send them all to that worker.
+        # Workers fetch the writer from the worker that holds it: Dask would send all tasks to that
+        # worker if the writer were their argument.
         shared = share(partition, writer, priority=10)
         try:
             while waiting or running:
-                while waiting and len(running) < most:
+                while waiting and len(running) < max_tasks:
                     span = waiting.popleft()
                     self._tasks.submit(span, _write_range, shared.key, span)
                 for future in (shared, *running):
-                    raise_if_failed(future, f"Writing {writer.place}")
-                done = self._tasks.take_done()
-                written |= {span: made for span, made in done if made is not None}
+                    raise_if_failed(future, f"Writing {writer.storage}")
+                finished = self._tasks.take_done()
+                written |= {
+                    span: written_range
+                    for span, written_range in finished
+                    if written_range is not None
+                }
                 watch.look()
-                if not done:
+                if not finished:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
-            raise LidarError(f"The cluster was lost while it wrote {writer.place}.") from error
+            raise LidarError(f"The cluster was lost while it wrote {writer.storage}.") from error
         finally:
             if running:
                 writer.stop()
-                until = time.monotonic() + ENDS_S
-                while any(f.status == "pending" for f in running) and time.monotonic() < until:
+                deadline = time.monotonic() + ENDS_S
+                while any(f.status == "pending" for f in running) and time.monotonic() < deadline:
                     time.sleep(LOOK_EVERY_S)
                 running.clear()
         return written
@@ -253,23 +268,24 @@ class LidarWorkers:
 
 
 @lru_cache(maxsize=1)
-def _fetched(key: str) -> RangeWriter:
-    """Fetch the writer once for all ranges; it is made again if its worker has died.
+def _fetch_writer(key: str) -> RangeWriter:
+    """Fetch the writer, cached for all ranges of this process.
 
-    As an argument of the tasks, Dask would run them only on workers that hold it.
+    Dask makes the writer again if its worker has died. If the writer were an argument of the tasks,
+    Dask would run them only on workers that hold it.
     """
-    until = time.monotonic() + FETCH_S
-    while not (found := fetch_available(own_client(), [key])):
-        if time.monotonic() > until:
-            raise Reschedule  # what makes it again needs a slot
+    deadline = time.monotonic() + FETCH_S
+    while not (results := fetch_available(own_client(), [key])):
+        if time.monotonic() > deadline:
+            raise Reschedule  # the task that makes the writer again needs a slot
         time.sleep(LOOK_EVERY_S)
-    writer: RangeWriter = found[key]
+    writer: RangeWriter = results[key]
     return writer
 
 
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
-    """Write a range on a worker."""
+    """Write a range on a worker; return its result and the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
-    with explained(f"the worker {recorder.done().worker} cannot write there"):
-        made = _fetched(key)(span)
-    return made, recorder.done(span[1] - span[0])
+    with explained(f"the worker {recorder.finish().worker} cannot write there"):
+        written_range = _fetch_writer(key)(span)
+    return written_range, recorder.finish(span[1] - span[0])

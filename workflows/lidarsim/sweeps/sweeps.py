@@ -285,7 +285,7 @@ class Sweeps:
             pose=_poses_of(positions + scene.origin, rotations),
             mounts=_poses_of(
                 np.array([mount.position for mount in mounts]),
-                np.array([mount.turn for mount in mounts]),
+                np.array([mount.rotation_matrix for mount in mounts]),
             ),
             sensors=tuple(carried.name for carried in survey.carried),
             objects=tuple(scene.names),
@@ -480,7 +480,7 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     for station in range(path.stations):
         carrier_positions, carrier_rotations = full_poses(path, station, times)
         positions.append(carrier_positions + carrier_rotations @ np.array(mount.position))
-        rotations.append(carrier_rotations @ mount.turn)
+        rotations.append(carrier_rotations @ mount.rotation_matrix)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
     cast_scans = np.array([spec.scan + spec.ahead for spec in specs])  # repeated if frozen
     first_steps = (cast_scans - firsts[0]) % survey.steps_each[number]

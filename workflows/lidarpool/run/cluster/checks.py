@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from distributed import Client
 
@@ -20,7 +20,7 @@ from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from ...base.software import difference, software, software_there
+from ...base.software import difference, software, software_query
 from ...export.formats import Format
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
@@ -32,72 +32,101 @@ LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """A partition lacks workers or slots; more may join."""
+    """Error for a partition without enough workers or slots; more workers may join."""
+
+
+class SurveyWorkers(NamedTuple):
+    """Workers of a run, and the backend and software that the scans are cast with."""
+
+    pool: Pool  # all workers
+    casting: list[WorkerInfo]  # workers of partition GPU
+    backend: str
+    software: dict[str, str]  # of the casting workers
 
 
 def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
-    """Slots that a run needs in each partition, {name: slots}; those that write jobs need one."""
+    """Return the slots that a run needs in each partition, {name: slots}.
+
+    Writing jobs takes a slot of LIDAR.
+    """
     return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 
 def find_workers(
     client: Client,
-    needed: Mapping[str, int],
-    wanted: str,
+    required_slots: Mapping[str, int],
+    requested: str,
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
     *,
     writing: bool = False,
-) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
-    """Find all workers, the casting ones among them, their backend and their software.
+) -> SurveyWorkers:
+    """Wait for the workers of a run, and check that they suffice.
 
-    `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
-    software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
-    are in the queue, are waited for as long as `waiting` says. `writing` says that jobs are
-    written, too.
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    required_slots
+        {partition: slots that the run needs}.
+    requested
+        The requested backend.
+    advice
+        End of the message if the backend is not available.
+    earlier
+        Software that a resumed run was cast with.
+    waiting
+        Time to wait for workers that are missing or just died, or whose jobs are in the queue.
+    writing
+        Whether LIDAR workers write jobs, too.
 
-    LidarError if workers, slots `needed` or the backend are missing, or versions differ.
+    Raises
+    ------
+    LidarError
+        If workers, slots or the backend are missing, or versions differ.
     """
     while True:
-        looked = time.monotonic()
+        start_s = time.monotonic()
         try:
-            pool = _survey_pool(client, needed, writing)
+            pool = _survey_pool(client, required_slots, writing)
             casting = [worker for worker in pool if worker.resources.get(GPU)]
-            backend = common_backend(client, wanted, casting, advice)
-            casts = common_software(client, backend, casting, earlier or {})
-            return pool, casting, backend, casts
+            backend = common_backend(client, requested, casting, advice)
+            casting_software = common_software(client, backend, casting, earlier or {})
+            return SurveyWorkers(pool, casting, backend, casting_software)
         except TooFewWorkersError as error:
-            coming = 0  # jobs: a queue does not say which of them have died
+            coming = 0  # jobs in a queue, which does not say which jobs have died
             if waiting is not None:
-                coming = sum(look_for_tasks(client, name).coming for name in needed)
-            # One that has just died takes half a minute not to answer, which is no waiting: what
-            # counts is when the last look began.
-            if waiting is None or not waiting.left(looked):
+                coming = sum(look_for_tasks(client, name).coming for name in required_slots)
+            # A worker that has just died takes half a minute not to answer, which does not count
+            # as waiting: the remaining time is taken at the start of this attempt.
+            if waiting is None or not waiting.remaining_s(start_s):
                 if coming:
                     error.add_note(f"{queued(coming)}: if they wait, give --wait more time.")
                 raise
-            why = str(error).partition(": start ")[0] + (f"; {queued(coming)}" if coming else "")
-            waiting.tell("workers", why)  # who waits has started them
+            reason = str(error).partition(": start ")[0] + (f"; {queued(coming)}" if coming else "")
+            waiting.tell("workers", reason)  # a user who waits has started workers
         time.sleep(LOOK_EVERY_S)
 
 
-def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker: str) -> None:
-    """Refuse scans and batches for which a worker has too little memory: `room`, bytes a slot.
+def check_memory(
+    job: Job, tasks: TaskOptions, backend: str, available_bytes: float, worker: str
+) -> None:
+    """Raise JobError if a worker has too little memory for scans or batches: bytes a slot.
 
-    JobError: another job may fit.
+    It is no other LidarError because another job may fit.
     """
-    takes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
-    if (all_scans := takes(job.survey.scan_count)) <= room:
+    peak_bytes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
+    if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:
         return
-    scan = takes(1)
-    limit = f"more than the {room / MB:,.0f} MB that {worker} has for each slot"
-    if scan > room:
+    scan_bytes = peak_bytes(1)
+    limit = f"more than the {available_bytes / MB:,.0f} MB that {worker} has for each slot"
+    if scan_bytes > available_bytes:
         raise JobError(
-            f"Casting one scan takes about {scan / MB:,.0f} MB, {limit}: take a smaller step_deg, "
-            "fewer rays or columns, or give casting workers a larger --memory-limit."
+            f"Casting one scan takes about {scan_bytes / MB:,.0f} MB, {limit}: take a smaller "
+            "step_deg, fewer rays or columns, or give casting workers a larger --memory-limit."
         )
-    if min(tasks.batch_mb * MB, all_scans) > room:
+    if min(tasks.batch_mb * MB, all_scans) > available_bytes:
         raise JobError(
             f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give casting workers a "
             "larger --memory-limit."
@@ -107,77 +136,89 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
 def check_workers(
     job: Job, tasks: TaskOptions, backend: str, casting: Iterable[WorkerInfo]
 ) -> None:
-    """Check that casting workers have memory for a job; JobError if not."""
-    each = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
-    if each:  # the least alone: a campaign of tiny jobs cannot look at hundreds of workers for each
-        address = min(each, key=each.__getitem__)
-        check_memory(job, tasks, backend, each[address], f"the casting worker at {address}")
+    """Raise JobError if a casting worker has too little memory for a job."""
+    bytes_per_slot = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
+    # Only the smallest: a campaign of tiny jobs has no time for hundreds of workers a job.
+    if bytes_per_slot:
+        address = min(bytes_per_slot, key=bytes_per_slot.__getitem__)
+        check_memory(
+            job, tasks, backend, bytes_per_slot[address], f"the casting worker at {address}"
+        )
 
 
-def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:
-    """All workers of the cluster, after checking that they suffice."""
+def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: bool) -> Pool:
+    """Return all workers of the cluster, after checking that they suffice."""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
             f"The cluster at {client.scheduler.address} has no workers: start some, for "
             f'example dask worker {client.scheduler.address} --resources "GPU=1"'
         )
-    # Only those that will work: a cluster may have other workers, with other packages.
-    _check_versions(client, [a for a, w in workers.items() if {*needed} & {*w["resources"]}])
+    # Only workers of this run: a cluster may have other workers, with other packages.
+    _check_versions(
+        client, [a for a, w in workers.items() if {*required_slots} & {*w["resources"]}]
+    )
     try:
-        pool = Pool.from_client(client, declaring=set(needed))
-        pool.require(dict.fromkeys(needed, 0))  # that none declares two
+        pool = Pool.from_client(client, declaring=set(required_slots))
+        pool.require(dict.fromkeys(required_slots, 0))  # no worker may declare two partitions
     except PoolError as error:  # errors that more workers do not correct
         raise LidarError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
-        LIDAR: f"{GENERATE}, {SORT} and {needed.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
+        LIDAR: f"{GENERATE}, {SORT} and {required_slots.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
         f"{', and writing jobs of a campaign' if writing else ''}",
         OTHER: "path planning; or leave it out with --no-plan",
     }
     try:
-        pool.require(needed, purpose)
+        pool.require(required_slots, purpose)
     except PoolError as error:
         raise TooFewWorkersError(str(error)) from error
     return pool
 
 
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
-    """Check that the workers at these addresses have this Python and these sources."""
-    here = platform.python_version()
+    """Check that the workers at these addresses have the driver's Python and sources."""
+    driver_version = platform.python_version()
     for address, python in ask_workers(client, platform.python_version, workers).items():
-        if str(python).split(".")[:2] != here.split(".")[:2]:  # code is sent to it by value
+        # Code is sent to workers by value, which needs the same minor version.
+        if str(python).split(".")[:2] != driver_version.split(".")[:2]:
             raise LidarError(
-                f"The worker at {address} has Python {python}, here it is {here}: install the same "
-                "one on both sides."
+                f"The worker at {address} has Python {python}, here it is {driver_version}: "
+                "install the same one on both sides."
             )
-    ours = software()["lidarpool"]
-    for address, answer in _answers(client, software_there(), workers).items():
+    driver_sources = software()["lidarpool"]
+    for address, answer in _answers(client, software_query(), workers).items():
         if not answer:
             raise LidarError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
                 f"{__version__} in the environment that dask worker is started from."
             )
-        if answer["lidarpool"] != ours:
+        if answer["lidarpool"] != driver_sources:
             raise LidarError(
                 f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
-                f"{ours}: install the same on both sides, and start the worker again."
+                f"{driver_sources}: install the same on both sides, and start the worker again."
             )
 
 
 def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None:
-    """Check that the LIDAR workers can write those formats of plug-ins that they are to write.
+    """Check that the LIDAR workers can write the formats of plug-ins.
 
-    LidarError if one has another version of a plug-in, or cannot import it.
+    LidarError if a worker has another version of a plug-in, or cannot import it.
     """
-    written = [one for one in formats if one.row.in_pieces and one.row.plugin is not None]
+    written = [
+        file_format
+        for file_format in formats
+        if file_format.row.in_pieces and file_format.row.plugin is not None
+    ]
     if not written:
         return
-    plugins = [one.row.plugin for one in written if one.row.plugin is not None]
-    wanted = software(plugins=plugins)
+    plugins = [
+        file_format.row.plugin for file_format in written if file_format.row.plugin is not None
+    ]
+    required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
-    for address, answer in _answers(client, software_there(plugins=plugins), writing).items():
-        if differs := difference(answer, wanted):
+    for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
+        if differs := difference(answer, required):
             raise LidarError(
                 f"The worker at {address} has {differs}: install the same on both sides, and start "
                 "the worker again."
@@ -189,35 +230,35 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
 
 
 def _check_installed(formats: Iterable[Format]) -> None:
-    for one in formats:
-        one.check_installed()
+    for file_format in formats:
+        file_format.check_installed()
 
 
 def common_software(
     client: Client, backend: str, workers: Sequence[WorkerInfo], earlier: Mapping[str, str]
 ) -> dict[str, str]:
-    """Software of the workers that cast: `earlier` if there is one, else what most of them have.
+    """Return the software that scans are cast with: `earlier`, or the most common of the workers.
 
-    Workers with another are refused one by one when they are prepared. LidarError if none has
-    the earlier one.
+    Workers with different software are refused when they are prepared. LidarError if no worker has
+    the `earlier` software.
     """
-    answers = _answers(client, software_there(backend), [worker.address for worker in workers])
+    answers = _answers(client, software_query(backend), [worker.address for worker in workers])
     if earlier and dict(earlier) not in answers.values():
-        address, there = next(iter(answers.items()))
+        address, installed = next(iter(answers.items()))
         raise LidarError(
             "The scans of the run were cast with other software than the casting workers have: "
-            f"the worker at {address} has {difference(there, earlier)}. Continue it there, or drop "
-            "it with --fresh (in Python remove_run)."
+            f"the worker at {address} has {difference(installed, earlier)}. Continue it there, or "
+            "drop it with --fresh (in Python remove_run)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
-    most = max(counts, key=lambda one: (counts[one], one))
-    return dict(earlier) if earlier else dict(most)
+    common = max(counts, key=lambda items: (counts[items], items))
+    return dict(earlier) if earlier else dict(common)
 
 
 def _answers(
     client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
-    """Return what the workers at these addresses answer; the first error of one is raised."""
+    """Return the answers of workers by address, or raise the first error."""
     answers = ask_workers(client, question, workers)
     if workers and not answers:
         raise TooFewWorkersError(
@@ -230,7 +271,7 @@ def _answers(
 
 
 def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend: str) -> str:
-    """Say that GPUs of a cluster stay idle; empty if it has none, or they are used."""
+    """Return a note if GPUs of a cluster stay idle, else an empty string."""
     if backend == "cuda" or not any(worker.gpus for worker in pool):
         return ""
     if any(worker.gpus for worker in casting):
@@ -239,21 +280,22 @@ def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend:
 
 
 def common_backend(
-    client: Client, wanted: str, workers: Sequence[WorkerInfo], advice: str = AUTO_TAKES
+    client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_TAKES
 ) -> str:
-    """Name of the ray-casting backend to use on all these workers.
+    """Return the name of a ray-casting backend that all these workers have.
 
-    "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
-    worker casts which scan. LidarError, which ends with `advice`, if a worker lacks it.
+    "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on the
+    distribution of scans to workers. LidarError, which ends with `advice`, if a worker lacks the
+    backend.
     """
     answers = _answers(client, available_backends, [worker.address for worker in workers])
-    if wanted == "auto":
+    if requested == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
     for address, reasons in answers.items():
-        if reason := reasons.get(wanted, "there is no backend of that name"):
+        if reason := reasons.get(requested, "there is no backend of that name"):
             raise LidarError(
-                f"Backend {wanted!r} cannot be used on the casting worker at {address}: "
+                f"Backend {requested!r} cannot be used on the casting worker at {address}: "
                 f"{reason}. {advice}"
             )
-    return wanted
+    return requested

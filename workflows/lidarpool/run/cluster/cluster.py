@@ -1,4 +1,4 @@
-"""A cluster that can run some jobs: checked, and watched for its loss."""
+"""A cluster that can run jobs: checked, and watched for its loss."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from .watch import Waiting, Watch
 
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 
-# Errors that Dask raises once the scheduler is gone; those of connections are OSErrors.
+# Errors that Dask raises once the scheduler is gone; errors of connections are OSErrors.
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 def client_of(
-    options: RunOptions, needed: Mapping[str, int], waiting: Waiting, screen: Screen
+    options: RunOptions, required_slots: Mapping[str, int], waiting: Waiting, screen: Screen
 ) -> AbstractContextManager[Client]:
-    """Client of the cluster that is there, or started, for so many slots of each partition."""
+    """Return a client of an existing cluster, or of a new cluster with `required_slots`."""
     if options.client is not None:
         return nullcontext(options.client)
     if options.scheduler is not None:
@@ -47,15 +47,16 @@ def client_of(
         return screen.starting(started, f"starting {options.cluster}")
     check_starts_workers()
     workers = options.gpu_workers, options.other_workers
-    local = local_client(needed, *workers, tls=options.tls)
-    return screen.starting(local, "starting the workers", own=True)
+    local = local_client(required_slots, *workers, tls=options.tls)
+    return screen.starting(local, "starting the workers", shares_terminal=True)
 
 
 class Cluster:
-    """The cluster that is there, or started, once it was checked for jobs such as `first`.
+    """The cluster of a run, checked for jobs such as `first`.
 
-    `store` says which are left, and what earlier runs cast with; `enter` has the cluster left or
-    stopped in the end. LidarError if it lacks something.
+    `store` lists the remaining jobs, and the software of earlier runs. `enter` enters the context
+    of the client, and its caller leaves that context in the end. LidarError if workers, memory or
+    software are missing.
     """
 
     def __init__(
@@ -66,12 +67,12 @@ class Cluster:
         screen: Screen,
         enter: Callable[[AbstractContextManager[Client]], Client],
     ) -> None:
-        writing = store.only is None
-        needed = slots_needed(options, planning=first.planning is not None, writing=writing)
+        writing = store.only_job is None
+        required_slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
-            options.cluster.require(needed)
+            options.cluster.require(required_slots)
         waiting = Waiting(options.wait_s, screen.tell)
-        self.client = client = enter(client_of(options, needed, waiting, screen))
+        self.client = client = enter(client_of(options, required_slots, waiting, screen))
         self.options = options
         self._screen = screen
         # For errors about a lost cluster; a client that was never connected is refused below.
@@ -80,27 +81,23 @@ class Cluster:
             raise LidarError("The client is asynchronous: give one made without asynchronous=True.")
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
-            left = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
-            if store.only is not None:
-                left = len(store.only.scans) - store.only.resumed
-            for name, slots in needed.items():  # partitions may grow with their work
-                self.partitions[name].want(max(slots, left) if name == GPU else slots)
-            self._pool, self._casting, self.backend, self.software = find_workers(
+            self._request_slots(first, store, required_slots)
+            workers = find_workers(
                 client,
-                needed,
+                required_slots,
                 store.backend or options.backend,
                 store.advice,
-                store.casting if store.kept else {},
+                store.casting if store.committed_in_words else {},
                 waiting,
                 writing=writing,
             )
-            if store.only is not None:  # jobs of campaigns are written in formats of the table
-                check_formats(client, self._pool, first.outputs)
-            store.cast_with(self.backend, self.software)
-            if store.only is not None:  # others are checked one by one
-                self.check(store.only.job)
+            self._pool = workers.pool
+            self._casting = workers.casting
+            self.backend = workers.backend
+            self.software = workers.software
+            self._check_jobs(first, store)
         except LidarError:
-            self._want_nothing()
+            self._release_slots()
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
@@ -108,13 +105,31 @@ class Cluster:
             raise
         names = sorted({name for worker in self._pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
-        # Slots of LIDAR that the long stages leave, as they are at the start.
+        # Slots of LIDAR without the long stages, as the slots are at the start.
         self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
         if note := gpu_note(self._pool, self._casting, self.backend):
             store.notes.append(note)
         self._callers_error: BaseException | None = None
 
-    def _want_nothing(self) -> None:
+    def _request_slots(
+        self, first: Job, store: RunStore, required_slots: Mapping[str, int]
+    ) -> None:
+        """Request slots for the remaining scans, as partitions may adapt to their work."""
+        scan_count = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
+        if store.only_job is not None:
+            scan_count = len(store.only_job.scans) - store.only_job.resumed
+        for name, slots in required_slots.items():
+            self.partitions[name].want(max(slots, scan_count) if name == GPU else slots)
+
+    def _check_jobs(self, first: Job, store: RunStore) -> None:
+        """Check formats and memory for a single job, and store the software of the run."""
+        if store.only_job is not None:  # jobs of campaigns are written in formats of the table
+            check_formats(self.client, self._pool, first.outputs)
+        store.cast_with(self.backend, self.software)
+        if store.only_job is not None:  # jobs of a campaign are checked when they begin
+            self.check(store.only_job.job)
+
+    def _release_slots(self) -> None:
         """Let partitions shrink that have grown for the run."""
         if self.client.status == "running":
             with suppress(PoolError, OSError):
@@ -128,7 +143,7 @@ class Cluster:
         )
 
     def tasks(self, name: str) -> Tasks[Any]:
-        """Tasks for a partition, none yet."""
+        """Return an empty group of tasks for a partition."""
         return Tasks(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
@@ -136,11 +151,11 @@ class Cluster:
         return Watch(self.client, names, lasting, self.options.patience_s, self._screen.tell)
 
     def check(self, job: Job) -> None:
-        """Check that the workers have memory for a job; JobError if not."""
+        """Raise JobError if the workers have too little memory for a job."""
         check_workers(job, self.options, self.backend, self._casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the caller; its OSError must not look like the cluster's."""
+        """Call a callback of the user; its OSError must not look like an error of the cluster."""
         try:
             callback(*arguments)
         except BaseException as error:
@@ -153,7 +168,7 @@ class Cluster:
 
         Does nothing if the scheduler serves no pages, or the cluster is the run's own.
         """
-        if self.options.own:
+        if self.options.starts_workers:
             yield
             return
         with suppress(PoolError):
@@ -167,15 +182,15 @@ class Cluster:
 
     @contextmanager
     def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
-        """On any error of the body, call `stop` with the reason, and say if the cluster was lost.
+        """Call `stop` on any error of the body; translate errors of a lost cluster.
 
-        In the end its partitions may shrink.
+        `stop` gets the reason. In the end the partitions may shrink.
         """
         try:
             yield
         except BaseException as error:
             # A client that loses its scheduler cancels all futures, so tasks look cancelled.
-            # After some seconds it gives up and closes, and any call of it makes any error.
+            # After some seconds the client closes, and any of its calls may raise any error.
             lost = self._is_lost(error)
             stop(f"the run was stopped: {str(error) or type(error).__name__}")
             if error is self._callers_error:
@@ -186,15 +201,15 @@ class Cluster:
                 raise self._lost_error() from error
             raise
         finally:
-            self._want_nothing()
+            self._release_slots()
 
     def _is_lost(self, error: BaseException) -> bool:
-        """Whether the scheduler is gone: a call may fail a moment before the client knows."""
-        until = time.monotonic() + LOST_S
+        """Return True if the scheduler is gone; calls may fail a moment before the client knows."""
+        deadline = time.monotonic() + LOST_S
         while (
             self.client.status == "running"
             and isinstance(error, _CLUSTER_LOST)
-            and time.monotonic() < until
+            and time.monotonic() < deadline
         ):
             time.sleep(0.01)
         return self.client.status != "running"

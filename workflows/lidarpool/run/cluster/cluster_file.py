@@ -22,14 +22,14 @@ from poolpart.deploy.clusters import INFORMATION
 
 from ..pipeline.names import GPU, LIDAR, OTHER
 
-# A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
-# without tasks for so long. And a host that does not answer is given up after so long.
-_IDLE = "1h"
-_CONNECT = "30s"
+# A scheduler that SSH has started outlives a driver that was killed: it ends after this time
+# without tasks.
+_IDLE_TIMEOUT = "1h"
+_CONNECT_TIMEOUT = "30s"  # for a host to answer
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition; other fields are arguments of the cluster that differ for it."""
+    """Workers of a partition; extra fields override arguments of the cluster."""
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
@@ -40,24 +40,24 @@ class WorkerGroup(BaseModel):
     hosts: list[str] | None = Field(None, min_length=1)
 
     @property
-    def most(self) -> int:
-        """Workers that there may be."""
+    def worker_limit(self) -> int:
+        """Largest number of workers."""
         if self.adapt:
             return self.adapt[1]
         counted = self.hosts and "workers" not in self.model_fields_set
         return len(self.hosts or ()) if counted else self.workers
 
     def __str__(self) -> str:
-        return f"{self.adapt[0]} to {self.most}" if self.adapt else str(self.most)
+        return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
-    def wrong(self) -> str:
-        """Say what is wrong with the number of workers; empty if nothing is."""
+    def mistake(self) -> str:
+        """Return a message about a wrong number of workers; empty if there is no mistake."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s needs adapt beside it, such as [0, 8]."
         if "workers" in self.model_fields_set:
             return "adapt is a number of workers too: leave out workers."
-        least, most = self.adapt
-        if not 0 <= least <= most <= 10_000 or most < 1:
+        min_workers, max_workers = self.adapt
+        if not 0 <= min_workers <= max_workers <= 10_000 or max_workers < 1:
             return f"adapt is {self.adapt}: give the least and the greatest number, such as [0, 8]."
         return ""
 
@@ -74,10 +74,10 @@ class ClusterFile(BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> ClusterFile:
-        """Read a file and import what it names; nothing is started.
+        """Read a file and import the class of the cluster, but start no worker.
 
-        LidarError if it cannot be read, a field is wrong, a package is missing, or the class is
-        not a cluster.
+        LidarError if the file cannot be read, a field is wrong, a package is missing, or the class
+        is not a cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
         with sentences(cls, path):
@@ -89,63 +89,68 @@ class ClusterFile(BaseModel):
                     f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
                     f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
                 )
-            if wrong := workers.wrong():
-                raise LidarError(f"{path}: partitions.{name}.{wrong}")
+            if mistake := workers.mistake():
+                raise LidarError(f"{path}: partitions.{name}.{mistake}")
         file._factory()
         return file
 
     @property
     def slots(self) -> dict[str, int]:
-        """Slots of each partition, the most that it may have."""
-        return {name: one.most * one.slots for name, one in self.partitions.items()}
+        """Largest number of slots of each partition."""
+        return {name: group.worker_limit * group.slots for name, group in self.partitions.items()}
 
-    def require(self, needed: Mapping[str, int]) -> None:
-        """Check that the partitions have so many slots; LidarError if not."""
-        for name, least in needed.items():
-            if (there := self.slots.get(name, 0)) < least:
+    def require(self, required_slots: Mapping[str, int]) -> None:
+        """Raise LidarError if a partition cannot have the required slots."""
+        for name, required in required_slots.items():
+            if (available := self.slots.get(name, 0)) < required:
                 raise LidarError(
-                    f"{self._source}: partition {name} has {there} of the {least} slots needed: "
-                    f"give it more slots or workers, such as {{slots: {least}}}."
+                    f"{self._source}: partition {name} has {available} of the {required} slots "
+                    f"needed: give it more slots or workers, such as {{slots: {required}}}."
                 )
 
     def __str__(self) -> str:
         parts = ", ".join(f"{name} {workers}" for name, workers in self.partitions.items())
-        total = plural(sum(one.most for one in self.partitions.values()), "worker")
-        total = f"up to {total}" if any(one.adapt for one in self.partitions.values()) else total
+        total = plural(sum(group.worker_limit for group in self.partitions.values()), "worker")
+        total = (
+            f"up to {total}" if any(group.adapt for group in self.partitions.values()) else total
+        )
         return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
 
     @contextmanager
     def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
-        """Cluster with these workers, which are there or in a queue, as long as the body runs.
+        """Start the cluster with its workers, which run or are in a queue, while the body runs.
 
-        `tell` is called with what goes wrong with workers meanwhile. LidarError if it does not
-        start, or does not take an argument.
+        `tell` is called with messages about failing workers. LidarError if the cluster does not
+        start, or does not accept an argument.
         """
         arguments = dict(self.arguments)
         partitions = self.model_dump(exclude_unset=True)["partitions"]
         factory = self._factory()
-        heard: list[str] = []
+        ssh_lines: list[str] = []
         try:
             if factory is SSHCluster:
                 shared = {"worker_options", "worker_class"} & arguments.keys()
                 common = {option: arguments.pop(option) for option in shared}
-                partitions = {name: common | own for name, own in partitions.items()}
+                partitions = {name: common | options for name, options in partitions.items()}
                 for option, key, value in (
-                    ("scheduler_options", "idle_timeout", _IDLE),
-                    ("connect_options", "connect_timeout", _CONNECT),
+                    ("scheduler_options", "idle_timeout", _IDLE_TIMEOUT),
+                    ("connect_options", "connect_timeout", _CONNECT_TIMEOUT),
                 ):
                     arguments[option] = {key: value} | arguments.get(option, {})
-            with _listening(heard):
+            with _listening(ssh_lines):
                 cluster = factory(**arguments)
                 try:
                     start_partitions(cluster, partitions, tell)
                 except BaseException:
                     cluster.close()
                     raise
-        except Exception as error:  # of sbatch, of SSH, of a constructor: any
-            told = str(error).partition(" Very likely")[0]  # jobqueue goes on with all arguments
-            told = ": ".join([told, *[line for line in heard if INFORMATION not in line][-1:]])
-            reason = " ".join(f"{type(error).__name__}: {told}".split())[:400]
+        except Exception as error:  # sbatch, SSH and constructors raise any error
+            # The messages of jobqueue go on with all arguments.
+            message = str(error).partition(" Very likely")[0]
+            message = ": ".join(
+                [message, *[line for line in ssh_lines if INFORMATION not in line][-1:]]
+            )
+            reason = " ".join(f"{type(error).__name__}: {message}".split())[:400]
             raise LidarError(
                 f"{self._source}: {self.cluster} was not started ({reason})."
             ) from error
@@ -153,35 +158,36 @@ class ClusterFile(BaseModel):
             yield cluster
 
     def _factory(self) -> Any:
-        """Import the class; only clusters are taken."""
+        """Import and return the class of the cluster; LidarError if the class is no cluster."""
         package, _, name = self.cluster.rpartition(".")
         try:
-            with deferred_interrupts():  # and their handlers kept: dask-jobqueue brings its own
-                found = getattr(import_module(package), name, None)
+            # Keeps the signal handlers of this process: dask-jobqueue installs its own.
+            with deferred_interrupts():
+                factory = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
             raise LidarError(
                 f"{self._source}: {self.cluster} is not installed ({error}): pip install "
                 "'lidarpool[clusters]' has dask-jobqueue and what SSHCluster needs."
             ) from error
         except ValueError:  # no dot
-            found = None
-        if found is not SSHCluster and not (
-            isinstance(found, type) and issubclass(found, SpecCluster)
+            factory = None
+        if factory is not SSHCluster and not (
+            isinstance(factory, type) and issubclass(factory, SpecCluster)
         ):
             raise LidarError(
                 f"{self._source}: {self.cluster} cannot be started by partition: "
                 "give dask_jobqueue.SLURMCluster, another of dask_jobqueue, or "
                 "distributed.SSHCluster. Start others yourself, and use --scheduler."
             )
-        return found
+        return factory
 
 
 @contextmanager
-def _listening(heard: list[str]) -> Iterator[None]:
-    """Collect what processes that SSH starts say until they are up; Dask only logs it."""
+def _listening(lines: list[str]) -> Iterator[None]:
+    """Append output of processes that SSH starts, which Dask only logs, to `lines`."""
 
     def info(line: str, *arguments: object) -> None:
-        heard.append(line)
+        lines.append(line)
         log(line, *arguments)
 
     log = ssh.logger.info

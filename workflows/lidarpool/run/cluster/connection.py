@@ -1,4 +1,4 @@
-"""Clients for a local cluster started for the run, or for an existing cluster."""
+"""Clients of a local cluster that is started for the run, or of an existing cluster."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from .cluster_file import ClusterFile
 from .watch import Waiting
 
 CONNECT_TIMEOUT_S = 10
-KNOCK_S = 5.0  # of a scheduler that is waited for
+KNOCK_S = 5.0  # longest attempt to connect to a scheduler that may not be up yet
 _UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # a host that is starting
 
-# What Dask watches many times a second in each process, for a dashboard that a cluster of one run
-# does not have: idle, a worker took 3 % of a core, and now takes a fifth of that.
+# Dask profiles each process many times a second, for a dashboard that a cluster of one run does not
+# have: an idle worker took 3 % of a core, and takes a fifth of that with these settings.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
@@ -53,7 +53,7 @@ _QUIET = {
 
 
 class TlsFiles(NamedTuple):
-    """PEM files for an encrypted cluster: its authority's certificates, ours, and our key."""
+    """PEM files for an encrypted cluster: certificates of authority and client, and a key."""
 
     ca: Path | None = None
     cert: Path | None = None
@@ -61,7 +61,7 @@ class TlsFiles(NamedTuple):
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
-    """Worker processes of the GPU and OTHER partitions for a machine.
+    """Return the number of worker processes of the partitions GPU and OTHER for a machine.
 
     One worker for each GPU, and OTHER has the remaining cores. Without GPUs the GPU partition has
     CPU workers for three quarters of the cores. The LIDAR stages mostly wait, so they share one
@@ -101,32 +101,32 @@ def local_cluster(
 
 
 def check_starts_workers() -> None:
-    """Check that this process may start workers; LidarError in a task of Dask or a daemon."""
+    """Raise LidarError if this process may not start workers: in a task of Dask or a daemon."""
     try:
         get_worker()
-        place = "in a task of Dask"
+        context = "in a task of Dask"
     except ValueError:  # outside of tasks
-        place = "in a daemonic process, such as a worker of a DataLoader,"
+        context = "in a daemonic process, such as a worker of a DataLoader,"
         if not current_process().daemon:
             return
     raise LidarError(
-        f"A run without a client starts workers, which {place} cannot be done: give "
+        f"A run without a client starts workers, which {context} cannot be done: give "
         "client=distributed.get_client() in a task, or call it in a process of its own."
     )
 
 
 def local_client(
-    needed: Mapping[str, int],
+    required_slots: Mapping[str, int],
     gpu_workers: int | None = None,
     other_workers: int | None = None,
     *,
     tls: bool = False,
 ) -> AbstractContextManager[Client]:
-    """Client of a cluster on this machine that lasts as long as the body.
+    """Return a context with a client of a cluster on this machine that ends with the context.
 
-    Workers as of `local_cluster`, with the slots of LIDAR that are `needed`, and by default none of
-    OTHER if none are. `tls` encrypts the traffic, with a certificate of its own; PoolError if none
-    can be made, or the workers do not start.
+    Workers as of `local_cluster`, with the `required_slots` of LIDAR, and by default no worker of
+    OTHER unless it has required slots. `tls` encrypts the traffic, with a certificate of its own;
+    PoolError if no certificate can be made, or the workers do not start.
     """
 
     @contextmanager
@@ -137,8 +137,8 @@ def local_client(
             closing(
                 local_cluster(
                     gpu_workers=gpu_workers,
-                    lidar_slots=needed.get(LIDAR, 0),
-                    other_workers=other_workers if OTHER in needed or other_workers else 0,
+                    lidar_slots=required_slots.get(LIDAR, 0),
+                    other_workers=other_workers if OTHER in required_slots or other_workers else 0,
                     security=tls,
                     dashboard_port=None,  # is never printed, and Bokeh takes half a second
                 )
@@ -151,10 +151,10 @@ def local_client(
 
 @contextmanager
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Client of a cluster that is started for it and lasts as long as the body.
+    """Start a cluster and yield its client; the cluster ends with the body.
 
-    `tell` is called when it has started, and with what goes wrong with workers. LidarError if
-    it does not start.
+    `tell` is called when the cluster has started, and with messages about failing workers.
+    LidarError if the cluster does not start.
     """
     with _client_of(file.started(tell)) as client:
         tell(f"started {file}")
@@ -167,10 +167,10 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Client of a cluster that is started for it and lasts as long as the body.
+    """Start a cluster and yield its client; the cluster ends with the body.
 
     Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
-    all jobs in the queue, and one that comes while they are being stopped waits until they are.
+    all jobs in the queue, and an interrupt while workers are being stopped waits until they are.
     """
     stack = ExitStack()
     try:
@@ -187,11 +187,11 @@ def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]
 def connected(
     scheduler: str, files: TlsFiles | None = None, waiting: Waiting | None = None
 ) -> Iterator[Client]:
-    """Client of a cluster that is running already, or will be soon.
+    """Yield a client of a cluster that is running already, or will be soon.
 
     `scheduler` is an address such as ``tcp://host:8786`` or ``tls://host:8786``; certificates for
-    the latter are by default those of Dask's configuration. A scheduler that nobody has started yet
-    is waited for as `waiting` says, by default some seconds. LidarError if none answers, or the
+    the latter are by default from Dask's configuration. A scheduler that is not up yet is waited
+    for as `waiting` says, by default some seconds. LidarError if no scheduler answers, or the
     certificates are wrong.
     """
     if not scheduler.startswith("inproc"):
@@ -221,10 +221,10 @@ def connected(
 
 
 def _check_address(address: str) -> None:
-    """Refuse an address at which nothing can ever be."""
-    with suppress(ValueError):  # of what is no port
-        given = urlsplit(f"//{address.rpartition('//')[2]}")
-        if given.hostname and given.port:
+    """Raise LidarError if an address has no host or no valid port."""
+    with suppress(ValueError):  # for a port that is no number, or out of range
+        parts = urlsplit(f"//{address.rpartition('//')[2]}")
+        if parts.hostname and parts.port:
             return
     raise LidarError(
         f"The address {address!r} has no host, or no port of 1 to 65535: give that of the "
@@ -233,38 +233,38 @@ def _check_address(address: str) -> None:
 
 
 async def _reach(address: str, security: Security, waiting: Waiting) -> None:
-    """Return when a scheduler answers; a client waits for ever for a silent one."""
-    why = "nobody answers"
+    """Wait until a scheduler answers; a client would wait for ever for a silent scheduler."""
+    reason = "nobody answers"
     while True:
         timeout: float = CONNECT_TIMEOUT_S
         if waiting.seconds:
-            timeout = min(KNOCK_S, max(waiting.left(), 1.0))
-        waiting.tell(f"the scheduler at {address}", why)
+            timeout = min(KNOCK_S, max(waiting.remaining_s(), 1.0))
+        waiting.tell(f"the scheduler at {address}", reason)
         try:
             options = security.get_connection_args("client")
-            # A little later than `connect`, which says why, unless what listens says nothing.
+            # `connect` times out first, with a reason, unless a silent program listens.
             answer = connect(address, timeout=timeout, **options)
             comm = await asyncio.wait_for(answer, timeout + 1)
             comm.abort()
             return
         except Exception as error:
-            if not waiting.left() or not _absent(error):
+            if not waiting.remaining_s() or not _absent(error):
                 raise
-            why = _reason(error)
+            reason = _reason(error)
         await asyncio.sleep(LOOK_EVERY_S)
 
 
 def _root(error: BaseException) -> BaseException:
-    """First cause of an error. Another program may listen there, and its answer may cause any."""
+    """Return the first cause of an error; the answer of a foreign program may cause any error."""
     cause = error.__cause__ or error.__context__
-    # What was cut off by a time-out says less than the time-out.
+    # An operation that a time-out has cut off says less than the time-out.
     if cause is None or isinstance(cause, asyncio.CancelledError):
         return error
     return _root(cause)
 
 
 def _absent(error: BaseException) -> bool:
-    """Whether nothing was there, not even a name, so that it may come; not a refusal."""
+    """Return True if the address does not resolve or answer yet, so that a retry may help."""
     root = _root(error)
     absent = (ConnectionRefusedError, TimeoutError, asyncio.CancelledError, socket.gaierror)
     return isinstance(root, absent) or getattr(root, "errno", None) in _UNREACHABLE

@@ -1,4 +1,4 @@
-"""Tasks of a partition that the driver submits a few at a time, and what each is for."""
+"""Tasks of a partition that the driver submits a few at a time, each with its purpose."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
-from ...base.software import call_alike, call_with_plugins
+from ...base.software import call_with_plugins, call_with_same_sources
 from ..pipeline.task_book import TaskBook
 
 T = TypeVar("T")
 
 
 class Tasks(Generic[T]):
-    """Tasks that have been submitted; `book` has the records of those that are done.
+    """Submitted tasks of a partition; `book` has the records of finished tasks.
 
-    Each returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
+    Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
 
     def __init__(self, partition: Partition, sources: str) -> None:
@@ -29,36 +29,45 @@ class Tasks(Generic[T]):
         self.partition = partition
         self._sources = sources
         self.book = TaskBook()
-        self.running: dict[Future, T] = {}  # {future: what it is for}
-        # {plug-in that the tasks use: its version, which their workers must have}
+        self.running: dict[Future, T] = {}  # {future: its purpose}
+        # {plug-in that the tasks use: version that the workers must have}
         self.plugins: Mapping[Plugin, str] = {}
 
-    def submit(self, of: T, function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
-        """Submit a task; `options` as of `Partition.submit`."""
+    def submit(
+        self, purpose: T, function: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> None:
+        """Submit a task with its purpose; `options` as of `Partition.submit`."""
         call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
-        future = self.partition.submit(call_alike, self._sources, *call, *arguments, **options)
-        self.running[future] = of
+        future = self.partition.submit(
+            call_with_same_sources, self._sources, *call, *arguments, **options
+        )
+        self.running[future] = purpose
 
     def take_done(self) -> list[tuple[T, Any]]:
-        """Take those that are done, with their results."""
-        done = {future.key: future for future in self.running if future.status == "finished"}
-        taken = []
-        for key, (result, record) in fetch_available(self._client, [*done]).items() if done else ():
+        """Remove the finished tasks; return their purposes and results."""
+        finished = {future.key: future for future in self.running if future.status == "finished"}
+        results = []
+        for key, (result, record) in (
+            fetch_available(self._client, [*finished]).items() if finished else ()
+        ):
             self.book.add(record)
-            taken.append((self.running.pop(done[key]), result))
-        return taken
+            results.append((self.running.pop(finished[key]), result))
+        return results
 
     def take_failed(self) -> list[tuple[T, Future]]:
-        """Take those that have failed, or were cancelled; Dask itself runs lost ones again."""
+        """Remove failed and cancelled tasks; return their purposes and futures.
+
+        Dask repeats lost tasks, but not these.
+        """
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
     def look(self) -> TaskLocations:
-        """Ask where they are."""
+        """Return the locations of the running tasks."""
         keys = [future.key for future in self.running]
         return look_for_tasks(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Drop all of them; those that have begun run to their end."""
+        """Cancel all tasks; tasks that have begun run to their end."""
         self._client.cancel([*self.running])
         self.running.clear()

@@ -21,40 +21,42 @@ TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
 
 
 class Waiting:
-    """Time that something may take to come, from the first time that it is asked or told.
+    """Time limit of a wait, which starts at the first question or message.
 
-    `tell` is called every few seconds with a line that says what it waits for.
+    `tell` is called every few seconds with a message about the wait.
     """
 
     def __init__(self, seconds: float = 0.0, tell: Callable[[str], None] = lambda words: None):
         self.seconds = seconds
         self._tell = tell
-        self._told = float("-inf")
+        self._told_at = float("-inf")
 
     @cached_property
-    def _began(self) -> float:
+    def _start_s(self) -> float:
         return time.monotonic()
 
-    def begin(self) -> None:
-        """Begin anew: what was waited for has been there."""
-        self._began = time.monotonic()
+    def restart(self) -> None:
+        """Start the time limit anew, after the wait was over."""
+        self._start_s = time.monotonic()
 
-    def left(self, now: float | None = None) -> float:
-        """Seconds that are left; 0 when it is over."""
-        now = time.monotonic() if now is None else now
-        return max(0.0, self._began + self.seconds - now)
+    def remaining_s(self, now_s: float | None = None) -> float:
+        """Return the remaining time in seconds; 0 after the limit."""
+        now_s = time.monotonic() if now_s is None else now_s
+        return max(0.0, self._start_s + self.seconds - now_s)
 
-    def tell(self, what: str, why: str = "") -> None:
-        """Say what is waited for, if it is time to."""
-        now = time.monotonic()
-        if now - max(self._told, self._began) >= max(TELL_EVERY_S, (now - self._began) / 10):
-            self._told = now
-            left = f"for another {self.left(now):.0f} s"
-            self._tell(f"waiting for {what}, {left}{f': {why}' if why else ''}")
+    def tell(self, awaited: str, reason: str = "") -> None:
+        """Report that `awaited` is waited for, if the last message is old."""
+        now_s = time.monotonic()
+        if now_s - max(self._told_at, self._start_s) >= max(
+            TELL_EVERY_S, (now_s - self._start_s) / 10
+        ):
+            self._told_at = now_s
+            remaining = f"for another {self.remaining_s(now_s):.0f} s"
+            self._tell(f"waiting for {awaited}, {remaining}{f': {reason}' if reason else ''}")
 
 
 def queued(jobs: int) -> str:
-    """Say that jobs are on their way."""
+    """Return a clause about jobs in a queue or starting."""
     return f"{plural(jobs, 'job')} in the queue, or starting"
 
 
@@ -62,8 +64,9 @@ class Watch:
     """Detects a partition that stays without workers, or whose workers take no tasks.
 
     Dask itself would wait for ever. The workers of the partitions `names` get new tasks during the
-    run; tasks of `lasting` ones last as long as the run, so their workers need not take more. One
-    may be empty for `patience_s`; `tell` is called every few seconds with a message meanwhile.
+    run; tasks of `lasting` partitions last as long as the run, so their workers need not take more.
+    A partition may be empty for `patience_s`; `tell` is called every few seconds with a message
+    meanwhile.
     """
 
     def __init__(
@@ -77,10 +80,10 @@ class Watch:
         self.client = client
         self.lasting = frozenset(lasting)
         self._tell = tell
-        # {partition: how long it may be without workers}
+        # {partition: time that it may be without workers}
         self._waits = {name: Waiting(patience_s, tell) for name in (*names, *self.lasting)}
         self._looked = float("-inf")
-        self.notes: list[str] = []  # what a user should know: workers that Dask has paused
+        self.notes: list[str] = []  # notes for the user on workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
         """Stop watching these partitions, which have no more work."""
@@ -88,26 +91,25 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check from time to time; LidarError if a partition was empty for too long."""
-        now = time.monotonic()
-        if now - self._looked < WATCH_EVERY_S:
+        """Check the partitions if the last check is old; LidarError if workers are missing."""
+        now_s = time.monotonic()
+        if now_s - self._looked < WATCH_EVERY_S:
             return
-        self._looked = now
-        # partitions with workers, and with those that take no tasks
-        there = set()
-        paused = set()
+        self._looked = now_s
+        staffed = set()  # partitions with workers that take tasks
+        paused = set()  # partitions with workers that take no tasks
         for worker in worker_identities(self.client).values():
             for name in self._waits.keys() & worker["resources"].keys():
                 if worker["status"] == "running" or name in self.lasting:
-                    there.add(name)
+                    staffed.add(name)
                 else:
                     paused.add(name)
                     if worker["status"] == "paused":
                         self._note_paused(name, worker)
         for name, waiting in self._waits.items():
-            if name in there:
-                waiting.begin()
-            elif not waiting.left():
+            if name in staffed:
+                waiting.restart()
+            elif not waiting.remaining_s():
                 raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
             elif name in paused:
                 advice = "give them a larger --memory-limit"
@@ -117,7 +119,7 @@ class Watch:
                 waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
-        """Say once of each worker that it gets no more tasks."""
+        """Report a paused worker at its first appearance."""
         note = (
             f"Dask has paused worker {worker['name']} of partition {partition}, whose memory limit "
             f"is {format_bytes(worker['memory_limit'])}: others get its work until memory is free"
@@ -128,7 +130,7 @@ class Watch:
 
 
 def _lacking(name: str, paused: bool, seconds: str) -> str:
-    """Say that a partition was without workers for so long, or that they were paused."""
+    """Return a message about a partition that had no workers, or only paused workers."""
     start = f'start some with --resources "{name}=1" and run it again.'
     if paused:
         return (

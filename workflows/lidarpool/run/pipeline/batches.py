@@ -20,7 +20,7 @@ class BatchState(Enum):
 
 
 class Outcome(Enum):
-    """What has become of a casting task; or why its batches are offered again."""
+    """State of a casting task, or the reason why its batches are offered again."""
 
     PENDING = "pending"
     DONE = "done"
@@ -39,15 +39,15 @@ class Batch:
     job: PipelineJob
     first: int
     stop: int
-    number: int  # of earlier batches: limits how far the last of a job is ahead of its first
-    order: int = 0  # of waiting batches
-    place: BatchState = BatchState.WAITING
-    since: float = 0.0  # since when it is in its state
+    number: int  # count of earlier batches of all jobs; limits the span from oldest to newest
+    order: int = 0  # waiting batches are offered in this order
+    state: BatchState = BatchState.WAITING
+    since: float = 0.0  # monotonic time of the last change of state
     key: str = ""  # of the casting task; "" while waiting
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
-    divided: bool = False  # not to be cast with batches of other jobs
+    divided: bool = False  # True if it must not be cast with batches of other jobs
 
     def __post_init__(self) -> None:
         self.share = len(self) / self.job.scans_per_task  # of the memory of a task
@@ -57,10 +57,10 @@ class Batch:
 
     @property
     def scans(self) -> range:
-        """Numbers of its scans."""
+        """Numbers of the scans."""
         return range(self.first, self.stop)
 
-    def move(self, place: BatchState) -> None:
-        """Record its new state."""
-        self.place = place
+    def move(self, state: BatchState) -> None:
+        """Set the state, and the time of the change."""
+        self.state = state
         self.since = time.monotonic()

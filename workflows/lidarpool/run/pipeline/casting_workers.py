@@ -21,9 +21,9 @@ from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
-from ...base.software import difference, software_there
+from ...base.software import difference, software_query
 from .batches import Outcome
-from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
+from .failures import JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .messages import BatchRange
 from .names import INTERSECT
 from .rigs import CastWork, RigFailed, RigMissing, drop_all, intersect
@@ -33,24 +33,24 @@ _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, Recursion
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # for workers to drop their rigs
-SPARE_SCENES = 2  # of which no survey is under way, kept for the next one
-INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
+SPARE_SCENES = 2  # scenes without a survey under way, kept for the next survey
+INLINE_BYTES = 1 << 17  # larger payloads are sent to one worker, and fetched by other workers
 CHECKING = "checking the casting workers"
 PREPARING = "preparing the scene on the casting workers"
 
 
 @dataclass(eq=False)
-class _Packed:
-    """What tasks bring to workers that lack it: bytes, or what a worker has of a large thing."""
+class _Payload:
+    """Bytes that casting tasks bring to workers without a copy, or a future of large bytes."""
 
     name: str  # on the workers
-    pack: Callable[[], bytes]  # makes it, again if it is lost
+    pack: Callable[[], bytes]  # makes the data, again if the future is lost
     data: bytes | Future
-    sent: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
-    there: set[str] = field(default_factory=set)  # of those that have it
+    recipients: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
+    holders: set[str] = field(default_factory=set)  # addresses of workers that have received it
 
     def release(self) -> None:
-        """Let the cluster forget it now: frames of a job's error may keep this object a while."""
+        """Release the future now: the traceback of an error may keep this object for a while."""
         if isinstance(self.data, Future):
             self.data.release()
 
@@ -58,15 +58,15 @@ class _Packed:
 class CastingWorkers:
     """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
 
-    A worker's software is checked before it unpickles anything: a worker with other sources of
-    lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
-    The first tasks of a job on a worker bring what that worker makes its rig of.
+    A worker's software is checked before the worker unpickles anything: a worker with other sources
+    of lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts no
+    batch. The first tasks of a job on a worker bring the plan and scene of the worker's rig.
 
     Each task is bound to one worker. Dask lets such a task wait for ever when the worker is gone,
-    so `look` asks every second which workers there are. In return, Dask never fails a task for the
+    so `look` checks every second which workers exist. In return, Dask never fails a task for the
     deaths of its neighbours, and the driver knows which batches a dead worker had.
 
-    `run` is the run's id; `software` is that of the workers that may cast, see `base.software`.
+    `run` is the run's id; `software` is the software that workers must have, see `base.software`.
     """
 
     def __init__(
@@ -77,43 +77,44 @@ class CastingWorkers:
         self.run = run
         self._backend = backend
         self._software = dict(software)
-        # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
-        self._jobs: dict[int, tuple[_Packed, _Packed]] = {}
-        # Of jobs, and those used last; what packs them keeps what they are known by.
-        self._scenes: dict[tuple[int, ...], _Packed] = {}
+        # {job: (plan of its rig, static part of its scene, which other jobs may share)}
+        self._jobs: dict[int, tuple[_Payload, _Payload]] = {}
+        # {ids of the fields of a scene: its static part}, last used last. `_Payload.pack` holds the
+        # scene, so that the ids stay valid.
+        self._scenes: dict[tuple[int, ...], _Payload] = {}
         self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
         self._setups: dict[str, Future] = {}  # {address: task that is checking the worker}
         # {address of a worker that may cast: tasks at a time}. The answers are not kept on the
         # workers: one with a result cannot be returned to the queue.
         self._checked: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
-        self._count = 0  # of the names and keys that were given
-        self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: casting task, its jobs}
+        self._name_count = 0  # names and keys so far
+        self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
-        self.seen = TaskLocations()
-        self._wanted = -1  # slots, as the scheduler knows
-        self._adapts = True  # the partition grows with what is wanted, as far as known
-        self.notes: list[str] = []  # what a user should know
+        self.locations = TaskLocations()
+        self._requested_slots = -1  # as the scheduler knows
+        self._adapts = True  # False once the partition is known not to adapt to requests
+        self.notes: list[str] = []  # notes for the user
 
     @property
     def slots(self) -> dict[str, int]:
-        """{address of a worker that was checked and takes tasks: tasks at a time}."""
-        return {a: slots for a, slots in self._checked.items() if a in self.seen.free}
+        """Workers that were checked and take tasks, {address: tasks at a time}."""
+        return {a: slots for a, slots in self._checked.items() if a in self.locations.free}
 
     @property
     def slot_count(self) -> int:
-        """Tasks that all workers cast at a time; at least 1."""
+        """Casting tasks that run at a time on all workers; at least 1."""
         return max(1, sum(self.slots.values()))
 
     @property
     def futures(self) -> list[Future]:
-        """All tasks."""
-        brought = [one.data for one in self._packed_things if isinstance(one.data, Future)]
-        return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *brought]
+        """Futures of all casting tasks, checks of workers and shared payloads."""
+        shared = [payload.data for payload in self._payloads if isinstance(payload.data, Future)]
+        return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *shared]
 
     @property
-    def _packed_things(self) -> list[_Packed]:
+    def _payloads(self) -> list[_Payload]:
         return [*(rig for rig, _ in self._jobs.values()), *self._scenes.values()]
 
     @property
@@ -125,64 +126,69 @@ class CastingWorkers:
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Let a job be cast; returns its survey, pickled, and a name that jobs of one scene share.
+        """Register a job; return its pickled survey, and a name that jobs of its scene share.
 
-        JobError if it cannot be pickled.
+        JobError if the job cannot be pickled.
         """
         try:
             packed = _pickled(survey)
-            # What identifies its still part while it exists: jobs of it share their trees.
+            # Identifies the static part while the scene exists: its jobs share their trees.
             key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
-            still = self._scenes.pop(key, None)
-            if still is None:
-                still = self._packed("scene", lambda: _pickled(scene.with_actors(())))
-            self._scenes[key] = still  # the last used
-            plan = still.name, scene.actors, packed, self._backend
-            self._jobs[job] = self._packed(str(job), lambda: _pickled(plan)), still
-        except _UNSENT as error:  # of pickling what a user has defined
+            static_scene = self._scenes.pop(key, None)
+            if static_scene is None:
+                static_scene = self._payload("scene", lambda: _pickled(scene.with_actors(())))
+            self._scenes[key] = static_scene  # the last used
+            plan = static_scene.name, scene.actors, packed, self._backend
+            self._jobs[job] = self._payload(str(job), lambda: _pickled(plan)), static_scene
+        except _UNSENT as error:  # raised by pickling classes of the user
             raise JobError(f"The survey cannot be sent to the workers: {error}") from error
-        return packed, still.name
+        return packed, static_scene.name
 
     def remove(self, job: int) -> None:
-        """Cast nothing more of a job.
+        """Stop casting a job.
 
-        With the next task of another, the workers drop its rig, and scenes that were not used last.
+        With the next task of another job, the workers drop the rig of this job, and old unused
+        scenes.
         """
-        if (left := self._jobs.pop(job, None)) is None:
+        if (payloads := self._jobs.pop(job, None)) is None:
             return
-        old = [left[0]]
+        old = [payloads[0]]
         if len(self._scenes) > SPARE_SCENES:
             used = [scene for _, scene in self._jobs.values()]
             spare = [key for key, scene in self._scenes.items() if scene not in used]
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
-        for packed in old:
-            packed.release()
-            for address in packed.sent & self._checked.keys():
-                self._unneeded.setdefault(address, []).append(packed.name)
+        for payload in old:
+            payload.release()
+            for address in payload.recipients & self._checked.keys():
+                self._unneeded.setdefault(address, []).append(payload.name)
 
-    def _packed(self, what: str, pack: Callable[[], bytes]) -> _Packed:
+    def _payload(self, label: str, pack: Callable[[], bytes]) -> _Payload:
         data = pack()
-        self._count += 1
-        name = f"{self.run}.{what}-{self._count}"
-        return _Packed(name, pack, data if len(data) <= INLINE_BYTES else self._shared(name, data))
+        self._name_count += 1
+        name = f"{self.run}.{label}-{self._name_count}"
+        return _Payload(name, pack, data if len(data) <= INLINE_BYTES else self._share(name, data))
 
-    def _shared(self, name: str, data: bytes) -> Future:
-        self._count += 1
-        return share(self._partition, data, key=f"{name}-packed-{self._count}", priority=10)
+    def _share(self, name: str, data: bytes) -> Future:
+        self._name_count += 1
+        return share(self._partition, data, key=f"{name}-packed-{self._name_count}", priority=10)
 
-    def _brought(self, packed: _Packed, worker: str) -> bytes | Future | None:
-        """Return what a task brings to a worker; None if it is there."""
-        if worker in packed.there:
+    def _payload_for(self, payload: _Payload, worker: str) -> bytes | Future | None:
+        """Return the argument that brings a payload to a worker; None if the worker has a copy."""
+        if worker in payload.holders:
             return None
-        packed.sent.add(worker)
-        if isinstance(packed.data, Future) and packed.data.status in ("lost", "cancelled", "error"):
-            packed.data = self._shared(packed.name, packed.pack())
-        return packed.data
+        payload.recipients.add(worker)
+        if isinstance(payload.data, Future) and payload.data.status in (
+            "lost",
+            "cancelled",
+            "error",
+        ):
+            payload.data = self._share(payload.name, payload.pack())
+        return payload.data
 
     # -- casting ---------------------------------------------------------------------------
 
     def cast(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Offer batches, each with its job, to a worker as one task; returns its key.
+        """Submit batches, each with its job, to a worker as a task; return the key of the task.
 
         The jobs must share a scene.
         """
@@ -190,42 +196,48 @@ class CastingWorkers:
         for job, span in batches:
             spans.setdefault(job, []).append(span)
         first = next(iter(spans))
-        works = [CastWork(job, self._jobs[job][0].name, tuple(of)) for job, of in spans.items()]
-        things = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
-        brought = [self._brought(packed, worker) for packed in things]
+        works = [
+            CastWork(job, self._jobs[job][0].name, tuple(spans_of_job))
+            for job, spans_of_job in spans.items()
+        ]
+        payloads = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
+        arguments = [self._payload_for(payload, worker) for payload in payloads]
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        self._count += 1
-        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._count}"
+        self._name_count += 1
+        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._name_count}"
         unneeded = self._unneeded.pop(worker, [])
         future = self._partition.submit(
-            intersect, works, unneeded, *brought, key=key, workers=worker
+            intersect, works, unneeded, *arguments, key=key, workers=worker
         )
         self._casts[key] = future, [*spans]
         return key
 
     def outcome(self, key: str, worker: str) -> Outcome:
-        """State of a casting task; JobError if it has failed, and is of one job."""
+        """Return the state of a casting task.
+
+        JobError if the task has failed and has batches of a single job.
+        """
         future, jobs = self._casts[key]
         status = future.status
         if status == "pending":
             return Outcome.PENDING
-        packed = {thing for job in jobs for thing in self._jobs.get(job, ())}
+        payloads = {payload for job in jobs for payload in self._jobs.get(job, ())}
         if status == "finished":
-            for one in packed:
-                one.there.add(worker)
+            for payload in payloads:
+                payload.holders.add(worker)
             return Outcome.DONE
         error = error_of(future)
         if isinstance(error, RigMissing):
-            for one in packed:
-                one.there.discard(worker)
+            for payload in payloads:
+                payload.holders.discard(worker)
             return Outcome.NO_RIG
         if was_killed(future):
             return Outcome.DIED
         if status == "error" and len(jobs) > 1:
             return Outcome.DIVIDE
-        what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
-        raise_if_failed(future, what, JobError)  # whose words name the scans
+        activity = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
+        raise_if_failed(future, activity, JobError)  # the message names the scans
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:
@@ -233,74 +245,74 @@ class CastingWorkers:
         if (cast := self._casts.pop(key, None)) is not None:
             cast[0].release()
 
-    def words_on_memory(self, worker: str) -> str:
-        """Clause for a message about a dead worker, if a nanny ended it for its memory."""
-        return words_on_memory(self._client, [worker])
+    def memory_clause(self, worker: str) -> str:
+        """Return a clause for a message if a nanny ended a dead worker for its memory, else ""."""
+        return memory_clause(self._client, [worker])
 
     # -- checking workers --------------------------------------------------------------------
 
     def look(self) -> TaskLocations | None:
-        """From time to time, handle workers that have joined or left, or take no tasks.
+        """Handle workers that have joined or left, or take no tasks, if the last check is old.
 
-        Returns where workers and casting tasks are, None if it is not time to look. LidarError
-        if no worker may cast, or several in a row die while they are checked.
+        Returns the locations of workers and casting tasks, or None if the last check is recent.
+        LidarError if no worker may cast, or several in a row die while they are checked.
         """
         if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
             self._check()
             return None
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
-        self.seen = look_for_tasks(self._client, self._partition.name, keys)
-        known = self._setups.keys() | self._checked.keys()
-        for address in known - self.seen.members:
+        self.locations = look_for_tasks(self._client, self._partition.name, keys)
+        known_workers = self._setups.keys() | self._checked.keys()
+        for address in known_workers - self.locations.members:
             self._remove(address)
-        for address in sorted(self.seen.free.keys() - known - self._refused.keys()):
-            self._count += 1
+        for address in sorted(self.locations.free.keys() - known_workers - self._refused.keys()):
+            self._name_count += 1
             self._setups[address] = self._partition.submit(
-                software_there(self._backend),
-                key=f"check-{self.run}-{self._count}",
+                software_query(self._backend),
+                key=f"check-{self.run}-{self._name_count}",
                 priority=10,
                 workers=address,
             )
         self._check()
-        return self.seen
+        return self.locations
 
     def _check(self) -> None:
-        """Record the workers that may cast."""
-        answered = {}
+        """Record the workers whose software check has ended."""
+        addresses = {}
         for address, future in self._setups.items():
-            if future.status == "finished" and address in self.seen.free:
-                answered[future.key] = address
+            if future.status == "finished" and address in self.locations.free:
+                addresses[future.key] = address
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
-        if not answered:
+        if not addresses:
             return
         # All at a time: one by one, 200 workers on a busy machine took minutes. A worker that has
         # stopped since is asked again.
-        found = fetch_available(self._client, answered, ANSWER_S)
+        answers = fetch_available(self._client, addresses, ANSWER_S)
         identities = worker_identities(self._client)
-        for key, software in found.items():
-            address = answered[key]
+        for key, software in answers.items():
+            address = addresses[key]
             if address in identities:  # else it has left
                 self._take(address, software, identities[address])
 
     def want(self, slots: int) -> None:
-        """Want so many slots of a partition that grows with its work; 0 when there is no more.
+        """Request a number of slots of an adaptive partition; 0 when all work is done.
 
         The driver binds each batch to a worker, so that no batch waits for workers to come.
         """
-        if slots != self._wanted and self._adapts:
-            self._wanted = slots
+        if slots != self._requested_slots and self._adapts:
+            self._requested_slots = slots
             self._adapts = self._partition.want(slots)
-        if not slots:  # what workers have for tasks would keep these workers
-            for packed in self._packed_things:
-                packed.release()
+        if not slots:  # payloads on workers would keep these workers
+            for payload in self._payloads:
+                payload.release()
             self._jobs.clear()
             self._scenes.clear()
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
-        addresses = [*self._checked.keys() & self.seen.members]
+        addresses = [*self._checked.keys() & self.locations.members]
         self._checked.clear()
         if self._client.status == "running":
             self.want(0)
@@ -316,14 +328,14 @@ class CastingWorkers:
                 )
 
     def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
-        """Record a worker that has answered, with the software that it has."""
+        """Record a worker that has answered the software check; refuse different software."""
         del self._setups[address]
         if differs := difference(software, self._software):
             self._refused[address] = differs
             self.notes.append(
                 f"worker {identity['name']} at {address} has {differs}: it cast nothing"
             )
-            if self._refused.keys() >= self.seen.members:
+            if self._refused.keys() >= self.locations.members:
                 raise LidarError(
                     f"No worker of partition {self._partition.name!r} has the run's software: the "
                     f"one at {address} has {differs}. Install the same on all."
@@ -337,34 +349,34 @@ class CastingWorkers:
         """Remove a worker that has gone."""
         self._refused.pop(address, None)
         self._unneeded.pop(address, None)
-        for packed in self._packed_things:
-            packed.there.discard(address)
+        for payload in self._payloads:
+            payload.holders.discard(address)
         if self._checked.pop(address, None) is not None:
             return
         future = self._setups.pop(address)
-        place = self.seen.tasks.get(future.key)
-        if place is not None and place.deaths:
+        location = self.locations.tasks.get(future.key)
+        if location is not None and location.deaths:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:
             raise LidarError(
                 f"{CHECKING} has killed {len(self._died)} of them in a row"
-                f"{words_on_memory(self._client, self._died)}: "
+                f"{memory_clause(self._client, self._died)}: "
                 "look into their logs."
             )
 
 
-def _pickled(thing: object) -> bytes:
-    data: bytes = cloudpickle.dumps(thing, protocol=5)
+def _pickled(value: object) -> bytes:
+    data: bytes = cloudpickle.dumps(value, protocol=5)
     return data
 
 
-def share(partition: Partition, thing: Any, **options: Any) -> Future:
-    """Have a thing on a worker, for tasks to fetch; Dask makes it again if that worker dies."""
+def share(partition: Partition, value: Any, **options: Any) -> Future:
+    """Submit a task that returns `value` for other tasks; Dask repeats it if a worker dies."""
     with warnings.catch_warnings():
-        # A large one makes a large graph, which is the only way to have it recomputed.
+        # A large value makes a large graph, which is the only way to have it recomputed.
         warnings.filterwarnings("ignore", message="Sending large graph")
-        return partition.submit(_same, thing, **options)
+        return partition.submit(_identity, value, **options)
 
 
-def _same(thing: Any) -> Any:
-    return thing
+def _identity(value: Any) -> Any:
+    return value

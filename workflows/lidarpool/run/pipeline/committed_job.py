@@ -1,4 +1,4 @@
-"""What is committed of a job: its parts in scan order, planning trials, and frames."""
+"""Committed results of a job: its parts in scan order, planning trials, and frames."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CommittedParts:
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def reaching_past(self, scan: int) -> list[Receipt]:
-        """Return the parts that have this scan or later ones, in order."""
+        """Return the parts that contain a scan or later scans, in order."""
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
@@ -69,7 +69,7 @@ class CommittedParts:
         self._count(part, -1)
 
     def _index(self, scan: int) -> int:
-        """Return the index of the last part that begins with a scan or before; 0 for none."""
+        """Return the index of the last part that starts at or before a scan; 0 if there is none."""
         return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     def _count(self, part: Receipt, sign: int) -> None:
@@ -79,7 +79,7 @@ class CommittedParts:
 
 
 class CommittedJob:
-    """What is committed of a job; only the run's database changes parts and trials.
+    """Committed results of a job; only the run's database changes parts and trials.
 
     Parameters
     ----------
@@ -98,14 +98,14 @@ class CommittedJob:
         self.forget_committed()
 
     def forget_committed(self) -> None:
-        """Forget what is committed."""
+        """Reset parts, trials and frames to none."""
         self.parts = CommittedParts()
         self.trials: list[Trial] = []
         self.frames = self.scans.start  # one past the last scan that was handed out as a frame
         self.frames_written = self.scans.start  # the same, as the database has it
 
     @property
-    def left(self) -> int:
+    def missing_count(self) -> int:
         """Number of scans that are not committed."""
         return len(self.scans) - self.parts.scans_done
 
@@ -113,7 +113,7 @@ class CommittedJob:
     def scans_complete(self) -> bool:
         """True if all scans are committed, and were handed out if the job has frames."""
         framed = not self.has_frames or self.frames == self.scans.stop
-        return framed and not self.left
+        return framed and not self.missing_count
 
     def unframed(self) -> list[Receipt]:
         """Return the parts with scans that were not handed out as frames, in order."""

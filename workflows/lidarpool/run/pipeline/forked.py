@@ -13,8 +13,8 @@ from ...plan import trial  # noqa: F401
 from . import stages  # noqa: F401
 
 keep_freed_memory()
-# A worker that starts tidies up the folders of those that have ended, at the same time as their
-# nannies, and would call what it does not find an error.
+# A starting worker removes the folders of ended workers, at the same time as their nannies, and
+# would log each missing folder as an error.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # if it cannot be loaded, a check says why
     from raybeam import embree_bodies, embree_packets, moving_loops  # noqa: F401

@@ -1,7 +1,7 @@
 """Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points. Those about scans say of which `job` of the run,
-by its number.
+Their size does not depend on the number of points. Messages about scans have the number of the
+`job` in the run.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from .placement import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end
 
-SAMPLES_MOST = 4  # sample rays of a scan
-SAMPLES_WANTED = 400  # of a survey
+MAX_SAMPLES_PER_SCAN = 4  # sample rays
+SAMPLES_PER_SURVEY = 400  # sample rays, about
 
 
 def samples_of_scan(scan_count: int) -> int:
-    """Sample rays of each scan: fewer if there are many scans, because all are sent."""
-    return max(1, min(SAMPLES_MOST, -(-SAMPLES_WANTED // scan_count)))
+    """Return the number of sample rays of each scan: fewer for many scans, as all are sent."""
+    return max(1, min(MAX_SAMPLES_PER_SCAN, -(-SAMPLES_PER_SURVEY // scan_count)))
 
 
 def summary_type(samples: int) -> np.dtype[np.void]:
-    """Summary of a scan: hits, points kept, and ends of sample rays, metres, local coordinates.
+    """Return the dtype of the summary of a scan with a number of sample rays.
 
-    Missing samples are NaN.
+    A summary has the number of hits and of points kept, and the ends of the sample rays, metres,
+    local coordinates. Missing samples are NaN.
     """
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
@@ -54,7 +55,7 @@ class StageStart:
     attempt: int  # starts of stages before this one
 
     def trace(self, event: str, scans: Iterable[int] = ()) -> None:
-        """Report that this start of the stage has reached a point with some scans."""
+        """Emit a trace event of this start of the stage about scans."""
         trace(f"{self.stage}.{event}", **asdict(self), scans=list(scans))
 
 
@@ -90,7 +91,7 @@ class ScanRange(Scans):
 
 @dataclass(frozen=True, slots=True)
 class Summaries(Scans):
-    """To stage 3, and from it in scan order: the summaries of a committed part."""
+    """To stage 3, and back in scan order: the summaries of the scans of a committed part."""
 
     data: bytes  # of an array of `summary_type`
     framed: int  # one past the last scan that had been handed out when it was sent
@@ -99,7 +100,7 @@ class Summaries(Scans):
 
 @dataclass(frozen=True, slots=True)
 class CollectOrder:
-    """To stage 4: fetch the columns of batches of one casting task, and write each as a part."""
+    """To stage 4: fetch the columns of the batches of a casting task, and write each as a part."""
 
     key: str  # of the casting task
     worker: str  # address of the worker that has its result
@@ -127,10 +128,10 @@ class Receipt(Scans):
     held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
 
     @classmethod
-    def of_part(
+    def from_part(
         cls, part: PartColumns, job: int, name: str, size: int, record: TaskRecord | None = None
     ) -> Receipt:
-        """Make the receipt of a part, from what the part itself says."""
+        """Return the receipt of a part of `size` bytes, with totals from the part's columns."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
         summaries["hits"] = part.scan_hits
         summaries["points"] = part.counts
@@ -143,7 +144,7 @@ class Receipt(Scans):
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """From stages 1 and 4: scans of a survey cannot be described, or made a part of."""
+    """From stages 1 and 4: the scans of a survey cannot be described or stored."""
 
     job: int
     stage: str
@@ -156,7 +157,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """One scan from stage 3, in scan order, whose points are in storage.
+    """A scan from stage 3, in scan order, whose points are in storage.
 
     Parameters
     ----------
@@ -165,7 +166,7 @@ class ScanFrame:
     sensor
         Name of its sensor; "" for a single one without a name.
     rays, hits, count
-        Rays fired, those that hit something, and points of the cloud.
+        Rays fired, rays that hit a surface, and points of the cloud.
     samples
         float32 (m, 3): ends of a few rays, metres, local coordinates.
     """
@@ -182,7 +183,7 @@ class ScanFrame:
 
     @property
     def pose(self) -> Pose:
-        """Pose of the sensor at its beginning, in the scene's local coordinates."""
+        """Pose of the sensor at the start of the scan, in the scene's local coordinates."""
         return self._survey.pose(self.scan)
 
     def points(self) -> Cloud:

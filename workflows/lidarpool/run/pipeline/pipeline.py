@@ -1,11 +1,11 @@
 """The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
 
-Everything happens in `step`, called repeatedly from one thread; nothing in it waits for long. There
-is one rule of recovery: uncommitted batches are offered again, and frames that were not handed out
-are sorted again, whatever was lost. What arrives twice does no harm: a second receipt of a scan is
-ignored, and its part is the same file with the same bytes. The number of batches under way, and the
-distance of the last to the first, are limited: that bounds every queue, and the memory of sorter
-and workers.
+Everything happens in `step`, called repeatedly from one thread; no call in `step` waits for long.
+There is one rule of recovery: uncommitted batches are offered again, and frames that were not
+handed out are sorted again, whatever was lost. Messages that arrive twice do no harm: a second
+receipt of a scan is ignored, and its part is the same file with the same bytes. The number of
+batches under way, and the distance of the last to the first, are limited: that bounds every queue,
+and the memory of sorter and workers.
 """
 
 from __future__ import annotations
@@ -34,22 +34,21 @@ from .names import COLLECT, GENERATE, SORT
 from .pipeline_job import PipelineJob
 from .task_book import TaskBook
 
-STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
-WAIT_S = 0.05  # for news, where there is nothing else to do
-# of a wait, for more news: for each job or batch of a task
-LINGER_S = 0.004
-MOST_LINGERING = 25
+STALL_S = 60.0  # time without frames of the sorter, after which it gets its summaries again
+WAIT_S = 0.05  # wait for news while the driver is idle
+LINGER_S = 0.004  # wait for more news after the first, for each job or batch of a task
+MAX_LINGERS = 25  # jobs or batches that are counted for that wait
 CLOSING_S = 0.001  # longest wait while the stages end
-ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
+ANNOUNCED = 2  # jobs that stage 1 should have ahead, whatever their size
 
 
 class Commits(Protocol):
-    """Where parts are committed: the run's database."""
+    """Interface of the run's database, where parts are committed."""
 
     def commit(
         self, receipts: Iterable[tuple[PipelineJob, Receipt]]
     ) -> list[tuple[PipelineJob, Receipt]]:
-        """Commit parts of jobs, and return those that are new."""
+        """Commit parts of jobs; return the parts that were not committed before."""
         ...
 
     def summaries(self, part: Receipt) -> bytes:
@@ -60,7 +59,7 @@ class Commits(Protocol):
 class Pipeline:
     """The four stages, which jobs pass on the partitions of a cluster.
 
-    `workers` and `stages` are all that it asks of Dask, so that tests can play the cluster. Parts
+    `workers` and `stages` are the only access to Dask, so that tests can replace the cluster. Parts
     are committed in `commits`, and their files have the run's `mark`.
     """
 
@@ -73,10 +72,11 @@ class Pipeline:
         self.dispatcher = Dispatcher(workers, stages, mark)
         self.jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast}
         self.book = TaskBook()  # of stage 2, and in the end of the others
-        self.progress = 0  # a number that grows when something is committed or handed out
-        self.later = 0  # scans of jobs that are not begun yet
-        self._announced: dict[int, int] = {}  # {job: scans}, in the order of stage 1, until taken
-        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # until they are taken
+        self.progress = 0  # number of scans that were committed, plus frames handed out
+        self.scans_to_come = 0  # scans of jobs that are not begun yet
+        # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
+        self._announced: dict[int, int] = {}
+        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # for `take_ended`
 
     # -- jobs --------------------------------------------------------------------------------
 
@@ -89,9 +89,7 @@ class Pipeline:
         on_frame: Callable[[ScanFrame], None] | None = None,
         on_parts: Callable[[list[Receipt]], None] | None = None,
     ) -> None:
-        """Take a job on; JobError if it cannot be sent to workers.
-
-        What is committed of the job is not cast again.
+        """Add a job to the pipeline. Committed scans of the job are not cast again.
 
         Parameters
         ----------
@@ -101,9 +99,14 @@ class Pipeline:
             Scans of the whole run, where many jobs are like this one.
         on_frame
             Called with each frame, in scan order, in the driver's thread. Without it there are no
-            frames, and the job is complete when all of it is committed.
+            frames, and the job is complete when all its scans are committed.
         on_parts
-            Called with parts that were committed.
+            Called with the parts of each commit.
+
+        Raises
+        ------
+        JobError
+            If the job cannot be sent to workers.
         """
         job.packed, job.scene_name = self.workers.add(job.number, job.scene, job.survey)
         job.run = self.stages.run
@@ -112,8 +115,8 @@ class Pipeline:
         job.has_frames = on_frame is not None
         job.on_frame = on_frame
         job.on_parts = on_parts
-        # Stage 1 need not describe what is committed.
-        job.generated = job.scans.start if job.left else job.scans.stop
+        # If all is committed, stage 1 need not describe any scan.
+        job.generated = job.scans.start if job.missing_count else job.scans.stop
         self.jobs[job.number] = job
         self._describe([job])
         self._sort_again([job])
@@ -121,10 +124,10 @@ class Pipeline:
 
     @property
     def has_room(self) -> bool:
-        """Whether another job should begin, so that stage 1 always has scans to describe."""
-        most = self.dispatcher.most
+        """True if another job should begin, so that stage 1 always has scans to describe."""
+        max_weight = self.dispatcher.max_weight
         advice = self.dispatcher.advice
-        if len(self.jobs) >= most:
+        if len(self.jobs) >= max_weight:
             return False
         if len(self._announced) < ANNOUNCED:
             return True
@@ -132,20 +135,20 @@ class Pipeline:
         to_come = sum(
             -(-(j.scans.stop - j.generated) // min(advice, j.scans_per_task)) for j in jobs
         )
-        return len(self.dispatcher.batches) + to_come < most
+        return len(self.dispatcher.batches) + to_come < max_weight
 
     def take_ended(self) -> list[tuple[PipelineJob, JobError | None]]:
-        """Return the jobs that are complete, or failed by an error, since the last call."""
+        """Return the jobs that have ended since the last call, each with its error or None."""
         ended = self._ended
         self._ended = []
         return ended
 
     def _end(self, job: PipelineJob, error: JobError | None = None) -> None:
-        """Do nothing more for a job."""
+        """Remove a job from the pipeline, and record its error or success."""
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
-        if error is not None and job.has_frames:  # the sorter forgets what it has of it
+        if error is not None and job.has_frames:  # the sorter forgets the job's summaries
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._ended.append((job, error))
 
@@ -162,14 +165,14 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages; after this `stop` and `finish` must be called."""
+        """Start the stages; the caller must call `stop` on failure, and `finish` always."""
         self.stages.open()
         self._look()
 
     def step(self) -> bool:
-        """Do what can be done now; returns whether there was anything to do.
+        """Process messages, workers and batches once; return True if there were changes.
 
-        LidarError if something fails that all jobs need.
+        LidarError if a failure concerns all jobs.
         """
         messages = self.stages.inbox
         self.stages.inbox = []
@@ -187,22 +190,22 @@ class Pipeline:
         return moved
 
     def wait(self, seconds: float, keys: Iterable[str] = ()) -> None:
-        """Wait until there may be something to do, also when one of more tasks has ended."""
+        """Wait at most `seconds` for messages, or the end of a casting task or a task of `keys`."""
         if self.stages.closed:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
             seconds = max(seconds, WAIT_S)
             keys = [*self.workers.pending, *keys]
-            # Small jobs and batches come in dozens, and while there are many of them nobody waits
-            # for one. Each step costs a millisecond or two, whatever has come.
+            # Small jobs and batches come in dozens, and while there are many, nobody waits for a
+            # single one. Each step costs a millisecond or two, however few messages came.
             small = max(len(self.jobs), self.dispatcher.per_task)
-            many = 2 * len(self.dispatcher.batches) > self.dispatcher.most
-            linger_s = LINGER_S * min(small, MOST_LINGERING if many else 1)
+            much_under_way = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
+            linger_s = LINGER_S * min(small, MAX_LINGERS if much_under_way else 1)
             self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:
         if isinstance(message, ColumnsLost):
-            self.dispatcher.lost(message)
+            self.dispatcher.recast_columns(message)
             return
         job = self.jobs.get(message.job)  # None if it has failed
         match message:
@@ -246,49 +249,49 @@ class Pipeline:
         self._end_complete(of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
-        """Return True if a part is in storage; a part that its worker holds goes there now."""
+        """Return True if a part is in storage; store a part that its worker holds."""
         if not receipt.held_at or self.stages.store_held(receipt):
             return True
-        self.dispatcher.lost_part(receipt)
+        self.dispatcher.recast_part(receipt)
         return False
 
     # -- looking after workers and stages ------------------------------------------------------
 
     def _look(self) -> None:
-        """From time to time, handle workers and stages that have joined, died or are silent.
+        """Handle workers and stages that have joined, died or are silent, if the last check is old.
 
         LidarError if a stage has failed, or workers or slots are missing for too long.
         """
-        if (seen := self.workers.look()) is not None:
-            left = self.later + sum(job.left for job in self.jobs.values())
-            self.workers.want(self.dispatcher.slots_wanted(left))
-            self.dispatcher.leave_workers(seen)
+        if (locations := self.workers.look()) is not None:
+            scan_count = self.scans_to_come + sum(job.missing_count for job in self.jobs.values())
+            self.workers.want(self.dispatcher.slots_wanted(scan_count))
+            self.dispatcher.leave_workers(locations)
             since = time.monotonic() - STALL_S
             self._sort_again(job for job in self.jobs.values() if job.sorted_at < since)
         died, started = self.stages.look(self.progress)
         if died or started:
             self.dispatcher.leave_collectors(died, started)
-        if GENERATE in started:  # a stage that was started gets all that it needs
+        if GENERATE in started:  # a new stage 1 has no orders
             self._announced.clear()
             self._describe(self.jobs.values())
         if SORT in started:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Have stage 1 describe what is left of jobs; an absent one is told when it is started."""
+        """Order stage 1 to describe remaining scans of jobs; `_look` repeats lost orders."""
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
             if job.generated < job.scans.stop
         ]
-        self._announced |= {one.job: one.stop for one in orders}
+        self._announced |= {order.job: order.stop for order in orders}
         if orders:
             self.stages.send(GENERATE, orders)
 
     @property
     def _wants_scans(self) -> bool:
-        """Whether the next job of stage 1 wants scans, or is none any more."""
-        # Those of others are behind them in the pipe: a job gets no more than it has room for.
+        """True if the next job of stage 1 has room for scans, or has ended."""
+        # Scans of later jobs are behind them in the pipe: a job gets no more than it has room for.
         # After the last scan the pipe is closed, which ends each wait at once: a driver that still
         # asked did so 700 times a second.
         for number in self._announced:
@@ -297,15 +300,24 @@ class Pipeline:
         return False
 
     def _sort(self, job: PipelineJob, parts: Sequence[Receipt]) -> None:
-        """Send parts to the sorter if they have frames; an absent one gets them when it starts."""
+        """Send summaries of parts to the sorter; `_look` sends all again when the sorter starts."""
         if parts and job.has_frames:
-            so_far = job.frames, job.scans.stop
-            messages = [Summaries(job.number, p.first, p.stop, p.summaries, *so_far) for p in parts]
+            messages = [
+                Summaries(
+                    job.number,
+                    part.first,
+                    part.stop,
+                    part.summaries,
+                    framed=job.frames,
+                    until=job.scans.stop,
+                )
+                for part in parts
+            ]
             job.trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
             self.stages.send(SORT, messages)
 
     def _sort_again(self, jobs: Iterable[PipelineJob]) -> None:
-        """Send the sorter all that was not handed out of jobs."""
+        """Send the sorter all summaries of jobs that were not handed out as frames."""
         for job in jobs:
             job.sorted_at = time.monotonic()
             if job.has_frames:
@@ -316,12 +328,12 @@ class Pipeline:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Let all stages end: everything is committed; then wait until they have ended."""
+        """Let all stages end after everything is committed."""
         self.workers.want(0)
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """End all stages at once; `finish` does the rest."""
+        """End all stages at once; `finish` must follow."""
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)

@@ -25,7 +25,7 @@ class PipelineJob(CommittedJob):
     number
         Number of the job in its run.
     scene, survey
-        What is scanned, and how.
+        Scene, and the sensors and scans of the survey.
     scans
         Scans that are to be done.
     has_frames
@@ -42,11 +42,11 @@ class PipelineJob(CommittedJob):
         self.run = ""  # id of the run, for traces
         self.packed = b""  # the survey, pickled
         self.scene_name = ""  # jobs of one scene may be cast in one task
-        self.scans_per_task = 1  # that fit into the memory of a casting task
-        self.scans_of_run = 0  # of all jobs, where many are like this one
+        self.scans_per_task = 1  # scans that fit into the memory of a casting task
+        self.scans_of_run = 0  # scans of all jobs, where many jobs are like this one
         self.on_frame: Callable[[ScanFrame], None] | None = None
         self.on_parts: Callable[[list[Receipt]], None] | None = None
-        # How far the pipeline is.
+        # Progress of the pipeline.
         self.generated = scans.start  # one past the last scan that was taken from stage 1
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0  # batches
@@ -58,18 +58,18 @@ class PipelineJob(CommittedJob):
         """Return the points of a committed scan."""
         raise NotImplementedError
 
-    def trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
-        """Report that the driver has reached a point with some scans."""
-        more |= {"run": self.run, "stage": stage}
-        trace(f"driver.{event}", job=self.number, scans=list(scans), **more)
+    def trace(self, event: str, stage: str, scans: Iterable[int], **details: str) -> None:
+        """Emit a trace event of the driver about scans of this job."""
+        details |= {"run": self.run, "stage": stage}
+        trace(f"driver.{event}", job=self.number, scans=list(scans), **details)
 
     def hand_out(self, ordered: Summaries) -> int:
-        """Hand out frames; return their number, since some may have been handed out before."""
+        """Hand out frames in scan order; return the number of frames that are new."""
         self.sorted_at = time.monotonic()
         earlier = self.frames
         survey = self.survey
-        kind = summary_type(samples_of_scan(survey.scan_count))
-        for scan, summary in zip(ordered.scans, np.frombuffer(ordered.data, kind), strict=True):
+        dtype = summary_type(samples_of_scan(survey.scan_count))
+        for scan, summary in zip(ordered.scans, np.frombuffer(ordered.data, dtype), strict=True):
             if scan != self.frames:
                 continue
             assert self.on_frame is not None, "it has frames"

@@ -32,27 +32,27 @@ class TaskRecord:
 
     @property
     def seconds(self) -> float:
-        """Time from start to stop."""
+        """Time from start to stop, seconds."""
         return self.stop - self.start
 
     @property
     def misplaced(self) -> bool:
-        """Whether the worker was not in the task's partition."""
+        """True if the worker was not in the task's partition."""
         return self.partition not in self.resources
 
 
 class Recorder:
-    """Records time and worker of the current task; `done` returns the record."""
+    """Records time and worker of the current task; `finish` returns the record."""
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage = stage
         self.partition = partition
         self.start = time.time()
         # The clock may be set while the task runs; its time must not become hours, or negative.
-        self._begun = time.perf_counter()
+        self._start_s = time.perf_counter()
 
-    def done(self, items: int = 1) -> TaskRecord:
-        """Record of the task until now."""
+    def finish(self, items: int = 1) -> TaskRecord:
+        """Return the record of the task until now, with a number of items."""
         worker = get_worker()
         return TaskRecord(
             stage=self.stage,
@@ -60,7 +60,7 @@ class Recorder:
             worker=str(worker.name),
             resources=resources_here(worker),
             start=self.start,
-            stop=self.start + (time.perf_counter() - self._begun),
+            stop=self.start + (time.perf_counter() - self._start_s),
             items=items,
         )
 
@@ -71,7 +71,7 @@ def recorded(
     """Run `function` on a worker and return its result with the record of the run."""
     recorder = Recorder(stage, partition)
     result = function(*args, **kwargs)
-    return result, recorder.done()
+    return result, recorder.finish()
 
 
 def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:

@@ -1,4 +1,4 @@
-"""Policies of the driver, as pure functions: how large batches are, where they go, when to retry.
+"""Policies of the driver, as pure functions: sizes of batches, choice of workers, retries.
 
 Nothing here reads a clock, the cluster or the driver.
 """
@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from poolpart.task_locations import TaskLocations
 
@@ -17,234 +19,362 @@ from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
 SMALL_SECONDS = 0.05  # casting time of a batch that no slot idles for at the end
-BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
-GROWTH = 8  # times as many scans as the largest of the last batches that the next may have
-TASK_SECONDS = 0.4  # casting time that makes a task worth its overhead, and
-SLOT_SECONDS = 0.008  # more of it with each slot: a driver has some 125 tasks a second
-TASK_BATCHES = 32  # batches of one task, at most
-AHEAD = 2  # tasks offered to a worker for each of its slots, so that it need not wait
-COLLECTING = 3  # tasks whose batches a collector is given at a time
-WORTH_S = 20.0  # casting time that makes another slot worth its start
-SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
-SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
-KILLS_MOST = 3  # workers that a single scan may kill, alone
-LATE_S = 60.0  # a batch is late when it takes so long at one place, and
-LATE_FACTOR = 20.0  # so much longer than others
+MIN_BATCHES_PER_SLOT = 16  # so that no slot idles for long at the end
+MAX_GROWTH = 8  # scans of the next batch, as a multiple of the largest recent batch
+TASK_SECONDS = 0.4  # casting time that makes a task worth its overhead
+SLOT_SECONDS = 0.008  # casting time of a task, for each slot: a driver starts 125 tasks a second
+MAX_BATCHES_PER_TASK = 32
+TASKS_PER_SLOT = 2  # offered tasks for each slot of a worker, so that the slot need not wait
+TASKS_PER_COLLECTOR = 3  # tasks whose batches a collector has at a time
+SLOT_WORTH_S = 20.0  # casting time that makes another slot worth its start
+MAX_SPAN = 8  # batches from the oldest to the newest, as a multiple of the batches under way
+SUSPECT_DEATHS = 2  # workers that may die with a batch before the batch is tried alone
+MAX_KILLS = 3  # workers that a single scan may kill while it is tried alone
+LATE_S = 60.0  # a batch is late when it stays longer than this in a state, and
+LATE_FACTOR = 20.0  # longer than this multiple of the median casting time
 
 
 # -- how much is under way -------------------------------------------------------------------
 
 
-def most_scans(fit: int, scan_count: int, slots: int) -> int:
-    """Find how many scans a batch may have: so many `fit` into its memory, and all slots get some.
+def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int:
+    """Return the largest number of scans of a batch; at least 1, since a scan is never split.
 
-    One at least: a scan is never split.
+    Parameters
+    ----------
+    scans_per_task
+        Scans that fit into the memory of a casting task.
+    scan_count
+        Scans of the run. They are divided so that all slots get some.
+    slots
+        Casting tasks that run at a time.
     """
-    return max(1, min(fit, scan_count // (BATCHES_LEAST * slots)))
+    return max(1, min(scans_per_task, scan_count // (MIN_BATCHES_PER_SLOT * slots)))
 
 
 def scans_per_batch(
-    last: Sequence[tuple[float, int]], fit: int, scan_count: int, slots: int
+    recent_casts: Sequence[tuple[float, int]], scans_per_task: int, scan_count: int, slots: int
 ) -> int:
-    """Choose how many scans a batch should have, from casting times and scans of the last ones.
+    """Choose the number of scans of a batch from the casting times of recent batches.
 
-    Several, because those of one vary: what a campaign had learned of one batch went up and down
-    fourfold. For the others see `most_scans`; a small batch is not divided further.
+    Several recent batches, because casting times vary: with the last batch alone, the size went up
+    and down fourfold during a campaign. A small batch is not divided further.
+
+    Parameters
+    ----------
+    recent_casts
+        Casting time in seconds and number of scans of each recent batch; not empty.
+    scans_per_task
+        Scans that fit into the memory of a casting task.
+    scan_count
+        Scans of the run. They are divided so that all slots get some.
+    slots
+        Casting tasks that run at a time.
     """
-    a_second = statistics.median(scans / max(seconds, 1e-6) for seconds, scans in last)
-    wanted = min(int(BATCH_SECONDS * a_second), GROWTH * max(scans for _, scans in last))
-    most = max(most_scans(fit, scan_count, slots), int(SMALL_SECONDS * a_second))
-    return max(1, min(wanted, most, fit))
+    scans_per_second = statistics.median(
+        scans / max(seconds, 1e-6) for seconds, scans in recent_casts
+    )
+    worthwhile_scans = min(
+        int(BATCH_SECONDS * scans_per_second), MAX_GROWTH * max(scans for _, scans in recent_casts)
+    )
+    max_scans = max(
+        max_scans_per_batch(scans_per_task, scan_count, slots),
+        int(SMALL_SECONDS * scans_per_second),
+    )
+    return max(1, min(worthwhile_scans, max_scans, scans_per_task))
 
 
-def batches_per_task(last: Sequence[tuple[float, int]], slots: int) -> int:
-    """Choose how many small batches a casting task has, from casting times of the last ones.
+def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> int:
+    """Choose the number of small batches of a casting task from casting times of recent batches.
 
-    A task takes the scheduler 0.5 to 1 ms. With one batch in each, a receipt took 2.5 ms of the
+    A task takes the scheduler 0.5 to 1 ms. With a batch a task, a receipt took 2.5 ms of the
     scheduler's processor time; with several, it takes 0.4 to 0.9 ms.
+
+    Parameters
+    ----------
+    recent_casts
+        Casting time in seconds and number of scans of each recent batch.
+    slots
+        Casting tasks that run at a time.
     """
-    if not last:
+    if not recent_casts:
         return 1
-    typical = max(statistics.median(seconds for seconds, _ in last), 1e-6)
-    worth_s = max(TASK_SECONDS, SLOT_SECONDS * slots)
-    return max(1, min(int(worth_s / typical), TASK_BATCHES))
+    median_s = max(statistics.median(seconds for seconds, _ in recent_casts), 1e-6)
+    target_s = max(TASK_SECONDS, SLOT_SECONDS * slots)
+    return max(1, min(int(target_s / median_s), MAX_BATCHES_PER_TASK))
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
-    """How many small batches some batches count as, where a task has so many.
+    """Return the number of small batches that `batches` count as, if a task has `per_task`.
 
-    All of a task's batches are in a worker's memory at a time: one that takes half of what is there
+    All batches of a task are in a worker's memory at a time: a batch that takes half of the memory
     counts as half a task.
     """
     return sum([max(1.0, per_task * batch.share) for batch in batches])
 
 
-def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
-    """Batches that may be under way by their `weight`, so many in a task."""
-    return (AHEAD * slots + COLLECTING * collectors + 2) * per_task
+def max_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
+    """Return the largest `weight` of batches under way, if a task has `per_task` batches."""
+    return (TASKS_PER_SLOT * slots + TASKS_PER_COLLECTOR * collectors + 2) * per_task
 
 
-def slots_wanted(left: int, scan_s: float | None) -> int:
-    """Slots that so many scans are worth, if each takes `scan_s` seconds to cast, None if unknown.
+def slots_wanted(scan_count: int, scan_s: float | None) -> int:
+    """Return the number of casting slots that `scan_count` scans are worth.
 
-    Then as many as may be of use: who waits in a queue twice waits twice as long.
+    `scan_s` is the casting time of a scan in seconds. If it is unknown, None, each scan is worth a
+    slot: a job of a batch queue that asks for more slots later waits a second time.
     """
-    return left if scan_s is None else min(left, math.ceil(left * scan_s / WORTH_S))
+    return (
+        scan_count
+        if scan_s is None
+        else min(scan_count, math.ceil(scan_count * scan_s / SLOT_WORTH_S))
+    )
 
 
 # -- where batches go ------------------------------------------------------------------------
 
 
-def kills(batch: Batch, stage: str) -> int:
-    """How many workers of a stage died with a batch while it was tried alone; below 0: it is not.
+def kills_alone(batch: Batch, stage: str) -> int:
+    """Return the number of a stage's workers that died with a batch alone; < 0 if not yet suspect.
 
-    After some deaths a batch is suspect, and tried alone. An innocent one succeeds then; one whose
-    worker dies again is divided, down to single scans. A scan is the cause if `KILLS_MOST` workers
-    in a row die with it alone.
+    After `SUSPECT_DEATHS` deaths a batch is suspect, and tried alone. An innocent batch succeeds
+    then; a batch whose worker dies again is divided, down to single scans. A scan is the cause if
+    `MAX_KILLS` workers in a row die with that scan alone.
     """
     return batch.deaths[stage] - SUSPECT_DEATHS
 
 
-def suspect(batch: Batch, stage: str) -> bool:
-    """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
-    return bool(batch.deaths) and kills(batch, stage) >= 0
+def is_suspect(batch: Batch, stage: str) -> bool:
+    """Return True if a batch may be the cause of dying workers of a stage, to be tried alone."""
+    return bool(batch.deaths) and kills_alone(batch, stage) >= 0
+
+
+class TaskOffer(NamedTuple):
+    """A casting task and the worker that gets the task."""
+
+    batches: list[Batch]
+    worker: str  # address
 
 
 def offers(
-    batches: Sequence[Batch], slots: Mapping[str, int], most: int, per_task: int = 1
-) -> list[tuple[list[Batch], str]]:
-    """Choose workers for waiting batches, at most so many under way in all.
+    batches: Sequence[Batch], slots: Mapping[str, int], max_weight: int, per_task: int = 1
+) -> list[TaskOffer]:
+    """Group waiting batches into casting tasks, and choose a worker for each task.
 
     The worker with the least work for its slots gets the next task, of up to `per_task` batches of
     jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. A batch with
     which a worker has died gets a task for itself, or its neighbours would share the blame for the
-    next one. A suspect batch gets a worker for itself, and is waited for: the others must not
-    occupy all workers. Batches that wait are taken in their order. `slots` says how many tasks each
-    worker runs at a time.
+    next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
+    they must not occupy all workers. Waiting batches are taken in their order.
+
+    Parameters
+    ----------
+    batches
+        Waiting batches in their order, and all batches under way.
+    slots
+        {address of a worker: casting tasks that the worker runs at a time}.
+    max_weight
+        Largest `weight` of all batches under way.
+    per_task
+        Small batches of a task.
     """
-    casting = [b for b in batches if b.place is BatchState.CASTING]
-    load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
-    alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
-    waiting = [b for b in batches if b.place is BatchState.WAITING]
-    behind = [b for b in batches if b.place in (BatchState.CAST, BatchState.COLLECTING)]
-    left = most - weight([*behind, *(b for b in casting if b.worker in slots)], per_task)
-    backlog = any(b.place is BatchState.CAST for b in behind)
-    idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
-    spread = -(-weight(waiting, per_task) // max(1, idle))  # all idle slots get some
-    size = per_task if backlog else min(per_task, spread)
-    groups: dict[object, deque[Batch]] = {}  # those that may share a task
+    state = _OfferState.from_batches(batches, slots, max_weight, per_task)
+    waiting = [batch for batch in batches if batch.state is BatchState.WAITING]
+    idle_slots = state.idle_slots()
+    spread = -(-weight(waiting, per_task) // max(1, idle_slots))  # all idle slots get some
+    task_size = per_task if state.has_backlog else min(per_task, spread)
+    groups: dict[object, deque[Batch]] = {}  # batches that may share a task
     for batch in waiting:
-        groups.setdefault(_group(batch), deque()).append(batch)
-    chosen: list[tuple[list[Batch], str]] = []
+        groups.setdefault(_group_key(batch), deque()).append(batch)
+    chosen: list[TaskOffer] = []
     passed: set[Batch] = set()
     for first in waiting:
         if first in passed:
             continue
-        wary = suspect(first, INTERSECT)
-        fullness = {
-            address: load[address] / (1 if wary else AHEAD * count)
-            for address, count in slots.items()
-            if address not in alone
-        }
-        address = min(fullness, key=lambda a: (fullness[a], a), default="")
-        if not address or fullness[address] >= 1 or left < 1:
+        suspect = is_suspect(first, INTERSECT)
+        worker = state.least_loaded(alone=suspect)
+        if worker is None or state.free_weight < 1:
             break
-        group = groups[_group(first)]
-        busy = backlog or load[address] >= slots[address]
-        if busy and not first.deaths and min(left, weight(group, per_task)) < per_task:
+        group = groups[_group_key(first)]
+        if state.may_wait(first, group, worker):
             passed.update(group)  # a task that has to wait may become larger
             continue
-        task = _task(group, min(size, left), per_task)
-        left -= weight(task, per_task)
+        task = _take_task(group, min(task_size, state.free_weight), per_task)
         passed.update(task)
-        chosen.append((task, address))
-        load[address] += 1
-        if wary:
-            alone.add(address)
+        chosen.append(TaskOffer(task, worker))
+        state.add(task, worker, alone=suspect)
     return chosen
 
 
-def _group(batch: Batch) -> object:
-    """Return what the batches of a task have in common."""
+@dataclass(eq=False)
+class _OfferState:
+    """Load of the casting workers while tasks are offered."""
+
+    slots: Mapping[str, int]  # {address: casting tasks at a time}
+    per_task: int  # small batches of a task
+    load: Counter[str]  # {address: tasks that the worker has}
+    reserved: set[str]  # addresses of workers that try a suspect batch
+    free_weight: float  # of batches that may still be offered
+    has_backlog: bool  # True if batches that were cast wait for a collector
+
+    @classmethod
+    def from_batches(
+        cls, batches: Sequence[Batch], slots: Mapping[str, int], max_weight: int, per_task: int
+    ) -> _OfferState:
+        """Return the load by the batches that are under way."""
+        casting = [b for b in batches if b.state is BatchState.CASTING]
+        behind = [b for b in batches if b.state in (BatchState.CAST, BatchState.COLLECTING)]
+        counted = [*behind, *(b for b in casting if b.worker in slots)]
+        return cls(
+            slots,
+            per_task,
+            load=Counter(worker for _, worker in {(b.key, b.worker) for b in casting}),
+            reserved={batch.worker for batch in casting if is_suspect(batch, INTERSECT)},
+            free_weight=max_weight - weight(counted, per_task),
+            has_backlog=any(b.state is BatchState.CAST for b in behind),
+        )
+
+    def idle_slots(self) -> int:
+        """Return the number of slots without a task, on workers that are not reserved."""
+        return sum(
+            max(0, count - self.load[address])
+            for address, count in self.slots.items()
+            if address not in self.reserved
+        )
+
+    def least_loaded(self, *, alone: bool) -> str | None:
+        """Return the worker with the least work for its slots, or None if all are full.
+
+        With `alone`, only a worker without any task is not full.
+        """
+        fullness = {
+            address: self.load[address] / (1 if alone else TASKS_PER_SLOT * count)
+            for address, count in self.slots.items()
+            if address not in self.reserved
+        }
+        address = min(fullness, key=lambda a: (fullness[a], a), default="")
+        return address if address and fullness[address] < 1 else None
+
+    def may_wait(self, first: Batch, group: Collection[Batch], worker: str) -> bool:
+        """Return True if a task of a group would be small, and has to wait on its worker anyway."""
+        busy = self.has_backlog or self.load[worker] >= self.slots[worker]
+        if not busy or first.deaths:
+            return False
+        return min(self.free_weight, weight(group, self.per_task)) < self.per_task
+
+    def add(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
+        """Count a task that is offered to a worker."""
+        self.free_weight -= weight(task, self.per_task)
+        self.load[worker] += 1
+        if alone:
+            self.reserved.add(worker)
+
+
+def _group_key(batch: Batch) -> object:
+    """Return a key that is equal for batches that may share a task."""
     if batch.deaths:
         return batch
     return batch.job.number if batch.divided else batch.job.scene_name
 
 
-def _task(group: deque[Batch], most: float, per_task: int) -> list[Batch]:
-    """Take the batches of a task from a group, one at least."""
+def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:
+    """Remove the batches of a task from a group and return the batches; at least 1."""
     task = [group.popleft()]
-    taken = weight(task, per_task)
-    while group and (taken := taken + weight([group[0]], per_task)) <= most:
+    task_weight = weight(task, per_task)
+    while group and (task_weight := task_weight + weight([group[0]], per_task)) <= max_weight:
         task.append(group.popleft())
     return task
 
 
-def handovers(
-    batches: Sequence[Batch], collectors: Mapping[str, str]
-) -> list[tuple[list[Batch], str]]:
-    """Choose collectors for batches that were cast, those of a task together.
+class Handover(NamedTuple):
+    """Batches that were cast in one task, and the collector that stores the batches."""
 
-    Those with which a collector has died come alone. A collector on the host of the columns is
-    preferred. A suspect batch is collected while there is no other in stage 4: several collectors
-    may share a process. `collectors` has the address of the worker of each.
+    batches: list[Batch]
+    collector: str  # name
+
+
+def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
+    """Choose collectors for batches that were cast; batches of a task stay together.
+
+    Batches with which a collector has died come alone. A collector on the host of the columns is
+    preferred. A suspect batch is collected while no other batch is in stage 4: several collectors
+    may share a process. `collectors` is {name of a collector: address of its worker}.
     """
-    ready = [b for b in batches if b.place is BatchState.CAST]
-    busy = [b for b in batches if b.place is BatchState.COLLECTING]
-    if suspects := [b for b in ready if suspect(b, COLLECT)]:
+    ready = [b for b in batches if b.state is BatchState.CAST]
+    busy = [b for b in batches if b.state is BatchState.COLLECTING]
+    if suspects := [b for b in ready if is_suspect(b, COLLECT)]:
         ready = [] if busy else suspects[:1]
-    if any(suspect(b, COLLECT) for b in busy):
+    if any(is_suspect(b, COLLECT) for b in busy):
         return []
     load = Counter(name for _, name in {(b.key, b.collector) for b in busy})
     tasks: dict[tuple[str, Batch | None], list[Batch]] = {}
     for batch in ready:
         tasks.setdefault((batch.key, batch if batch.deaths[COLLECT] else None), []).append(batch)
-    chosen: list[tuple[list[Batch], str]] = []
+    chosen: list[Handover] = []
     for task in tasks.values():
-        free = [name for name in collectors if load[name] < COLLECTING]
+        free = [name for name in collectors if load[name] < TASKS_PER_COLLECTOR]
         if not free:
             break
-        near = [name for name in free if _host(collectors[name]) == _host(task[0].worker)]
-        name = min(near or free, key=lambda n: (load[n], n))
-        chosen.append((task, name))
+        on_host = [name for name in free if _host(collectors[name]) == _host(task[0].worker)]
+        name = min(on_host or free, key=lambda n: (load[n], n))
+        chosen.append(Handover(task, name))
         load[name] += 1
     return chosen
 
 
 def _host(address: str) -> str:
-    """Host of a worker's address."""
+    """Return the host of a worker's address."""
     return address.rpartition("/")[2].rpartition(":")[0]
 
 
 # -- when a batch is tried again -------------------------------------------------------------
 
 
-def late_after_s(last: Sequence[tuple[float, int]]) -> float:
-    """Seconds after which a batch is late, from casting times of the last; inf without any."""
-    if not last:
+def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
+    """Return the age in seconds after which a batch is late; inf without recent casting times."""
+    if not recent_casts:
         return float("inf")
-    return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in last))
+    return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in recent_casts))
 
 
 def loss(
-    batch: Batch, seen: TaskLocations, prepared: int, now: float, late_s: float
+    batch: Batch, locations: TaskLocations, prepared_workers: int, now_s: float, late_s: float
 ) -> Outcome | None:
-    """Whether a batch should be offered again although its task has not failed, and why.
+    """Return why a batch should be offered again although its task has not failed, or None.
 
-    It depends on what was `seen` of workers and tasks, and on the number of workers that are
-    `prepared`: while there is no other, a batch is waited for. A worker that Dask has paused starts
-    no task until memory is free, perhaps never: what it has not started is offered elsewhere.
+    A worker that Dask has paused starts no task until memory is free, perhaps never: its tasks
+    that have not started are offered elsewhere.
+
+    Parameters
+    ----------
+    batch
+        A batch under way.
+    locations
+        Workers of the partition, and where their tasks are.
+    prepared_workers
+        Workers that can cast. While there is no other worker, a silent or late worker is waited
+        for.
+    now_s
+        Current time, by the clock of `Batch.since`.
+    late_s
+        Age in seconds after which a batch is late.
     """
-    if batch.place in (BatchState.CASTING, BatchState.CAST):
-        if batch.worker not in seen.members:
-            return Outcome.DIED if batch.place is BatchState.CASTING else Outcome.GONE
-        if batch.worker in seen.silent:
-            if prepared:
+    if batch.state in (BatchState.CASTING, BatchState.CAST):
+        if batch.worker not in locations.members:
+            return Outcome.DIED if batch.state is BatchState.CASTING else Outcome.GONE
+        if batch.worker in locations.silent:
+            if prepared_workers:
                 return Outcome.GONE
-        elif batch.worker not in seen.free and batch.place is BatchState.CASTING:
-            task = seen.tasks.get(batch.key)
+        elif batch.worker not in locations.free and batch.state is BatchState.CASTING:
+            task = locations.tasks.get(batch.key)
             # "no-worker": not even sent there, as the worker was paused before.
             if task and task.state in ("no-worker", "processing") and not task.started:
                 return Outcome.REFUSED
-    late = batch.place in (BatchState.CASTING, BatchState.COLLECTING) and now - batch.since > late_s
-    return Outcome.LATE if late and (prepared > 1 or batch.place is BatchState.COLLECTING) else None
+    late = (
+        batch.state in (BatchState.CASTING, BatchState.COLLECTING) and now_s - batch.since > late_s
+    )
+    return (
+        Outcome.LATE
+        if late and (prepared_workers > 1 or batch.state is BatchState.COLLECTING)
+        else None
+    )

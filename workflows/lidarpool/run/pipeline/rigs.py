@@ -1,9 +1,10 @@
-"""Stage 2: rigs of GPU workers, and the casting of batches with them.
+"""Stage 2: rigs of GPU workers, and the casting of batches with these rigs.
 
-Each worker process makes the rig of a job once, and casting tasks name it. The first task of a job
-on a worker brings what the rig is made of; the worker keeps it in a table of this module, and the
-scene with its trees for other jobs of the same scene. A task's result would not work: Dask drops
-copies that no task needs at an instant, and every new copy would build its tree again.
+Each worker process builds the rig of a job once, and casting tasks name the rig. The first task of
+a job on a worker brings the plan of the rig, and the scene; the worker keeps the rig in a table of
+this module, and the scene with its trees for other jobs of the same scene. A task's result would
+not work: Dask drops copies that no task needs at an instant, and every new copy would build its
+tree again.
 """
 
 from __future__ import annotations
@@ -34,91 +35,96 @@ from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
 from .placement import Recorder, TaskRecord
 
-UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
+UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
-    """The worker has no such rig, or its scene: it was restarted, or has dropped it."""
+    """Error for a rig or scene that a worker lacks, after a restart or because it was dropped."""
 
 
 class RigFailed(RuntimeError):  # noqa: N818
-    """The rig of a survey cannot be made."""
+    """Error for a survey whose rig cannot be built."""
 
 
 @dataclass(eq=False)
-class _Kept:
-    """A rig, or a scene with one of its rigs, and when it was asked for."""
+class _CachedRig:
+    """A rig for a job, or for its scene, with the time of its last use."""
 
     rig: Rig
     scene: str  # handle
-    used_at: float
+    used_at: float  # monotonic time
 
 
-_kept: dict[str, _Kept] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
-_ended: deque[str] = deque(maxlen=64)  # runs: a task that is still casting for one keeps nothing
+_cache: dict[str, _CachedRig] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
+_ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
 _lock = threading.Lock()
 
 
 def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -> Rig:
-    """Return a rig of this process, made of a plan and scene if there is none.
+    """Return a rig of this process, built of a plan and scene if the rig is not cached.
 
-    RigMissing if it is not there, or its scene is not, and nothing to make it of; RigFailed if it
-    cannot be made.
+    Raises
+    ------
+    RigMissing
+        If the rig is not cached and there is no plan, or if its scene is not cached either.
+    RigFailed
+        If the rig cannot be built.
     """
-    kept = _kept.get(handle)
-    if kept is None:
+    cached = _cache.get(handle)
+    if cached is None:
         with _lock:
-            kept = _kept.get(handle)
-            if kept is None:
-                kept = _kept[handle] = _made(handle, plan, scene)
-                if (run := handle.partition(".")[0]) in _ended:
+            cached = _cache.get(handle)
+            if cached is None:
+                cached = _cache[handle] = _build(handle, plan, scene)
+                if (run := handle.partition(".")[0]) in _ended_runs:
                     drop_all(run)
-    its_scene = _kept.get(kept.scene, kept)
-    kept.used_at = its_scene.used_at = time.monotonic()
-    return kept.rig
+    its_scene = _cache.get(cached.scene, cached)
+    cached.used_at = its_scene.used_at = time.monotonic()
+    return cached.rig
 
 
-def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
+def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
         name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
         survey: Survey = pickle.loads(packed)  # noqa: S301
-        now = time.monotonic()
-        drop([h for h, one in [*_kept.items()] if now - one.used_at > UNUSED_S and h != name])
-        if (found := _kept.get(name)) is not None:
-            rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
+        now_s = time.monotonic()
+        unused = [h for h, cached in [*_cache.items()] if now_s - cached.used_at > UNUSED_S]
+        drop([unused_handle for unused_handle in unused if unused_handle != name])
+        if (cached_scene := _cache.get(name)) is not None:
+            rig = cached_scene.rig.with_survey(cached_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
-            still: Scene = pickle.loads(scene)  # noqa: S301
+            static_scene: Scene = pickle.loads(scene)  # noqa: S301
             threads = get_worker().state.nthreads
-            rig = Rig(still.with_actors(actors), survey, backend, threads, own_device())
+            rig = Rig(static_scene.with_actors(actors), survey, backend, threads, own_device())
         else:
             raise RigMissing(f"This worker has no scene {name!r}.")
     except RigMissing:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    _kept[name] = _Kept(rig, name, time.monotonic())
+    _cache[name] = _CachedRig(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
-    return _Kept(rig, name, time.monotonic())
+    return _CachedRig(rig, name, time.monotonic())
 
 
 def drop(handles: Collection[str]) -> None:
-    """Drop rigs and scenes; those that are not there are skipped."""
+    """Drop cached rigs and scenes by their handles; unknown handles are ignored."""
     for handle in handles:
-        _kept.pop(handle, None)
+        _cache.pop(handle, None)
 
 
 def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run that has ended."""
-    _ended.append(run)
+    _ended_runs.append(run)
     # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
-    drop([handle for handle in [*_kept] if handle.partition(".")[0] == run])
+    drop([handle for handle in [*_cache] if handle.partition(".")[0] == run])
 
 
 @dataclass(frozen=True, slots=True)
 class CastWork:
-    """What a casting task does for one job: cast some batches with the job's rig."""
+    """Batches of a job that a casting task casts with the job's rig."""
 
     job: int
     handle: str  # of the rig
@@ -142,53 +148,54 @@ def intersect(
 ) -> list[CastBatch]:
     """Cast the rays of batches and make their columns; runs on a GPU worker.
 
-    The jobs share the still part of a scene. It is made of `scene`, and the rig of each job of its
-    plan, if the worker has none; rigs and scenes that are `unneeded` are dropped before.
+    The jobs share the static part of a scene. If the worker has no copy, the static part is
+    unpickled from `scene`, and the rig of each job from its plan; rigs and scenes in `unneeded` are
+    dropped before.
 
     Raises
     ------
     RigMissing
-        If the worker has no such rig, and nothing to make it of.
+        If the worker has no rig for a job, and neither plan nor scene to build it.
     RigFailed
-        If a rig cannot be made.
+        If a rig cannot be built.
     ScanError
         If casting or a column fails, naming the scans.
     """
     drop(unneeded)
-    done = []
+    results = []
     for work, plan in zip(works, plans, strict=True):
         rig = rig_of(work.handle, plan, scene)
-        done += [_cast(rig, work, first, stop) for first, stop in work.spans]
-    return done
+        results += [_cast(rig, work, first, stop) for first, stop in work.spans]
+    return results
 
 
 def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     recorder = Recorder(INTERSECT, GPU)
-    about = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
+    fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
-    trace("intersect.start", **about, scans=scans)
+    trace("intersect.start", **fields, scans=scans)
     with naming_scans(first, stop):
-        found = list(rig.cast(first, stop))
-        trace("intersect.cast", **about, scans=scans)
+        batches = list(rig.cast(first, stop))
+        trace("intersect.cast", **fields, scans=scans)
         part = replace(
-            columns_of(found),
-            scan_hits=np.concatenate([returns.hits for returns in found]).astype(np.uint32),
-            samples=np.concatenate([_samples(returns) for returns in found]),
+            columns_of(batches),
+            scan_hits=np.concatenate([returns.hits for returns in batches]).astype(np.uint32),
+            samples=np.concatenate([_samples(returns) for returns in batches]),
         )
-    batch = CastBatch(work.job, part, recorder.done(stop - first))
-    trace("intersect.end", **about, scans=scans)
+    batch = CastBatch(work.job, part, recorder.finish(stop - first))
+    trace("intersect.end", **fields, scans=scans)
     return batch
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Sample rays: spread over the points of each scan, (scans, samples, 3); NaN if missing."""
-    samples = samples_of_scan(returns.survey.scan_count)
-    begins = np.cumsum(returns.counts) - returns.counts
-    steps = np.arange(samples) / max(samples - 1, 1)
+    """Return sample points spread over each scan, (scans, samples, 3), metres; NaN if missing."""
+    sample_count = samples_of_scan(returns.survey.scan_count)
+    starts = np.cumsum(returns.counts) - returns.counts
+    steps = np.arange(sample_count) / max(sample_count - 1, 1)
     last = np.maximum(returns.counts - 1, 0)
-    rows = begins[:, None] + np.floor(steps * last[:, None]).astype(np.int64)
-    there = (np.arange(samples) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
-    out = np.full((len(returns.specs), samples, 3), np.nan, np.float32)
+    rows = starts[:, None] + np.floor(steps * last[:, None]).astype(np.int64)
+    valid = (np.arange(sample_count) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
+    samples = np.full((len(returns.specs), sample_count, 3), np.nan, np.float32)
     if len(returns):
-        out[there] = returns.positions_of(rows[there])
-    return out
+        samples[valid] = returns.positions_of(rows[valid])
+    return samples

@@ -1,7 +1,8 @@
 """Stages 1, 3 and 4: the long-running tasks on LIDAR workers.
 
-Each secedes at once: it frees its thread but keeps its slot, so that a worker with one thread and
-four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver knows the reason.
+Each stage secedes at once: it frees its thread but keeps its slot, so that a worker with one thread
+and four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver knows the
+reason.
 """
 
 from __future__ import annotations
@@ -39,179 +40,194 @@ from .names import COLLECT, GENERATE, LIDAR
 from .placement import Recorder, TaskRecord
 from .rigs import CastBatch
 
-TELL_EVERY_S = 0.05  # messages that follow each other so fast travel together
-LINGER_S = 0.02  # the sorter waits so long for more
+SEND_EVERY_S = 0.05  # messages that follow each other faster are sent together
+LINGER_S = 0.02  # wait of the sorter for more messages
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
-def _work(
-    me: StageStart, inlet: Pipe, do: Callable[[Iterator[Any]], Iterable[int]], linger_s: float = 0.0
+def _serve(
+    start: StageStart,
+    inlet: Pipe,
+    process: Callable[[Iterator[Any]], Iterable[int]],
+    linger_s: float = 0.0,
 ) -> TaskRecord:
-    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done.
+    """Process the messages of the driver until a pipe is closed; return the record of the task.
 
-    Once there is something, it waits `linger_s` for more.
+    `process` gets an iterator of messages and yields the number of scans after each step. After the
+    first message, `linger_s` seconds are waited for more.
     """
-    recorder = Recorder(me.stage, LIDAR)
+    recorder = Recorder(start.stage, LIDAR)
     scans = 0
-    me.trace("start")
+    start.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
-            for count in do(chain.from_iterable(inlet.get_all(linger_s=linger_s))):
+            for count in process(chain.from_iterable(inlet.get_all(linger_s=linger_s))):
                 scans += count
-    return recorder.done(scans)
+    return recorder.finish(scans)
 
 
-def _tell(
-    me: StageStart, outlet: Pipe, news: Iterable[Scans | ColumnsLost | Failed], most: int = 0
+def _send_news(
+    start: StageStart,
+    outlet: Pipe,
+    news: Iterable[Scans | ColumnsLost | Failed],
+    max_items: int = 0,
 ) -> Iterator[int]:
-    """Send news to the driver, those that follow each other quickly together, at most so many.
+    """Send news to the driver, and yield the number of scans of each sent group.
 
-    Without a limit, the driver limits its orders. Yields of how many scans it has told.
+    News that follow each other quickly are sent together, at most `max_items`. Without a limit, 0,
+    the driver limits its orders.
     """
     waiting: list[Scans | ColumnsLost | Failed] = []
 
     def send() -> int:
-        outlet.put_many(waiting, unbounded=not most)
-        done = [item.scans for item in waiting if isinstance(item, Scans)]
-        for scans in done:
-            me.trace("sent", scans)
+        outlet.put_many(waiting, unbounded=not max_items)
+        scan_ranges = [item.scans for item in waiting if isinstance(item, Scans)]
+        for scans in scan_ranges:
+            start.trace("sent", scans)
         waiting.clear()
-        return sum(map(len, done))
+        return sum(map(len, scan_ranges))
 
-    told = time.monotonic()
+    sent_at = time.monotonic()
     for item in news:
         waiting.append(item)
-        if len(waiting) == most or time.monotonic() - told > TELL_EVERY_S:
+        if len(waiting) == max_items or time.monotonic() - sent_at > SEND_EVERY_S:
             yield send()
-            told = time.monotonic()
+            sent_at = time.monotonic()
     yield send()
 
 
 @telling_departure()
-def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 1: describe the scans of surveys, one after the other, the advised number in one item.
+def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
+    """Stage 1: describe the scans of surveys in order; the driver advises the scans of an item.
 
     From the driver come lists of `Description`. An item is a `ScanRange`: the survey describes the
     scans equally on every worker. A survey that cannot be described is reported as `Failed`.
     """
     secede()
-    return _work(
-        me, inlet, lambda wanted: _tell(me, outlet, _described(me, wanted, outlet), outlet.capacity)
+    return _serve(
+        start,
+        inlet,
+        lambda descriptions: _send_news(
+            start, outlet, _describe_scans(start, descriptions, outlet), outlet.capacity
+        ),
     )
 
 
-def _described(
-    me: StageStart, wanted: Iterable[Description], outlet: Pipe
+def _describe_scans(
+    start: StageStart, descriptions: Iterable[Description], outlet: Pipe
 ) -> Iterator[ScanRange | Failed]:
-    for one in wanted:
-        sent = one.first
+    for description in descriptions:
+        first = description.first
         try:
-            with naming_scans(sent, sent + 1):
-                survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
-            while sent < one.stop:
-                item = ScanRange(one.job, sent, min(sent + outlet.advice, one.stop))
+            with naming_scans(first, first + 1):
+                survey: Survey = pickle.loads(description.survey)  # noqa: S301 - of the run's own driver
+            while first < description.stop:
+                item = ScanRange(
+                    description.job, first, min(first + outlet.advice, description.stop)
+                )
                 with naming_scans(item.first, item.stop):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described
-                me.trace("put", item.scans)
+                start.trace("put", item.scans)
                 yield item
-                sent = item.stop
-        except ScanError as error:  # others can be described
-            yield Failed(one.job, GENERATE, str(error))
+                first = item.stop
+        except ScanError as error:  # other surveys can be described
+            yield Failed(description.job, GENERATE, str(error))
 
 
 @telling_departure()
-def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
+def sort_frames(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of the scans of each survey into scan order.
 
-    From the driver come lists of `Summaries`, and to it goes each of them once those before it
-    went, or had been handed out already, as they say. A survey is forgotten after its last scan.
+    From the driver come lists of `Summaries`. Each is sent back to the driver once all earlier
+    scans were sent back, or had been handed out before (`Summaries.framed`). A survey is forgotten
+    after its last scan.
     """
     secede()
-    orders: dict[int, _Order] = {}  # {job: where its survey is}
+    orders: dict[int, _ScanOrder] = {}  # {job: its waiting summaries}
 
     def sort(news: Iterator[Summaries]) -> Iterator[int]:
         ready = []
         for item in news:
-            me.trace("get", item.scans)
-            order = orders.setdefault(item.job, _Order())
-            ready += order.take(item)
-            if order.following >= item.until:
+            start.trace("get", item.scans)
+            order = orders.setdefault(item.job, _ScanOrder())
+            ready += order.add(item)
+            if order.next_scan >= item.until:
                 del orders[item.job]
         if ready:
             scans = [*chain.from_iterable(item.scans for item in ready)]
-            me.trace("put", scans)
+            start.trace("put", scans)
             outlet.put_many(ready, unbounded=True)
-            me.trace("sent", scans)
+            start.trace("sent", scans)
             yield len(scans)
 
     # Each answer wakes the driver.
-    return _work(me, inlet, sort, linger_s=LINGER_S)
+    return _serve(start, inlet, sort, linger_s=LINGER_S)
 
 
 @dataclass(eq=False)
-class _Order:
-    """Where the sorter is in a survey."""
+class _ScanOrder:
+    """Summaries of a survey that wait for earlier scans."""
 
-    following: int = 0  # the scan that comes next
+    next_scan: int = 0
     waiting: dict[int, Summaries] = field(default_factory=dict)  # {first scan: summaries}
 
-    def take(self, item: Summaries) -> list[Summaries]:
-        """Take summaries; returns those that can go on now."""
-        self.following = max(self.following, item.framed)
-        if item.stop > self.following:
-            self.waiting[max(item.first, self.following)] = item
+    def add(self, item: Summaries) -> list[Summaries]:
+        """Add summaries, and return the summaries that are next in scan order, if there are any."""
+        self.next_scan = max(self.next_scan, item.framed)
+        if item.stop > self.next_scan:
+            self.waiting[max(item.first, self.next_scan)] = item
         ready = []
-        while (found := self.waiting.pop(self.following, None)) is not None:
-            ready.append(found)
-            self.following = found.stop
+        while (summaries := self.waiting.pop(self.next_scan, None)) is not None:
+            ready.append(summaries)
+            self.next_scan = summaries.stop
         return ready
 
 
 @telling_departure()
 def collect(
-    me: StageStart, storage: Storage, probe: tuple[str, bytes], inlet: Pipe, outlet: Pipe
+    start: StageStart, storage: Storage, probe: tuple[str, bytes], inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
-    """Stage 4: fetch batches from the workers that cast them, and write each as a part.
+    """Stage 4: fetch batches from the workers that cast the batches, and write each as a part.
 
-    `probe` is a file in the storage, name and content: a worker that does not see it holds its
-    parts in memory, and the driver fetches them. From the driver come lists of `CollectOrder`, to
-    it go `Receipt`, `ColumnsLost` and `Failed`.
+    `probe` is a file in the storage, name and content: a worker that does not see this file holds
+    its parts in memory, and the driver fetches the parts. From the driver come lists of
+    `CollectOrder`; `Receipt`, `ColumnsLost` and `Failed` are sent to the driver.
     """
     secede()
-    there = storage if storage.sees(*probe) else None
+    visible_storage = storage if storage.sees(*probe) else None
 
     def store(orders: Iterator[CollectOrder]) -> Iterator[int]:
         # The pipe's client: `own_client` makes a message to the scheduler each time.
-        news = (_collected(me, there, order, inlet.client) for order in orders)
-        return _tell(me, outlet, chain.from_iterable(news))
+        news = (_write_parts(start, visible_storage, order, inlet.client) for order in orders)
+        return _send_news(start, outlet, chain.from_iterable(news))
 
-    return _work(me, inlet, store)
+    return _serve(start, inlet, store)
 
 
-def _collected(
-    me: StageStart, storage: Storage | None, order: CollectOrder, client: Client
+def _write_parts(
+    start: StageStart, storage: Storage | None, order: CollectOrder, client: Client
 ) -> Iterator[Receipt | ColumnsLost | Failed]:
-    """Make the parts of a casting task; gives the messages to the driver."""
-    found = fetch_available(client, [order.key], FETCH_PATIENCE_S, at=order.worker)
-    if order.key not in found:
+    """Write the parts of a casting task, and yield the messages to the driver."""
+    results = fetch_available(client, [order.key], FETCH_PATIENCE_S, holder=order.worker)
+    if order.key not in results:
         yield ColumnsLost(order.key)
         return
-    batches = {(batch.job, batch.part.first): batch for batch in found[order.key]}
+    batches = {(batch.job, batch.part.first): batch for batch in results[order.key]}
     for job, (first, stop), name in order.parts:
         batch: CastBatch = batches[job, first]
         scans = range(first, stop)
-        me.trace("get", scans)
+        start.trace("get", scans)
         try:
             with naming_scans(first, stop):
                 data = pack(batch.part)
-                receipt = Receipt.of_part(batch.part, job, name, len(data), batch.record)
-            me.trace("part", scans)
+                receipt = Receipt.from_part(batch.part, job, name, len(data), batch.record)
+            start.trace("part", scans)
             if storage is None:
                 yield replace(receipt, held_at=hold_for_driver(name, data))
                 continue
             with storing(storage):
                 storage.write(name, data)
-            me.trace("stored", scans)
+            start.trace("stored", scans)
             yield receipt
         except ScanError as error:
             yield Failed(job, COLLECT, str(error))

@@ -1,8 +1,8 @@
 """The database of a run: which parts and trials of its jobs belong to the result.
 
-One SQLite file. A batch belongs to the result once its receipt is in here; before that anything may
-be lost or done twice, after that a second receipt is ignored. Recovery and resuming offer all other
-batches again. A job that has ended leaves a row, and its receipts go.
+One SQLite file. A batch belongs to the result once its receipt is in this database; before that,
+work may be lost or repeated, after that a second receipt is ignored. Recovery and resuming offer
+all other batches again. A job that has ended leaves a row, and its receipts are deleted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from lidarsim.base.errors import LidarError
 
 from ...columns.parts import part_name
-from ...datasets.job_table import JOBS_MOST
+from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
 from ..pipeline.committed_job import CommittedJob
 from ..pipeline.messages import Receipt
@@ -50,7 +50,7 @@ CREATE TABLE jobs (
     number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL, crc INTEGER NOT NULL
 );
 """
-# Columns of each table but for `crc`, which is the CRC-32 of their values.
+# Columns of each table without `crc`, which is the CRC-32 of the other columns' values.
 _COLUMNS = {
     "meta": ("name", "value"),
     "parts": ("job", "first", "stop", "rows", "size", "hits", "cells", "summaries"),
@@ -59,46 +59,45 @@ _COLUMNS = {
     "made_of": ("job", "hash"),
     "jobs": ("number", "failed", "data"),
 }
-_OF_DISK = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
-_OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
+_DISK_ERRORS = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
+_JOB_TABLES = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
 
 
 class DamagedError(LidarError):
-    """A database cannot be read any more."""
+    """Error for a database that cannot be read."""
 
 
 class RunDatabase:
     """Committed parts and trials of the jobs of a run, and the jobs that have ended.
 
-    Jobs under way have what is committed of them in memory, too. A file that does not exist is
-    made, and begins with the values `new`. Commits survive a power failure if they are `durable`.
-    All methods that write raise LidarError if the disk is full or fails.
+    Jobs under way have a copy of their committed results in memory. A file that does not exist is
+    created with the first `values`. Commits survive a power failure if they are `durable`. All
+    methods that write raise LidarError if the disk is full or fails.
 
-    LidarError if it is damaged, of another version, in use by another run, or cannot be
+    LidarError if the database is damaged, of another version, in use by another run, or cannot be
     written.
     """
 
-    def __init__(self, path: Path, *, durable: bool = True, **new: str) -> None:
+    def __init__(self, path: Path, *, durable: bool = True, **values: str) -> None:
         self.path = path
         self._durable = durable
         self.meta: dict[str, str] = {}
-        # Numbers of the jobs that have not ended and of which something is committed.
-        self.begun: set[int] = set()
-        self.ended_count = 0
-        self._ended = bytearray()  # of each job: 1 if it has ended
+        self.begun: set[int] = set()  # jobs under way with committed parts, trials or frames
+        self.ended_count = 0  # jobs that have ended
+        self._ended = bytearray()  # for each job: 1 if it has ended
         with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
             )
             self._sql.create_function("crc32", -1, _crc32, deterministic=True)
             try:
-                self._open({"format": str(FORMAT), "mark": secrets.token_hex(8)} | new)
+                self._open({"format": str(FORMAT), "mark": secrets.token_hex(8)} | values)
             except BaseException:
                 self._sql.close()
                 raise
 
-    def _open(self, new: Mapping[str, str]) -> None:
+    def _open(self, values: Mapping[str, str]) -> None:
         # The lock is held while the database is open, so that no second run writes to it. No
         # write-ahead log: it does not work on network disks.
         self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
@@ -107,12 +106,14 @@ class RunDatabase:
         if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
-            self._sql.executemany(_insert("meta"), new.items())
+            self._sql.executemany(_insert("meta"), values.items())
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
-        if (made := self.meta.get("format")) != str(FORMAT):
-            raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
-        _checked_place(self.meta)
+        if (version := self.meta.get("format")) != str(FORMAT):
+            raise sqlite3.DatabaseError(
+                f"it is of format {version}, and this version reads {FORMAT}"
+            )
+        _checked_location(self.meta)
         (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # of pages and indices
         if state != "ok":
             raise sqlite3.DatabaseError(" ".join(state.split()))
@@ -124,7 +125,7 @@ class RunDatabase:
         with closing(self._sql.execute("SELECT number FROM jobs")) as rows:
             for (number,) in rows:
                 self._mark_ended(number)
-        for table in _OF_JOBS:
+        for table in _JOB_TABLES:
             self.begun.update(job for (job,) in self._rows(f"SELECT DISTINCT job FROM {table}"))
 
     def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
@@ -134,7 +135,7 @@ class RunDatabase:
     # -- reading -------------------------------------------------------------------------
 
     def read(self, job: CommittedJob) -> None:
-        """Read what is committed of a job, of which nothing was read before."""
+        """Read the committed results of a job that has none in memory."""
         if job.number in self.begun:
             with _explained(self.path):
                 self._read(job)
@@ -159,25 +160,25 @@ class RunDatabase:
 
     @property
     def used(self) -> bool:
-        """Whether anything is committed, or was."""
+        """True if any result is or was committed."""
         return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
     def ended(self, number: int) -> bool:
-        """Whether a job has ended."""
+        """Return True if a job has ended."""
         return number < len(self._ended) and self._ended[number] != 0
 
     def failed(self) -> list[int]:
-        """Numbers of the jobs that have failed, in order."""
+        """Return the numbers of the jobs that have failed, in order."""
         query = "SELECT number FROM jobs WHERE failed ORDER BY number"
         return [number for (number,) in self._rows(query)]
 
     def hash_of(self, number: int) -> str:
-        """Hash of what a job under way is made of; empty if none was kept."""
-        found = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
-        return "".join(text for (text,) in found)
+        """Return the hash of the inputs of a job under way; empty if no hash was stored."""
+        rows = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
+        return "".join(text for (text,) in rows)
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
-        """Yield what was stored of the jobs that have ended, by number; one at a time."""
+        """Yield the stored rows of the jobs that have ended, by number, a row at a time."""
         with (
             _explained(self.path),
             closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
@@ -195,16 +196,16 @@ class RunDatabase:
     # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
-        """Store some values."""
+        """Store values of the `meta` table."""
         with self._transaction():
             self._sql.executemany(_insert("meta", "OR REPLACE"), values.items())
         self.meta |= values
 
     def commit(self, receipts: Iterable[tuple[J, Receipt]]) -> list[tuple[J, Receipt]]:
-        """Commit parts of jobs in one transaction; return those that are new.
+        """Commit parts of jobs in a transaction; return the newly committed parts.
 
-        A part with a scan that is committed already is left out. The frames that were handed out of
-        these jobs are committed as well.
+        A part with a scan that is committed already is left out. The number of frames that were
+        handed out of these jobs is committed as well.
         """
         new: list[tuple[J, Receipt]] = []
         for job, part in receipts:
@@ -230,7 +231,7 @@ class RunDatabase:
         return new
 
     def set_hash(self, number: int, text: str) -> None:
-        """Keep the hash of what a job under way is made of."""
+        """Store the hash of the inputs of a job under way."""
         with self._transaction():
             self._sql.execute(_insert("made_of", "OR REPLACE"), (number, text))
 
@@ -259,7 +260,7 @@ class RunDatabase:
         job.trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
-        """Store which jobs have ended or failed, and what is to be known of them; no more is kept.
+        """Store ended jobs, (number, failed, row), and delete their parts, trials and frames.
 
         A job may have ended before.
         """
@@ -273,7 +274,7 @@ class RunDatabase:
             self._mark_ended(number)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
-        """Let some jobs be done again: there are files of them, also if there is nothing else."""
+        """Reset jobs that have ended. Their output files exist, even if the database is empty."""
         self.set(forgot="jobs")
         forgotten = [(number,) for number in numbers]
         with self._transaction():
@@ -282,21 +283,21 @@ class RunDatabase:
             self._mark_ended(number, False)
 
     def restart(self, job: CommittedJob) -> None:
-        """Drop all that is committed of a job that has not ended."""
+        """Drop all committed results of a job that has not ended."""
         with self._transaction():
             self._delete([job.number])
         self.begun.discard(job.number)
         job.forget_committed()
 
     def save_frames(self, jobs: Iterable[CommittedJob]) -> None:
-        """Commit how many frames of jobs were handed out; each commit of a part does so anyway."""
+        """Commit the number of frames handed out of jobs; each commit of a part does so anyway."""
         unsaved = [job for job in jobs if job.frames != job.frames_written]
         if unsaved:
             with self._transaction():
                 self._write_frames(unsaved)
 
     def copy(self) -> bytes:
-        """Content of the file after the last transaction."""
+        """Return the content of the file after the last transaction."""
         with _explained(self.path):
             return self._sql.serialize()
 
@@ -305,13 +306,13 @@ class RunDatabase:
         self._sql.close()
 
     def _delete(self, numbers: Iterable[int]) -> None:
-        """Delete what is committed of some jobs."""
-        there = [(number,) for number in numbers if number in self.begun]
-        for table in _OF_JOBS:
-            self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", there)
+        """Delete committed results of jobs."""
+        parameters = [(number,) for number in numbers if number in self.begun]
+        for table in _JOB_TABLES:
+            self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", parameters)
 
     def _mark_ended(self, number: int, ended: bool = True) -> None:
-        if not 0 <= number < JOBS_MOST:
+        if not 0 <= number < MAX_JOBS:
             raise ValueError(f"{number} is not the number of a job")
         if number >= len(self._ended):
             self._ended.extend(bytes(number + 1 - len(self._ended)))
@@ -346,7 +347,7 @@ def _explained(path: Path) -> Iterator[None]:
     except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
         # Other operational errors, such as a missing column or text that is no UTF-8, are damage.
-        of_disk = any(one in words.lower() for one in _OF_DISK)
+        of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
         if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
                 f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
@@ -359,7 +360,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _crc32(*values: Any) -> int:
-    """Return the CRC-32 of the values of a row, as SQLite has them."""
+    """Return the CRC-32 of the values of a row, as read back from SQLite."""
     crc = 0
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)
@@ -368,31 +369,31 @@ def _crc32(*values: Any) -> int:
 
 def _insert(table: str, conflict: str = "") -> str:
     """Return the statement that inserts a row of a table and its CRC-32."""
-    places = ", ".join(f"?{number}" for number, _ in enumerate(_COLUMNS[table], 1))
-    return f"INSERT {conflict} INTO {table} VALUES ({places}, crc32({places}))"
+    placeholders = ", ".join(f"?{number}" for number, _ in enumerate(_COLUMNS[table], 1))
+    return f"INSERT {conflict} INTO {table} VALUES ({placeholders}, crc32({placeholders}))"
 
 
 def parts_folder(mark: str) -> str:
-    """Name of the folder of the parts in a place that runs share."""
+    """Return the name of a run's folder of parts in a location that runs share."""
     return f"run-{mark}"
 
 
-def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Mark and place of parts of a database's values; ValueError if they are not of a run."""
+def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
+    """Return mark and location of parts from a database's values; ValueError if invalid."""
     mark = meta["mark"]
-    place = meta.get("parts", "")
+    location = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):
         raise ValueError(f"{mark!r} is not the mark of a run")
-    if place and not place.endswith(f"/{parts_folder(mark)}"):
-        raise ValueError(f"{place!r} is not the place of this run's parts")
-    return mark, place
+    if location and not location.endswith(f"/{parts_folder(mark)}"):
+        raise ValueError(f"{location!r} is not the place of this run's parts")
+    return mark, location
 
 
-def read_place(path: Path) -> tuple[str, str] | None:
-    """Mark of a run, and the place of its parts or "", from its database.
+def read_parts_location(path: Path) -> tuple[str, str] | None:
+    """Return the mark of a run and the location of its parts, "" by default, from a database.
 
-    None if there is no database, or a damaged one; LidarError if a run is using it, or if it is
-    another program's.
+    None if there is no database, or a damaged one; LidarError if a run is using the database, or if
+    it is another program's.
     """
     if not path.exists():
         return None
@@ -410,7 +411,7 @@ def read_place(path: Path) -> tuple[str, str] | None:
             rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
             if any(_crc32(name, value) != crc for name, value, crc in rows):
                 return None
-            return _checked_place({name: value for name, value, _ in rows})
+            return _checked_location({name: value for name, value, _ in rows})
     except sqlite3.Error as error:
         if "locked" in str(error):
             raise LidarError(f"Another run is using {path.parent}.") from error

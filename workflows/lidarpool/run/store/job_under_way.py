@@ -1,4 +1,4 @@
-"""A job under way, and what a run reads of its committed parts."""
+"""A job under way, and how a run reads its committed parts."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from ..pipeline.messages import Receipt, samples_of_scan, summary_type
 from ..pipeline.pipeline_job import PipelineJob
 from ..progress import Progress
 
-SAMPLE_RAYS = 400  # of the pictures
+SAMPLE_RAYS = 400  # rays in pictures of a survey, about
 
 
 class JobUnderWay(PipelineJob):
-    """A job from its first batch until it is written, with what is read of its parts.
+    """A job from its first batch until it is written, with access to its parts.
 
     Parameters
     ----------
     job
         The job.
     scans
-        Its scans that are to be done.
+        Scans of the job that are to be cast.
     storage
-        Where its parts are.
+        Storage of the job's parts.
     summaries
         Returns the summaries of a committed part.
     has_frames
         True if scans are handed out as frames, too.
     keeper
-        What must live as long as the points are in use, for the parts go with it.
+        Object that must live as long as the points are in use: the parts are deleted with it.
     """
 
     def __init__(
@@ -65,19 +65,19 @@ class JobUnderWay(PipelineJob):
         """Return the receipt of a part in storage; None if the part is damaged."""
         try:
             data = self.storage.read(name)
-            return Receipt.of_part(unpack(data), self.number, name, len(data))
+            return Receipt.from_part(unpack(data), self.number, name, len(data))
         except LidarError:
             return None
         except OSError as error:
-            if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
+            if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk, or the part was just removed
                 return None
             raise LidarError(
                 f"The part {self.storage.path(name)} cannot be read: {error.strerror or error}."
             ) from error
 
     @property
-    def kept(self) -> str:
-        """Committed scans and trials in words; empty for none."""
+    def committed_in_words(self) -> str:
+        """Number of committed scans or trials in words; empty if there are none."""
         if self.parts.scans_done:
             return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
         if self.trials:
@@ -90,7 +90,7 @@ class JobUnderWay(PipelineJob):
         return self.scans_complete and len(self.trials) == self.job.trials
 
     def progress(self) -> Progress:
-        """Progress of a resumed run at its start."""
+        """Return the progress of a resumed run at its start."""
         framed = self.frames - self.scans.start
         return Progress(
             scans=len(self.scans),
@@ -104,10 +104,10 @@ class JobUnderWay(PipelineJob):
         )
 
     def status(self, *, is_writing: bool) -> dict[str, Any]:
-        """Return what a page lists of the job: its name and values, and how far it is.
+        """Return name, values and progress of the job for a page.
 
-        `stored` of its `scans` are in storage, with so many `points`; `seconds` is the casting time
-        so far, and `writing` is True while its files are written.
+        `stored` is the number of its `scans` in storage, and `points` the number of their points;
+        `seconds` is the casting time so far, and `writing` is True while its files are written.
         """
         return {
             "name": self.job.name,
@@ -147,7 +147,7 @@ class JobUnderWay(PipelineJob):
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> Ints:
-        """Return the hits by counters of the scene, see `Scene.counters`."""
+        """Return the hits for each counter of the scene, see `Scene.counters`."""
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
             triangles, hits = read_tally(self.storage, part.name)
@@ -155,20 +155,20 @@ class JobUnderWay(PipelineJob):
         return counts
 
     def sample_rays(self) -> Floats32:
-        """Return the ends of some rays, (k, 2, 3), metres, local coordinates."""
+        """Return starts and ends of sample rays, (k, 2, 3), metres, local coordinates."""
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
-        kind = summary_type(samples)
-        every = max(1, samples * survey.scan_count // SAMPLE_RAYS)
+        dtype = summary_type(samples)
+        step = max(1, samples * survey.scan_count // SAMPLE_RAYS)
         rays = [np.empty((0, 2, 3), np.float32)]
-        every_nth = range(0, survey.scan_count, every)
-        chosen = {scan for scan in every_nth if not self.parts.missing(scan, scan + 1)}
+        sampled_scans = range(0, survey.scan_count, step)
+        chosen = {scan for scan in sampled_scans if not self.parts.missing(scan, scan + 1)}
         parts = {part.first: part for part in map(self.parts.part_of, sorted(chosen))}
         for part in parts.values():
-            for scan, summary in enumerate(np.frombuffer(self._summaries(part), kind), part.first):
-                ends = summary["samples"][~np.isnan(summary["samples"][:, 0])]
-                if scan in chosen and len(ends):
+            for scan, summary in enumerate(np.frombuffer(self._summaries(part), dtype), part.first):
+                end_points = summary["samples"][~np.isnan(summary["samples"][:, 0])]
+                if scan in chosen and len(end_points):
                     start = np.asarray(survey.pose(scan).position, np.float32)
-                    starts = np.broadcast_to(start, ends.shape)
-                    rays.append(np.stack([starts, ends], axis=1))
+                    starts = np.broadcast_to(start, end_points.shape)
+                    rays.append(np.stack([starts, end_points], axis=1))
         return np.concatenate(rays)

@@ -13,8 +13,8 @@ from ..pipeline.messages import Receipt, scans_in_words
 from .database import RunDatabase
 from .job_under_way import JobUnderWay
 
-CHECKERS = 4  # threads that check parts; each holds one in memory, twice
-_IN_PART = attrgetter("first", "stop", "rows")  # of a receipt, what the part must say as well
+CHECKERS = 4  # threads that check parts; each has two copies of a part in memory
+_IN_PART = attrgetter("first", "stop", "rows")  # values of a receipt that the part has as well
 
 
 def check_parts(
@@ -25,13 +25,13 @@ def check_parts(
     Parameters
     ----------
     job
-        A job under way, with what is committed of it.
+        A job under way, with its committed results.
     db
-        The database, which was lost perhaps, or is a copy of some seconds before.
+        The database; it may be new because it was lost, or an older copy.
     sizes
-        Bytes of the files in storage, by name.
+        {name of a file in storage: bytes}.
     strays
-        Names of the parts of the job in storage, those that are committed among them.
+        Names of the parts of the job in storage, including committed parts.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def check_parts(
 
 
 def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
-    """Return "missing" or "damaged", to the checksum of each column; empty for a whole part."""
+    """Return "missing", "damaged" by the checksum of any column, or "" for a valid part."""
     if part.name not in sizes:
         return "missing"
     if sizes[part.name] != part.size:
@@ -70,7 +70,7 @@ def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
 
 
 def _note(job: JobUnderWay, parts: Sequence[Receipt], state: str) -> str:
-    """Say which scans are cast again, and that their parts were missing or damaged."""
+    """Return a note that scans are cast again because their parts were missing or damaged."""
     names = listed([part.name for part in parts])
     scans = listed([scans_in_words(part.first, part.stop) for part in parts])
     verb = "was" if len(parts) == 1 else "were"

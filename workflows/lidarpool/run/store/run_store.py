@@ -1,4 +1,4 @@
-"""What a run keeps, in a folder or storage: database and parts, for a later run to go on from."""
+"""Store of a run, in a folder or storage: database and parts, so that a later run can resume."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
@@ -21,88 +21,109 @@ from lidarsim.simulator.scene_caster import AUTO_TAKES
 from ...base.fingerprint import fingerprint
 from ...base.shard import shard_in_words
 from ...base.software import software
-from ...columns.parts import mark_name, own_files, scans_of
+from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
 from ...scenario.build import Job
 from ..job_source import CONTENT, Jobs, identity_of
 from ..pipeline.failures import storing
-from .database import FILE, PARTS_FOLDER, DamagedError, RunDatabase, parts_folder, read_place
+from .database import (
+    FILE,
+    PARTS_FOLDER,
+    DamagedError,
+    RunDatabase,
+    parts_folder,
+    read_parts_location,
+)
 from .job_under_way import JobUnderWay
 from .part_check import check_parts
 from .remote import OWNER, RemoteRun, fetch_database
 
-PARTS = "parts"  # the folder of the parts, in the run's folder
+PARTS = "parts"  # folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
-SENSORS_NAMED = 8  # kinds of a sensor that are named
-_OTHERS = "and others"
+MAX_SENSOR_KINDS = 8  # kinds of a sensor that are named in full
+_AND_OTHERS = "and others"
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
 _DROP = "--fresh (in Python remove_run)"
 
 
-class RunStore:
-    """What a run keeps of its jobs, one or many: a database, and the folder of their parts.
+class _EarlierDatabase(NamedTuple):
+    """Database that an earlier run has left."""
 
-    The file in the folder of the parts that says whose they are has what the database begins with,
-    and each part has its receipt: where the database is missing or damaged, it is made again.
+    db: RunDatabase | None = None  # open; None if no result is committed
+    mark: str = ""  # of a run without committed results
+    parts: str = ""  # location of the parts of such a run
+    damage: DamagedError | None = None  # why the database cannot be read
+
+
+class RunStore:
+    """Database of a run, and the folder of the parts of its jobs.
+
+    The mark file in the folder of the parts has the first values of the database, and each part has
+    its receipt: if the database is missing or damaged, it is made again.
 
     Parameters
     ----------
     jobs
-        What the run does; what their results depend on must be the same for a run to go on.
+        Jobs of the run. Their identity must be the same for a run to be resumed.
     backend
-        The one that is asked for.
-    place
-        Where it is kept, a folder or a URL; None for a temporary folder that goes with the
-        last user of the points.
+        The requested backend.
+    location
+        Folder or URL of the run; None for a temporary folder that is deleted with the last user of
+        the points.
     parts
-        Another place for the parts, a path or URL, in which they get their own folder. A resumed
-        run uses the place of its parts.
+        Another location for the parts, a path or URL, in which they get their own folder. A resumed
+        run uses the earlier location of its parts.
     resume
         Whether to continue an existing run; otherwise there must be none.
 
-    LidarError if it holds an unfinished run and that is not to be resumed, or cannot be: it is
-    of other jobs, in use, or cast with another backend than is asked for; or if there are `parts`
-    without a `place`, whose database says which parts there are.
+    Raises
+    ------
+    LidarError
+        If there is an unfinished run and `resume` is False, or the run cannot be resumed: it is of
+        other jobs, in use, or cast with another backend than requested. Also if there are `parts`
+        without a `location`, whose database lists the parts.
     """
 
     def __init__(
         self,
         jobs: Jobs,
         backend: str = "auto",
-        place: str | Path | Storage | None = None,
+        location: str | Path | Storage | None = None,
         parts: str | Path | Storage | None = None,
         *,
         resume: bool = False,
     ) -> None:
-        if parts is not None and place is None:
+        if parts is not None and location is None:
             raise LidarError(
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
         self.jobs = jobs
         self._requested_backend = backend
-        self.lasting = place is not None
+        self.lasting = location is not None
         self.notes: list[str] = []  # remarks for the user
         self.begun = False  # True if it continues an earlier run
         self._removed = False
         self.identity = software() | dict(jobs.identity)
         self._run_identity = self.identity | {"shard": str(jobs.shard)}
         self._remote = None
-        self.place = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
-        self._folder = self.place  # of the database
-        if not self.place.is_local:
-            self._remote = RemoteRun(self.place)
+        self.location = Storage.at(
+            tempfile.mkdtemp(prefix="lidarpool-") if location is None else location
+        )
+        self._folder = self.location  # of the database
+        if not self.location.is_local:
+            self._remote = RemoteRun(self.location)
             self._folder = Storage.at(tempfile.mkdtemp(prefix="lidarpool-"))
         folder = self._folder.local()
-        if place is None or self._remote:
+        if location is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
         self.under_way: dict[int, JobUnderWay] = {}  # {number: job}
-        self.only: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
+        self.only_job: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
             self.db = self._open(parts, resume)
@@ -112,115 +133,137 @@ class RunStore:
         self.resumed = self.db.ended_count  # jobs of an earlier run
 
     def _open(self, parts: str | Path | Storage | None, resume: bool) -> RunDatabase:
-        """Open the database, or a new one if nothing is committed in it."""
-        path = _database(self._folder)
+        """Open the run's database, or create a new database if the existing is empty or lost."""
+        path = _database_path(self._folder)
         durable = self.lasting and self._remote is None
-        mark = earlier_parts = ""  # of a run that has kept nothing: mark and place of its parts
-        damage: DamagedError | None = None
-        try:
-            if self._remote:
-                fetch_database(self._remote.storage, path)
-            if path.exists():
-                db = RunDatabase(path, durable=durable)
-                if db.used:
-                    self.begun = True
-                    return db
-                db.close()
-                mark = db.meta["mark"]
-                earlier_parts = db.meta.get("parts", "")
-        except DamagedError as error:
-            damage = error
-        except LidarError as error:  # the copy of a database is nobody's business
-            raise LidarError(str(error).replace(self._folder.url, self.place.url)) from error
-        new = self._marked(parts) if resume else None
-        if new is not None and mark and self._difference(new["identity"]):
-            new = None  # it has kept nothing
-        if new is not None:
-            read_place(path)  # an error if it is another program's
-            self._check_same(new["identity"])
+        earlier = self._open_earlier(path, durable)
+        if earlier.db is not None:
             self.begun = True
-            lost = f"{FILE} was missing or damaged, and is made again from the parts"
-            self.notes += [lost] * (not mark)
-        elif damage is not None:
-            reason = str(damage).replace(self._folder.url, self.place.url)
-            raise LidarError(reason) from damage
-        elif self.lasting:
-            _remove(self.place, parts_of(self.place, earlier_parts), mark)
+            return earlier.db
+        meta = self._recover_meta(path, earlier.mark, parts) if resume else None
+        if meta is None:
+            self._discard(earlier)
         path.unlink(missing_ok=True)
         self._folder.prepare()
-        if new is None:
+        if meta is None:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-            new = {"mark": mark, "identity": json.dumps(self._run_identity), "parts": shared}
+            meta = {"mark": mark, "identity": json.dumps(self._run_identity), "parts": shared}
         try:
-            return RunDatabase(path, durable=durable, **new)
+            return RunDatabase(path, durable=durable, **meta)
         except LidarError:
             if path.exists() and not path.stat().st_size:  # the disk is full
                 path.unlink()
                 path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
             raise
 
-    def _marked(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
+    def _open_earlier(self, path: Path, durable: bool) -> _EarlierDatabase:
+        """Open the database that an earlier run may have left."""
+        try:
+            if self._remote:
+                fetch_database(self._remote.storage, path)
+            if not path.exists():
+                return _EarlierDatabase()
+            db = RunDatabase(path, durable=durable)
+            if db.used:
+                return _EarlierDatabase(db)
+            db.close()
+            return _EarlierDatabase(mark=db.meta["mark"], parts=db.meta.get("parts", ""))
+        except DamagedError as error:
+            return _EarlierDatabase(damage=error)
+        except LidarError as error:  # the user does not know the local copy of a database
+            raise LidarError(str(error).replace(self._folder.url, self.location.url)) from error
+
+    def _recover_meta(
+        self, path: Path, earlier_mark: str, parts: str | Path | Storage | None
+    ) -> dict[str, str] | None:
+        """Return the first values of a lost database from the folder of its parts, or None.
+
+        `earlier_mark` is the mark of an existing empty database, or "". LidarError if the database
+        is another program's, or the earlier run differs from this one.
+        """
+        meta = self._read_mark(parts)
+        if meta is None or (earlier_mark and self._difference(meta["identity"])):
+            return None
+        read_parts_location(path)  # raises if the database is another program's
+        self._check_same(meta["identity"])
+        self.begun = True
+        if not earlier_mark:
+            self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
+        return meta
+
+    def _discard(self, earlier: _EarlierDatabase) -> None:
+        """Remove an earlier run without committed results; LidarError for a damaged database."""
+        if earlier.damage is not None:
+            reason = str(earlier.damage).replace(self._folder.url, self.location.url)
+            raise LidarError(reason) from earlier.damage
+        if self.lasting:
+            _remove(self.location, parts_of(self.location, earlier.parts), earlier.mark)
+
+    def _read_mark(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
         """Return the first values of this run's database, from the folder of its parts."""
-        places = [self.place.below(PARTS)]
+        locations = [self.location.below(PARTS)]
         if parts is not None:
             shared = Storage.at(parts)
             folders = filter(PARTS_FOLDER.fullmatch, shared.entries())
-            places = [shared.below(name) for name in folders]
-        for place in places:
-            for name in place.sizes():
+            locations = [shared.below(name) for name in folders]
+        for location in locations:
+            for name in location.sizes():
                 with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
-                    values = json.loads(place.read(name)) if name.endswith("-mark") else {}
-                    if values.pop("place") == self.place.url and name == mark_name(values["mark"]):
+                    values = json.loads(location.read(name)) if name.endswith("-mark") else {}
+                    if values.pop("place") == self.location.url and name == mark_name(
+                        values["mark"]
+                    ):
                         return {key: str(value) for key, value in values.items()}
         return None
 
     def _claim(self, resume: bool) -> None:
         """Find the parts, and mark their folder as this run's."""
-        self.storage = replace(parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
+        self.storage = replace(parts_of(self.location, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
-        self._strays: dict[int, list[str]] = {}  # {number: parts that an earlier run has left}
+        self._strays: dict[int, list[str]] = {}  # {job: names of parts that a run has left}
         for name in self._sizes if resume else ():
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if self.db.used:
             self._check_same(self.db.meta["identity"])
         if (only_job := self.jobs.only_job) is not None:
-            self.only = self._take_on(only_job)
+            self.only_job = self._load(only_job)
         if self.db.used:
-            self._go_on(resume)
+            self._check_resumable(resume)
         if self._remote:
             self._remote.claim(self.db)
         if mark_name(self.db.meta["mark"]) not in self._sizes:
             with storing(self.storage):
                 self.storage.prepare()
                 self._write_mark()
-        if self.only is not None:  # now that the run itself is known to be the same
-            strays = self._strays.get(self.only.number, ())
-            self.notes += check_parts(self.only, self.db, self._sizes, strays)
+        if self.only_job is not None:  # not before the run is known to be the same
+            strays = self._strays.get(self.only_job.number, ())
+            self.notes += check_parts(self.only_job, self.db, self._sizes, strays)
 
     def _write_mark(self) -> None:
         names = ("mark", "identity", "parts", "backend", "casting")
         values = {name: self.db.meta[name] for name in names if name in self.db.meta}
-        values["place"] = self.place.url
+        values["place"] = self.location.url
         self.storage.write(mark_name(values["mark"]), json.dumps(values).encode())
 
-    def _go_on(self, resume: bool) -> None:
-        """Check that this run may continue the existing one, which is the same."""
+    def _check_resumable(self, resume: bool) -> None:
+        """Raise LidarError if the existing run of the same jobs may not be continued."""
         if not resume:
             raise LidarError(
-                f"{self.place} holds an unfinished run, {self.kept}: continue it with "
-                f"{_RESUME}, or drop it with {_DROP}."
+                f"{self.location} holds an unfinished run, {self.committed_in_words}: continue it "
+                f"with {_RESUME}, or drop it with {_DROP}."
             )
         if self.backend and self._requested_backend not in ("auto", self.backend):
             raise LidarError(
-                f"Backend {self._requested_backend!r} is asked for, and the scans in {self.place} "
-                f"were cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
+                f"Backend {self._requested_backend!r} is asked for, and the scans in "
+                f"{self.location} were cast with {self.backend!r}: continue with that, or drop "
+                f"them with {_DROP}."
             )
 
     def _difference(self, identity: str) -> str:
-        """Return how an earlier run differs, as a clause; empty if it is the same."""
+        """Return how an earlier run differs, as a clause; empty if the runs are the same."""
         earlier = json.loads(identity)
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
@@ -236,11 +279,11 @@ class RunStore:
         return ""
 
     def _check_same(self, identity: str) -> None:
-        """Check that an earlier run in this place is the same."""
+        """Raise LidarError if an earlier run in this location differs from this run."""
         if difference := self._difference(identity):
             raise LidarError(
-                f"The run in {self.place} cannot be continued, {difference}. Drop it with {_DROP}, "
-                "or give another folder."
+                f"The run in {self.location} cannot be continued, {difference}. Drop it with "
+                f"{_DROP}, or give another folder."
             )
 
     # -- reading ---------------------------------------------------------------------------
@@ -256,7 +299,7 @@ class RunStore:
         return dict(json.loads(self.db.meta.get("casting", "{}")))
 
     def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
-        """Keep with which backend and software all scans are cast."""
+        """Store the backend and software that all scans are cast with."""
         if backend != self.backend or casting != self.casting:
             self.db.set(backend=backend, casting=json.dumps(casting))
             with storing(self.storage):
@@ -264,31 +307,31 @@ class RunStore:
 
     @property
     def made_with(self) -> dict[str, Any]:
-        """What the bytes of all jobs depend on, for the manifests of a data set."""
+        """Identity, backend and software that determine the bytes of all jobs, for manifests."""
         identity = fingerprint(dict(self.identity))
         return {"identity": identity, "backend": self.backend, "casting": self.casting}
 
     @property
-    def kept(self) -> str:
-        """What is committed, in words; empty for nothing."""
-        if self.only is not None:
-            return self.only.kept
+    def committed_in_words(self) -> str:
+        """Number of committed scans, trials or jobs in words; empty if there are none."""
+        if self.only_job is not None:
+            return self.only_job.committed_in_words
         return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
 
     @property
     def advice(self) -> str:
         """Advice if the backend is not available, for the end of a message."""
-        if not self.kept:
+        if not self.committed_in_words:
             return AUTO_TAKES
         return (
-            f"The scans in {self.place} were cast with it: continue where it is to be had, or "
+            f"The scans in {self.location} were cast with it: continue where it is to be had, or "
             f"drop them with {_DROP}."
         )
 
     def rows(self) -> Iterator[JobRow]:
         """Yield the rows of the jobs that have ended, by number."""
         for row in self.db.job_rows():
-            yield JobRow.of(row)
+            yield JobRow.from_json(row)
 
     @property
     def sensors(self) -> dict[str, str]:
@@ -297,25 +340,25 @@ class RunStore:
 
     # -- jobs --------------------------------------------------------------------------------
 
-    def take_on(self, job: Job) -> JobUnderWay:
+    def open_job(self, job: Job) -> JobUnderWay:
         """Return a job under way; parts of an earlier run are checked first."""
         if job.number in self.under_way:
             return self.under_way[job.number]
-        under_way = self._take_on(job)
+        under_way = self._load(job)
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
             earlier_hash = self.db.hash_of(job.number)
             under_way.is_identified = bool(earlier_hash) and earlier_hash == _hash_of(job)
             if under_way.is_identified:
                 self.notes += check_parts(under_way, self.db, self._sizes, strays)
-            else:  # files that it is made of have changed, or a run died before it kept the hash
+            else:  # input files of the job have changed, or a run died before it stored the hash
                 self.db.restart(under_way)
                 self.storage.remove(strays)
                 under_way.resumed = 0
         return under_way
 
-    def _take_on(self, job: Job) -> JobUnderWay:
-        """Return a job with what is committed of it, from now on under way."""
+    def _load(self, job: Job) -> JobUnderWay:
+        """Return a new job under way, with its committed results."""
         is_only = self.jobs.only_job is not None
         count = job.survey.scan_count
         scans = self.jobs.shard.scans(count) if is_only else range(count)
@@ -335,31 +378,31 @@ class RunStore:
             self.under_way.pop(row.number, None)
 
     def forget(self, numbers: Iterable[int]) -> None:
-        """Let some jobs be done again."""
+        """Reset jobs that have ended, so that they are cast again."""
         if forgotten := [*numbers]:
             self.db.forget_jobs(forgotten)
             self.resumed = self.db.ended_count
 
-    def adopt(self, rows: Iterable[JobRow], **made: str) -> None:
-        """Take over jobs that are done in the data set, and what it was `made` with."""
-        if made:
-            self.db.set(**made)
+    def adopt(self, rows: Iterable[JobRow], **meta: str) -> None:
+        """Take over jobs that are done in the data set, and store values of `meta`."""
+        if meta:
+            self.db.set(**meta)
         self.end([row for row in rows if not self.db.ended(row.number)])
         self.resumed = self.db.ended_count
 
     def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
-        """Keep names of sensors with model and rate, for the card of the data set."""
-        kept = with_sensors(self.sensors, sensors)
-        if kept != self.sensors:
-            self.db.set(sensors=json.dumps(kept))
+        """Store names of sensors with model and rate, for the card of the data set."""
+        updated = with_sensors(self.sensors, sensors)
+        if updated != self.sensors:
+            self.db.set(sensors=json.dumps(updated))
 
     # -- the end -----------------------------------------------------------------------------
 
-    def save(self, *, now: bool = False) -> None:
-        """Keep how many frames were handed out, and what jobs are made of that are partly cast.
+    def save(self, *, force: bool = False) -> None:
+        """Store the number of frames handed out, and hashes of the inputs of partly cast jobs.
 
-        Where it is time or `now`, copy the database. LidarError if that fails, or another run
-        has taken over.
+        If a copy of the database is due, or with `force`, the database is copied. LidarError if the
+        copy fails, or another run has taken over.
         """
         for job in self.under_way.values():
             if job.parts.scans_done and not job.complete and not job.is_identified:
@@ -367,90 +410,94 @@ class RunStore:
                 self.db.set_hash(job.number, _hash_of(job.job))
         self.db.save_frames(self.under_way.values())
         if self._remote:
-            self._remote.save(self.db, now=now)
+            self._remote.save(self.db, force=force)
 
     def tidy(self) -> None:
         """Remove parts that are in no job under way, of dead or superseded collectors."""
         mark = self.db.meta["mark"]
-        of_jobs = [part.name for job in self.under_way.values() for part in job.parts.ordered]
-        ours = {mark_name(mark), *of_jobs}
+        part_names = [part.name for job in self.under_way.values() for part in job.parts.ordered]
+        needed_names = {mark_name(mark), *part_names}
         with suppress(OSError, LidarError):
-            self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
+            self.storage.remove(
+                [n for n in deletable_files(self.storage, mark) if n not in needed_names]
+            )
 
     def remove(self) -> None:
-        """Remove the store: the result is in place. Files of others among the parts stay."""
+        """Remove the store after the result is in place, but not files of other runs."""
         if self._remote:
             self._remote.check()
         self._removed = True
         self.db.close()
-        _remove(self.place, self.storage, self.db.meta["mark"])
+        _remove(self.location, self.storage, self.db.meta["mark"])
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
-        """Add to an error of the body how to resume; remove the store if nothing is committed."""
+        """Add a note on resuming to an error of the body; remove an empty store."""
         try:
             yield
         except BaseException as error:
             if self._removed or not self.lasting:
                 raise
             with suppress(LidarError):  # report the first error
-                self.save(now=True)
+                self.save(force=True)
             if self._remote and self._remote.lost:
                 self.db.close()
                 raise
-            kept = self.kept
+            committed = self.committed_in_words
             self.close()
-            if kept and self._folder.local(FILE).exists():
-                error.add_note(f"{kept} are kept in {self.place}: continue with {_RESUME}.")
+            if committed and self._folder.local(FILE).exists():
+                error.add_note(f"{committed} are kept in {self.location}: continue with {_RESUME}.")
             raise
 
     def close(self) -> None:
-        """Close the database of an unfinished run; remove one that has kept nothing."""
+        """Close the database of an unfinished run; remove an empty store."""
         used = self.db.used or self.begun
         self.db.close()
         if not used:
             with suppress(OSError, LidarError):
-                _remove(self.place, self.storage, self.db.meta["mark"])
-            self._folder.remove([FILE])  # where the place of the parts failed
+                _remove(self.location, self.storage, self.db.meta["mark"])
+            self._folder.remove([FILE])  # also if the storage of the parts has failed
 
 
-def with_sensors(known: Mapping[str, str], more: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return {name of a sensor: its kinds in words} with more: the same in whatever order."""
-    sensors = dict(known)
-    for name, words in more:
-        kinds = {*sensors.get(name, words).split("; "), *words.split("; ")}
-        named = sorted(kinds - {_OTHERS})
-        others = [_OTHERS] * (_OTHERS in kinds or len(named) > SENSORS_NAMED)
-        sensors[name] = "; ".join([*named[:SENSORS_NAMED], *others])
-    return dict(sorted(sensors.items()))
+def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return {name of a sensor: its kinds in words} with more sensors, in any order of addition."""
+    merged = dict(sensors)
+    for name, words in added:
+        kinds = {*merged.get(name, words).split("; "), *words.split("; ")}
+        names = sorted(kinds - {_AND_OTHERS})
+        suffix = [_AND_OTHERS] * (_AND_OTHERS in kinds or len(names) > MAX_SENSOR_KINDS)
+        merged[name] = "; ".join([*names[:MAX_SENSOR_KINDS], *suffix])
+    return dict(sorted(merged.items()))
 
 
 def _hash_of(job: Job) -> str:
-    """Return the hash of a job's inputs; empty if they have none: then it is not resumed."""
+    """Return the hash of a job's inputs; empty if an input has no fingerprint.
+
+    A job without a hash is not resumed.
+    """
     try:
         return fingerprint(identity_of(job))
     except LidarError:
         return ""
 
 
-def _database(folder: Storage) -> Path:
-    """Path of the database in a folder of this machine; LidarError if it is a link."""
-    folder.local(f"{FILE}-journal")  # which SQLite would follow, too
+def _database_path(folder: Storage) -> Path:
+    """Return the path of the database in a local folder; LidarError if the file is a link."""
+    folder.local(f"{FILE}-journal")  # SQLite would follow a link here, too
     return folder.local(FILE)
 
 
-def parts_of(place: Storage, parts: str) -> Storage:
-    """Where the parts of a run are: below the run's place, or in a place that was named."""
-    named, _, name = parts.rpartition("/")
-    return Storage.at(named or "/").below(name) if parts else place.below(PARTS)
+def parts_of(location: Storage, parts: str) -> Storage:
+    """Return the storage of the parts: below the run's location, or `parts` unless empty."""
+    folder, _, name = parts.rpartition("/")
+    return Storage.at(folder or "/").below(name) if parts else location.below(PARTS)
 
 
 @checked
 def remove_run(folder: str | Path | Storage) -> None:
-    """Remove a stored run and its parts, wherever they are, and nothing else.
+    """Remove a stored run and its parts, wherever the parts are, and no further file.
 
-    Other files among the parts stay. If its database is damaged, its parts are found only in its
-    folder.
+    If the database is damaged, only parts in the run's folder are found.
 
     Parameters
     ----------
@@ -460,27 +507,29 @@ def remove_run(folder: str | Path | Storage) -> None:
     Raises
     ------
     LidarError
-        If another run uses it, it cannot be removed, or there is a link in place of its files.
+        If another run uses the database, the files cannot be removed, or there is a link in place
+        of the run's files.
     """
-    place = Storage.at(folder)
+    location = Storage.at(folder)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
-        path = _database(place if place.is_local else Storage.at(temporary))
-        if not place.is_local:
-            fetch_database(place, path)
+        path = _database_path(location if location.is_local else Storage.at(temporary))
+        if not location.is_local:
+            fetch_database(location, path)
         try:
-            place_of_parts = read_place(path)
+            parts_location = read_parts_location(path)
         except LidarError as error:
-            raise LidarError(str(error).replace(temporary, place.url)) from error
-        mark, parts = place_of_parts or (None, "")
-        _remove(place, parts_of(place, parts), mark)
+            raise LidarError(str(error).replace(temporary, location.url)) from error
+        mark, parts = parts_location or (None, "")
+        _remove(location, parts_of(location, parts), mark)
 
 
-def _remove(place: Storage, parts: Storage, mark: str | None) -> None:
-    """Remove a run and what its mark says is its own.
+def _remove(location: Storage, parts: Storage, mark: str | None) -> None:
+    """Remove the database of a run, and the parts that have its mark.
 
-    `mark` is None if the database does not say it: then that in the folder of the parts counts.
+    If `mark` is None, because the database could not be read, the mark file in the folder of the
+    parts counts.
     """
-    with explained(f"The run in {place} cannot be removed"):
-        names = own_files(parts, mark)  # an error if they are behind a link
+    with explained(f"The run in {location} cannot be removed"):
+        names = deletable_files(parts, mark)  # an error if they are behind a link
         parts.remove(names, folder=True)
-        place.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
+        location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
