@@ -263,7 +263,7 @@ class Scenario(Section):
             if section.calibration is None:
                 with mistakes.noted(), prefixed(self._source):
                     mounted = section.mounted(self.path, CENTRE, self.noise, self.returns)
-                    (mounted.returns or self.returns).of(mounted.sensor.optics)
+                    (mounted.returns or self.returns).divergence(mounted.sensor.optics)
         mistakes.tell()
 
     def _contradictions(self) -> Iterator[str]:

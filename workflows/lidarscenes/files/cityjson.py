@@ -222,7 +222,7 @@ class _CityFile:
         for group, (number, material) in zip(groups, owners[starts].tolist(), strict=True):
             pieces[number].append(self._piece(points, group, material, document))
         return [
-            joined(name, object_pieces, self._allowance)
+            join_pieces(name, object_pieces, self._allowance)
             for (name, _), object_pieces in zip(objects, pieces, strict=True)
         ]
 

@@ -88,7 +88,7 @@ def _contents(
     frames: Iterator[_Frame],
     stage: dict[str, Any],
     stem: str,
-    options: Wanted,
+    options: ReadOptions,
     allowance: Allowance,
 ) -> Iterator[Content]:
     """Yield the content of each pose of an animation, or of the first time."""
