@@ -2,7 +2,8 @@
 
 It is the watertight test of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle
 Intersection": corners are taken relative to the ray's origin and sheared so that the ray runs
-along an axis; three signed areas in the plane across that axis then show whether the ray passes inside.
+along an axis; three signed areas in the plane across that axis then show whether the ray passes
+inside.
 Shearing a corner does not depend on its triangle, and the sign of ``a * b - c * d`` is right or
 zero in floating point as long as no multiply-add is fused. Because zero counts as inside, triangles
 that share an edge or a corner leave no gap, whatever the rounding. (Signed volumes of Plücker
