@@ -97,7 +97,7 @@ def test_vertices_are_at_the_middles_of_pixels(tmp_path, suffix, meaning):
     }
     assert by_place(mesh) == expected and mesh.name == "hill" and notes == []
     assert len(mesh.faces) == 2 * 5 * 7 and upward_area(mesh) == 10 * 14
-    assert taken.epsg == 25832 and taken.told == "8 x 6 pixels of 2 m, EPSG:25832"
+    assert taken.epsg == 25832 and taken.summary == "8 x 6 pixels of 2 m, EPSG:25832"
 
 
 @pytest.mark.parametrize("mirrored", [1, -1])
@@ -119,7 +119,7 @@ def test_pixels_without_height_are_holes(tmp_path):
     mesh, taken, notes = read(write(tmp_path / "m.tif", heights, nodata=-9999))
     assert len(mesh.faces) == 2 * (35 - 4 - 1 - 1) and len(mesh.vertices) == 48 - 3
     assert mesh.bounds[:, 2].tolist() == [0, 47] and notes == []
-    assert taken.told.endswith(", 3 pixels without height")
+    assert taken.summary.endswith(", 3 pixels without height")
     mask = np.full(SLOPE.shape, 255, np.uint8)
     mask[2, 2] = 0
     mesh, *_ = read(write(tmp_path / "mask.tif", SLOPE.astype(np.int16), mask=mask))
@@ -155,7 +155,7 @@ def test_units_of_heights(tmp_path, options, unit, metres, said):
     # Feet on the ground become metres, too, in a zone of UTM.
     feet = options.get("crs") == "EPSG:2263"
     assert taken.epsg == (32618 if feet else 25832)
-    assert feet == (" from EPSG:2263" in taken.told)
+    assert feet == (" from EPSG:2263" in taken.summary)
 
 
 def test_degrees_become_metres_of_the_utm_zone(tmp_path):
@@ -163,7 +163,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     place = from_origin(-58.5, -34.5, 1 / 1200, 1 / 1200)
     heights = 3.0 * east - 2.0 * south
     mesh, taken, _ = read(write(tmp_path / "m.tif", heights, crs="EPSG:4326", storage=place))
-    assert taken.epsg == 32721 and " from EPSG:4326" in taken.told
+    assert taken.epsg == 32721 and " from EPSG:4326" in taken.summary
     x, y, z = mesh.vertices.T
     longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
     column = (longitude + 58.5) * 1200
@@ -213,7 +213,7 @@ def test_a_coarser_grid_has_means_without_holes_of_the_finer(tmp_path):
     assert found[X0 + 60, Y0 - 60] == 100.25 and found[X0 + 20, Y0 - 20] == 100
     assert set(mesh.vertices[:, 2]) == {100, 100.25, 100.5, 101}
     assert len(mesh.faces) == 2 * (81 - 4)  # of the corner without heights
-    assert taken.told.startswith("10 x 10 means of 8 m out of 40 x 40 pixels")
+    assert taken.summary.startswith("10 x 10 means of 8 m out of 40 x 40 pixels")
     window = (X0 + 20, Y0 - 60, X0 + 60, Y0 - 20)
     part = {place: z for place, z in by_place(read(path)[0]).items() if inside(place, window)}
     assert by_place(read(path, window=window)[0]) == part and len(part) == 400 - 9

@@ -371,7 +371,7 @@ def evaluated(path, code, animation=None):
 def played(path, name, code, first=1, rate_hz=24):
     """Vertices of the first object at a time code of an animation."""
     own = load_objects(path, animation=name).static[0].animation
-    return own.at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
+    return own.vertices_at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
 
 
 @pytest.mark.parametrize("name", ["", "Walk", "Run"])
@@ -421,7 +421,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     stage = METRES + "\ntimeCodesPerSecond = 24"
     path = write(tmp_path / "m.usda", prim("Flag", text=text), wheel, *men, stage=stage)
     found = load_objects(path, animation="Walk")
-    assert not found.moving
+    assert not found.actors
     flag, wheel, *both = (one.animation.vertices for one in found.static)
     np.testing.assert_allclose(flag[45], [(0, 0, 0), (1, 0, 0), (1, 1, 3), (0, 1, 1.5)])
     np.testing.assert_allclose(wheel[15, 1], [0, 2, 0], atol=1e-9)
