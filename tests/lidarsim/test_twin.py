@@ -23,7 +23,7 @@ from lidarsim.simulator.random_loops import RandomKeys
 from lidarsim.simulator.range_noise import noisy_ranges
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.saturation import saturated
-from lidarsim.simulator.separation import Report, separated
+from lidarsim.simulator.separation import Reporting, separated
 from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps import setup_of
 from lidarsim.simulator.surfaces import Light, Surfaces
@@ -40,8 +40,8 @@ KINDS = "nothing", "wall", "edge", "grazed", "panes", "clutter"
 
 def key_of(pulse):
     """Scan of a pulse, and its number in the scan."""
-    row = sum(pulse >= begin for begin in KEYS.begins.tolist()) - 1
-    return KEYS.scan + row, pulse - KEYS.begins.tolist()[row]
+    row = sum(pulse >= begin for begin in KEYS.scan_starts.tolist()) - 1
+    return KEYS.scan + row, pulse - KEYS.scan_starts.tolist()[row]
 
 
 def layers_of(rng, kind, ahead):
@@ -190,7 +190,7 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
     pulses = pulses_of(2, 7)
     noise = Noise(**losses, seed=5)
     hits, planes = columns_of(pulses, 7)
-    found = separated(hits, GAP, 7, planes, report=Report(mode, noise, KEYS, FIRST))
+    found = separated(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
     expected = {}
     for pulse, own in pulses.items():
         key = key_of(FIRST + pulse)
@@ -217,8 +217,8 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     distance = rng.uniform(0.01, 200, 2000)
     energy = 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
     assert noise.threshold == (0.1 * twin.energy_of(1, 50, 0) if noise.detection_range_m else 0)
-    seen = detected(noise, energy, *KEYS.of(ray), number)
-    ranges = noisy_ranges(noise, distance, energy, *KEYS.of(ray), number)
+    seen = detected(noise, energy, *KEYS.scan_and_number(ray), number)
+    ranges = noisy_ranges(noise, distance, energy, *KEYS.scan_and_number(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]
     assert seen.tolist() == [twin.detected(*row, noise) for _, *row in rows]
@@ -316,14 +316,14 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     place = far[hits]
     light = np.ones(len(hits))
     crossings = spray_loops.Crossings(beam, crossed)
-    spray_loops.veil(crossings, each, 0.1, far, SampledHits(hits, place, light))
+    spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
     begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
-    keys = RandomKeys(begun, KEYS.scan, KEYS.begins, FIRST)
+    keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []
     table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
-    stop, many = spray_loops.clumps(0, crossings, each, table, keys, far, out)
+    stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]

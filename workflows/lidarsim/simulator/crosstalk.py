@@ -22,7 +22,7 @@ from ..sensor.random_numbers import Purpose
 from ..sensor.survey import begin_ns
 from .detection import passes
 from .motion import CastPoses, Clock
-from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, merged, numbers, returns_without_surface
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
@@ -55,7 +55,7 @@ class CrosstalkStep(PulseStep):
     role = Role.RECEIVES
     effects = ("Crosstalk",)
     reads = "ray", "distance"
-    writes = OF_RETURNS
+    writes = RETURN_COLUMNS
     causes = (CROSSTALK,)
     purposes = (OTHER,)
 
@@ -91,9 +91,11 @@ class CrosstalkStep(PulseStep):
         ray = rays[row[order]]
         distance = distance[order]
         energy = energy[order]
-        scan, number = batch.keys.of(ray)
+        scan, number = batch.keys.scan_and_number(ray)
         seen = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
-        others = unreal(returns, ray[seen], distance[seen], energy[seen], CROSSTALK)
+        others = returns_without_surface(
+            returns, ray[seen], distance[seen], energy[seen], CROSSTALK
+        )
         return merged(returns, others)
 
     def received(
@@ -124,10 +126,20 @@ class CrosstalkStep(PulseStep):
             spots = self._spots(other, spec.station, spec.start_ns, span, poses)
             pairs = self._open(fired, order, origins, directions, spots, gate)
             most = int(np.maximum(pairs[2] - pairs[1], 0).sum())
-            (row, spot), (distance, far) = np.empty((2, most), np.int64), np.empty((2, most))
-            limits = self._cosine, sensor.min_range_m, sensor.max_range_m
-            given = *map(owned, (fired, origins, directions, spots.time, spots.place)), *limits
-            count = stray_loops.received(*pairs, order, *given, row, spot, distance, far)
+            output = stray_loops.ReceivedSpots(
+                row=np.empty(most, np.int64),
+                spot=np.empty(most, np.int64),
+                distance=np.empty(most),
+                range_m=np.empty(most),
+            )
+            count = stray_loops.receive(
+                stray_loops.SpotPairs(*pairs),
+                stray_loops.ReceivingRays(order, owned(fired), owned(origins), owned(directions)),
+                stray_loops.LitSpots(owned(spots.time), owned(spots.place)),
+                stray_loops.ReceptionLimits(self._cosine, sensor.min_range_m, sensor.max_range_m),
+                output,
+            )
+            row, spot, distance, far = output
             row = row[:count]
             spot = spot[:count]
             distance = distance[:count]

@@ -29,7 +29,7 @@ class DetectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """See `PulseStep.apply`."""
-        scan, ray = batch.keys.of(returns.ray)
+        scan, ray = batch.keys.scan_and_number(returns.ray)
         seen = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
         return returns.take(seen)
 

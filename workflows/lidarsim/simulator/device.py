@@ -158,7 +158,7 @@ class DeviceColumns:
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = making.done()
         assert tally is not None
-        found = Scanned(PulseReturns.one_each(ray, distance, triangle), hits, None)
+        found = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
         returns = BatchPoints(
             self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
         )

@@ -10,7 +10,7 @@ from ..columns.table import CAUSES
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose, uniform
-from .returns import OF_RETURNS, PulseReturns, merged, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 FALSE_ALARM = CAUSES.index("false alarm")
@@ -24,7 +24,7 @@ class FalseAlarmStep(PulseStep):
     role = Role.RECEIVES
     effects = ("False alarms",)
     reads = "ray", "distance"
-    writes = OF_RETURNS
+    writes = RETURN_COLUMNS
     causes = (FALSE_ALARM,)
     purposes = ALARM, PEAK
 
@@ -47,10 +47,12 @@ class FalseAlarmStep(PulseStep):
         """See `PulseStep.apply`."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
-        scan, ray = batch.keys.of(rays)
+        scan, ray = batch.keys.scan_and_number(rays)
         row, since_s, energy = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
         distance = sensor.min_range_m + since_s * (LIGHT_M_NS * 1e9 / 2)
-        return merged(returns, unreal(returns, rays[row], distance, energy, FALSE_ALARM))
+        return merged(
+            returns, returns_without_surface(returns, rays[row], distance, energy, FALSE_ALARM)
+        )
 
 
 def false_alarms(

@@ -8,7 +8,7 @@ from ..base.arrays import owned
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
 from ..sensor.random_numbers import Purpose, uniform
-from .returns import PulseReturns, made
+from .returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 
 PACKET = Purpose(61, "whether a packet is lost")
@@ -43,13 +43,13 @@ class DirtStep(PulseStep):
             there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
             if one.from_s or one.to_s is not None:
                 there &= one.during(batch.firings.times(beams))
-            share[there] *= made(one.transmission)
+            share[there] *= required(one.transmission)
         share = share.repeat(batch.each)
         batch.hits, batch.air = (
-            one and one._replace(energy=made(one.energy) * share.take(one.ray))
+            one and one._replace(energy=required(one.energy) * share.take(one.ray))
             for one in (returns, batch.air)
         )
-        return made(batch.hits)
+        return required(batch.hits)
 
 
 class LossStep(PulseStep):
@@ -81,11 +81,11 @@ class LossStep(PulseStep):
         firing = np.zeros((len(faults), len(firings.numbers)), np.bool_)
         for row, (place, fault) in enumerate(faults.items()):
             if fault.packet is None:
-                channel[row, made(fault.channels)] = True
+                channel[row, required(fault.channels)] = True
             else:
                 packet = firings.numbers // fault.packet
                 drawn = uniform(seed, PACKET, spec.station, packet, place)
-                firing[row] = drawn < made(fault.share)
+                firing[row] = drawn < required(fault.share)
         rows = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(ray, firings.times(ray), spans, firing, channel, rows)

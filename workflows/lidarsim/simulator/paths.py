@@ -23,7 +23,7 @@ from .actor_trajectories import ActorTrajectories
 from .doppler import approach, velocities_of_ends
 from .media import CROWN, LEAF, Draw, LightInMedia, Media, Rays, depths
 from .motion import CastPoses, Clock, along_rings
-from .returns import OF_RETURNS, SURFACE, PulseReturns, joined, selected
+from .returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
@@ -127,7 +127,7 @@ class CastStep(PulseStep):
         "Ghosts", "Wet ground", "Gaussian and oval beams", "Refraction", "Vegetation",
         "Rays without a return",
     )  # fmt: skip
-    writes = *OF_RETURNS, "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
     causes = (GHOST,)
     purposes = LEAF, CROWN
 
@@ -198,7 +198,7 @@ class CastStep(PulseStep):
         """Return the function that draws random bits of sub-rays for a purpose."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
-            scan, number = batch.keys.of(batch.start + ray // batch.each)
+            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.each)
             return raw(self._seed, purpose, scan, number, ray % batch.each)
 
         return draw

@@ -26,7 +26,7 @@ from .doppler import VELOCITY, radial_velocities
 from .motion import CastPoses, Firings
 from .paths import GHOST
 from .pulses import Scanned
-from .returns import made
+from .returns import required
 from .steps import received_causes
 from .surfaces import Surfaces, light_of
 
@@ -167,7 +167,7 @@ class BatchPoints:
     @property
     def range(self) -> Floats:
         """Distance from the start of the ray, metres, with noise."""
-        return made(self.found.reported)
+        return required(self.found.reported)
 
     @cached_property
     def positions(self) -> Floats:
@@ -494,7 +494,7 @@ class BatchPoints:
     @property
     def waveform(self) -> Records:
         """Recorded waveform, see `lidarsim.columns.waveforms.record`."""
-        table = made(self.found.waveform).copy()
+        table = required(self.found.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
@@ -505,12 +505,12 @@ class BatchPoints:
     @property
     def return_number(self) -> Bytes:
         """Number among the reported returns of its pulse."""
-        return made(self.found.number)
+        return required(self.found.number)
 
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return made(self.found.returns)
+        return required(self.found.returns)
 
     @property
     def cause(self) -> Bytes:

@@ -11,7 +11,7 @@ from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import CUT
 from ..sensor.random_numbers import Purpose, normal, raw
-from .returns import Keys, PulseReturns, made, numbers
+from .returns import Keys, PulseReturns, numbers, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
@@ -52,14 +52,14 @@ class RecordingStep(PulseStep):
         hits = batch.hits
         each = batch.each
         noise = self.setup.noise
-        digitizer = Digitizer.of(self.setup)
+        digitizer = Digitizer.for_sensor(self.setup)
         count = self.setup.recorded
         beams = returns.ray - batch.start
         keys = batch.keys
-        here = Keys(keys.scan, keys.begins - batch.start)
+        here = Keys(keys.scan, keys.scan_starts - batch.start)
         out = np.zeros(len(beams), record(count))
         out["sample_ps"] = round(1000 * digitizer.sample_ns)
-        when = returns.distance * digitizer.per_m
+        when = returns.distance * digitizer.samples_per_m
         first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
         last = np.ceil(when).astype(np.int64) + digitizer.reach
         place = numbers(beams)
@@ -80,7 +80,7 @@ class RecordingStep(PulseStep):
             block = slice(start, start + size)
             samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
             if noise.threshold:
-                scan, ray = here.of(beam[block])
+                scan, ray = here.scan_and_number(beam[block])
                 stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
                 number = begins[block, None] + np.arange(count)
                 drawn = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
@@ -106,11 +106,11 @@ def _window(
     sizes = high - low
     mine = np.repeat(np.arange(len(begins)), sizes)
     rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
-    when = hits.distance[rows] * digitizer.per_m
+    when = hits.distance[rows] * digitizer.samples_per_m
     first = np.ceil(when - CUT * digitizer.sigma).astype(np.int64)  # that is not 0
     time = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
-    height *= made(hits.energy)[rows, None] / each
+    height *= required(hits.energy)[rows, None] / each
     place = time - begins[mine, None]
     inside = (place >= 0) & (place < count)
     place += count * mine[:, None]
