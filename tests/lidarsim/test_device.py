@@ -130,7 +130,10 @@ def same(scene, survey, backend, cuts):
         assert np.array_equal(mine.counts, other.counts)
         assert np.array_equal(mine.hits, other.hits)
         rows = np.arange(0, len(other), 7)
-        assert np.abs(mine.ends(rows) - other.ends(rows)).max(initial=0) <= survey.precision_m
+        assert (
+            np.abs(mine.positions_of(rows) - other.positions_of(rows)).max(initial=0)
+            <= survey.precision_m
+        )
 
 
 @pytest.mark.parametrize("name", MADE)

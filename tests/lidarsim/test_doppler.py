@@ -58,7 +58,7 @@ def found_of(rig):
 
 def true_ends(returns):
     """Where rays end without noise, (n, 3)."""
-    return returns.origins + returns.found.distance[:, None] * returns.directions
+    return returns.origins + returns.pulse_returns.distance[:, None] * returns.directions
 
 
 def differences(path, times_ns, step_ns=2e5):
@@ -181,8 +181,8 @@ def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
     # The same rays, by the road of those whose returns may be lost.
     lossy = replace(survey, noise=Noise(dropout=1e-12))
     other = found_of(Rig(Scene.seed(), lossy, "numpy"))
-    assert other.found.velocity is not None
-    assert one.found.velocity is None
+    assert other.pulse_returns.velocity is not None
+    assert one.pulse_returns.velocity is None
     np.testing.assert_allclose(one.radial_velocity, other.radial_velocity, atol=1e-9)
 
 

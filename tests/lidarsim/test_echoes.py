@@ -318,8 +318,8 @@ def test_one_subray_without_noise_is_the_plain_ray():
     sensor = Sensor(BEAMS, Spin(90, step_deg=360))
     plain = cast(scene, sensor)
     beam = cast(scene, sensor, noise=Noise(dropout=1e-12))
-    assert plain["batch"].found.energy is None
-    assert beam["batch"].found.energy is not None
+    assert plain["batch"].pulse_returns.energy is None
+    assert beam["batch"].pulse_returns.energy is not None
     for name in ("x", "y", "z", "ray", "object", "channel", "class", "returns"):
         assert np.array_equal(plain[name], beam[name])
     assert np.allclose(plain["intensity"], beam["intensity"], rtol=1e-6)

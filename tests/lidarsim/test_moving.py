@@ -126,9 +126,11 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
             made = [column.make(found)[rays] for column in survey.stored_columns]
             both[found is batch] = {
                 key[:2]: key
-                for key in zip(found.found.ray[rays].tolist(), *map(list, made), strict=True)
+                for key in zip(
+                    found.pulse_returns.ray[rays].tolist(), *map(list, made), strict=True
+                )
             }
-        hidden = {int(ray) for ray in batch.found.ray[batch.object == 2]}
+        hidden = {int(ray) for ray in batch.pulse_returns.ray[batch.object == 2]}
         assert {ray for ray, _ in both[False]} - {ray for ray, _ in both[True]} <= hidden
         untouched = {k: v for k, v in both[False].items() if k[0] not in hidden}
         if "several" not in name:

@@ -173,7 +173,7 @@ class HalfOfReturns(Everywhere):
     role = Role.CHANGES
 
     def apply(self, returns, batch):
-        hits = batch.select(np.flatnonzero(returns.ray // batch.each % 2 == 0))
+        hits = batch.select(np.flatnonzero(returns.ray // batch.subrays_per_beam % 2 == 0))
         batch.hits = hits._replace(energy=hits.energy / 2)
         return batch.hits
 
@@ -196,14 +196,14 @@ class Aside(Everywhere):
     role = Role.AIMS | Role.ABOUT_AXIS
 
     def apply(self, returns, batch):
-        batch.turn(np.tile([0.1, 0.0], (batch.stop - batch.start, 1)))
+        batch.deflect(np.tile([0.1, 0.0], (batch.stop - batch.start, 1)))
         return returns
 
 
 class Farther(Everywhere):
     """Reports all ranges a metre longer."""
 
-    role = Role.OF_KEPT
+    role = Role.ON_REPORTED
 
     def apply(self, returns, batch):
         return returns._replace(reported=returns.reported + 1)

@@ -1,4 +1,4 @@
-"""The simulator: scene, sensors and physics make returns, and those make columns."""
+"""The simulator: scene, sensors and physics produce returns, and returns are the sources of columns."""
 
 from .scanner import Scanner
 

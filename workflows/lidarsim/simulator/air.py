@@ -112,7 +112,7 @@ class WeatherStep(PulseStep):
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
         self._fog = _fog_cells(
-            air, scatters, noise.threshold, min_range_m, max_range_m, setup.gap_m
+            air, scatters, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
     @staticmethod
@@ -133,7 +133,9 @@ class WeatherStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the hits of a batch after hits in the air are sampled."""
-        air_hits = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.each)
+        air_hits = self.sampled(
+            returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
+        )
         if air_hits is None:
             return returns
         return add_air_hits(self.setup, returns, batch, air_hits)
@@ -201,7 +203,9 @@ class WeatherStep(PulseStep):
         exit_distance = np.full(len(rows), np.inf)
         same_ray = ray[1:] == ray[:-1]
         exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
-        enters = (numbers(ray) % 2 == 0) & (exit_distance - surface_distance > self.setup.gap_m)
+        enters = (numbers(ray) % 2 == 0) & (
+            exit_distance - surface_distance > self.setup.half_pulse_m
+        )
         reach = reach.copy()
         np.minimum.at(reach, ray[enters], surface_distance[enters])
         return reach
@@ -234,9 +238,9 @@ def add_air_hits(
     receives the hits in the air, for `SeparationStep`.
     """
     if returns.velocity is not None:  # the air is at rest
-        rays = batch.here.rays(batch.beams, air_hits.ray, batch.window[0])
-        air_hits = air_hits._replace(velocity=approach(batch.here, air_hits.ray, *rays))
-    if setup.in_waveforms or setup.recorded:
+        rays = batch.subray_poses.rays(batch.beams, air_hits.ray, batch.window[0])
+        air_hits = air_hits._replace(velocity=approach(batch.subray_poses, air_hits.ray, *rays))
+    if setup.in_waveforms or setup.waveform_samples:
         batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
         return batch.hits
     if batch.air is not None:

@@ -1,4 +1,4 @@
-"""Errors of the directions in which beams are sent; reported directions have none."""
+"""Errors of the directions in which beams are sent; reported directions have no errors."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class AngleNoiseStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if directions have random errors."""
         return setup.noise.angle_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`."""
+        """Return the memory of the directions of beams, in bytes."""
         return turned_beams(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Add random angles to the beams of a batch; return the returns unchanged."""
         beams = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
-        batch.turn(np.column_stack([across, up]))
+        batch.deflect(np.column_stack([across, up]))
         return returns
 
 
@@ -49,16 +49,16 @@ class RippleStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if azimuths have a periodic error."""
         return setup.noise.ripple_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: nothing more where `AngleNoiseStep` turns the beams as well."""
+        """Return the memory of the directions of beams; 0 if `AngleNoiseStep` counts the memory."""
         return Memory() if setup.noise.angle_deg else turned_beams(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Add the errors of azimuth to the beams of a batch; return the returns unchanged."""
         noise = self.setup.noise
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
@@ -66,7 +66,7 @@ class RippleStep(PulseStep):
         # A degree of azimuth is less across a beam, the steeper the beam looks.
         level = hypot(*sensor.ahead.T[:2])
         across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
-        batch.turn(np.column_stack([across, np.zeros(len(across))]))
+        batch.deflect(np.column_stack([across, np.zeros(len(across))]))
         return returns
 
 
@@ -79,7 +79,7 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
 
 
 def turned_beams(setup: Setup, sizes: Sizes) -> Memory:
-    """Return the memory of beams with directions of their own."""
-    if setup.several:  # then only the beams of a batch are turned at a time
+    """Return the memory of beams with a direction each, in bytes."""
+    if setup.has_several_returns:  # then the beams are deflected batch by batch
         return Memory()
-    return Memory(kept=32 * sizes.rays, casting=20 * sizes.rays)
+    return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

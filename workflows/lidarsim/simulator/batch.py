@@ -1,4 +1,4 @@
-"""The columns of a batch: those of the returns of its scans, one station after the other."""
+"""Columns of a batch: of the returns of its scans, station after station."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from .device import DevicePoints
 from .points import BatchPoints
 
 
-def columns_of(found: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
-    """Make the columns of consecutive scans, and count the hits of each triangle."""
+def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
+    """Return the columns of the returns of consecutive scans, with the hits of each triangle."""
     columns = {
-        column.name: _joined([returns.column(column) for returns in found])
-        for column in found[0].survey.stored_columns
+        column.name: _joined([returns.column(column) for returns in batches])
+        for column in batches[0].survey.stored_columns
     }
-    triangles, hits = found[0].tally
-    if len(found) > 1:
-        every, counts = map(np.concatenate, zip(*(returns.tally for returns in found), strict=True))
-        triangles, row = np.unique(every, return_inverse=True)
+    triangles, hits = batches[0].tally
+    if len(batches) > 1:
+        all_triangles, counts = map(
+            np.concatenate, zip(*(returns.tally for returns in batches), strict=True)
+        )
+        triangles, row = np.unique(all_triangles, return_inverse=True)
         hits = np.zeros(len(triangles), np.int64)
         np.add.at(hits, row, counts)
     return PartColumns(
-        found[0].specs[0].scan,
-        _joined([returns.counts for returns in found]),
+        batches[0].specs[0].scan,
+        _joined([returns.counts for returns in batches]),
         columns,
         triangles.astype(np.int32),
         hits,
@@ -34,4 +36,5 @@ def columns_of(found: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
 
 
 def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
+    """Concatenate arrays; a single contiguous array is returned as is."""
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

@@ -1,10 +1,10 @@
-"""Crosstalk: pulses of the other sensors of a survey that a receiver takes for its own."""
+"""Crosstalk: a receiver cannot tell foreign pulses, of other sensors, from its own pulses."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ..base.elementary import arccos, exp
 from ..base.elementary_scalars import sin_cos_of
 from ..base.vectors import into_axes, length, products, turned
 from ..columns.table import CAUSES
-from ..sensor import Sensor, Survey
+from ..sensor import ScanSpec, Sensor, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose
@@ -27,29 +27,50 @@ from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 
+if TYPE_CHECKING:
+    from .stray_loops import ReceivedSpots
+
 OTHER = Purpose(23, "noise of the energy of another sensor's pulse")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
-SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off before it is computed
+SLACK_NS = 10.0  # error of the estimated time at which a pulse reaches the receiver, at most
+
+
+class ReceivedPulses(NamedTuple):
+    """Foreign pulses that rays receive: arrays (k,)."""
+
+    row: Indices  # of the rays
+    distance: Floats  # at which the pulse appears to the receiver, metres
+    energy: Floats
+
+
+class _WaitingRays(NamedTuple):
+    """Rays whose receiver waits for light: arrays (n,), vectors (n, 3)."""
+
+    fired: Floats  # nanoseconds since the start of the station
+    order: Indices  # of the firing times
+    origins: Floats
+    directions: Floats
+    gate: Floats  # (2,): nanoseconds after firing between which the receiver waits
 
 
 class _Spots(NamedTuple):
-    """Where pulses of a sensor hit something: arrays (n,)."""
+    """Points on surfaces that the pulses of a sensor light: arrays (n,)."""
 
-    time: Floats  # when, nanoseconds since the station began
-    place: Floats  # (n, 3)
+    time: Floats  # nanoseconds since the start of the station
+    position: Floats  # (n, 3)
     normal: Floats  # (n, 3)
     triangle: Ints32
-    distance: Floats  # from that sensor
+    distance: Floats  # from the sensor, metres
 
 
 class CrosstalkStep(PulseStep):
-    """Adds the pulses of other sensors that a sensor receives.
+    """Adds the foreign pulses that a sensor receives.
 
-    A pulse of another sensor lights a spot. A ray receives its light if the spot is in the field of
-    view of its receiver, as wide as its beam, nothing stands between them, and the light arrives
-    while the receiver waits for its own pulse.
+    A pulse of another sensor lights a spot. A ray receives the light of the spot if the spot is
+    visible and in the field of view of the ray's receiver, which is as wide as the beam, and if
+    the light arrives while the receiver waits for the pulse of the ray.
     """
 
     role = Role.RECEIVES
@@ -63,54 +84,52 @@ class CrosstalkStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         self._survey = setup.survey
         self._sensor = setup.sensor
-        wide, _ = setup.reporting.of(self._sensor.optics)
-        self._cosine = sin_cos_of(wide / 2)[1]
+        divergence, _ = setup.reporting.of(self._sensor.optics)
+        self._cosine = sin_cos_of(divergence / 2)[1]
         nm = self._sensor.optics.wavelength_nm
-        self._others = [
-            other
-            for other, carried in enumerate(self._survey.carried)
-            if other != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
+        self._other_sensors = [
+            number
+            for number, carried in enumerate(self._survey.carried)
+            if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the sensor has crosstalk."""
         return setup.noise.crosstalk
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: a cause of each return, rays, and pulses of others."""
-        others = _pulses_meanwhile(setup.survey, setup.sensor)
-        return Memory(kept=10 * sizes.returns, casting=(120 + 200 * others) * sizes.beams)
+        """Return the memory of causes of returns, of rays, and of foreign pulses, in bytes."""
+        foreign_pulses = _foreign_pulses(setup.survey, setup.sensor)
+        return Memory(
+            retained=10 * sizes.returns, casting=(120 + 200 * foreign_pulses) * sizes.beams
+        )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the returns of a batch and the received foreign pulses."""
         rays = np.arange(batch.start, batch.stop)
-        row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
+        row, distance, energy = self.received(
+            batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
+        )
         order = np.lexsort((distance, row))
         ray = rays[row[order]]
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.scan_and_number(ray)
-        seen = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
-        others = returns_without_surface(
-            returns, ray[seen], distance[seen], energy[seen], CROSSTALK
+        detected = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
+        foreign_returns = returns_without_surface(
+            returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )
-        return merged(returns, others)
+        return merged(returns, foreign_returns)
 
     def received(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
-    ) -> tuple[Indices, Floats, Floats]:
-        """Find pulses of other sensors that consecutive rays (n,) receive.
+    ) -> ReceivedPulses:
+        """Return the foreign pulses that consecutive rays (n,) receive.
 
-        `rays` count from the begin of a scan. Origins and directions are (n, 3).
-
-        Returns
-        -------
-        Rows of the rays, distances at which they seem to be, metres, and energies: (k,) each.
+        `rays` count from the start of a scan. Origins and directions are (n, 3).
         """
-        from . import stray_loops  # not before: numba takes half a second to import
-
         spec = self._survey.scan(scan)
         sensor = self._sensor
         firing, channel = np.divmod(rays, sensor.channels)
@@ -118,151 +137,181 @@ class CrosstalkStep(PulseStep):
         fired = sensor.begins_ns(firing) + sensor.beams.time_ns[channel]
         gate = 2 / LIGHT_M_NS * np.array([sensor.min_range_m, sensor.max_range_m])
         order = np.argsort(fired, kind="stable")
-        found: list[tuple[Indices, Floats, Floats]] = []
-        for other in self._others:
-            lidar = self._survey.carried[other].sensor
-            reach = (lidar.max_range_m + sensor.max_range_m) / LIGHT_M_NS
-            span = fired[order[0]] - reach, fired[order[-1]] + gate[1]
-            spots = self._spots(other, spec.station, spec.start_ns, span, poses)
-            pairs = self._open(fired, order, origins, directions, spots, gate)
-            most = int(np.maximum(pairs[2] - pairs[1], 0).sum())
-            output = stray_loops.ReceivedSpots(
-                row=np.empty(most, np.int64),
-                spot=np.empty(most, np.int64),
-                distance=np.empty(most),
-                range_m=np.empty(most),
-            )
-            count = stray_loops.receive(
-                stray_loops.SpotPairs(*pairs),
-                stray_loops.ReceivingRays(order, owned(fired), owned(origins), owned(directions)),
-                stray_loops.LitSpots(owned(spots.time), owned(spots.place)),
-                stray_loops.ReceptionLimits(self._cosine, sensor.min_range_m, sensor.max_range_m),
-                output,
-            )
-            row, spot, distance, far = output
-            row = row[:count]
-            spot = spot[:count]
-            distance = distance[:count]
-            far = far[:count]
-            towards = spots.place[spot] - origins[row]
-            when = fired[row] + spec.start_ns
-            free = self.caster.free(origins[row], towards, far, when, poses.ways)
-            energy = self._energy(spots, spot[free], towards[free], far[free])
-            found.append((row[free], distance[free], energy))
-        if not found:
-            return np.zeros(0, np.intp), np.zeros(0), np.zeros(0)
-        rows, distances, energies = map(np.concatenate, zip(*found, strict=True))
-        return rows, distances, energies
+        waiting = _WaitingRays(fired, order, origins, directions, gate)
+        pulses = [
+            self._received_from(number, spec, waiting, poses) for number in self._other_sensors
+        ]
+        if not pulses:
+            return ReceivedPulses(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
+        return ReceivedPulses(*map(np.concatenate, zip(*pulses, strict=True)))
 
-    def _open(
-        self,
-        fired: Floats,
-        order: Indices,
-        origins: Floats,
-        directions: Floats,
-        spots: _Spots,
-        gate: Floats,
-    ) -> tuple[Indices, Indices, Indices]:
-        """Spots, and from which row of `order` to which rays may see them, while they wait."""
-        times = fired[order]
-        about = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
-        away = spots.place - origins[order[about]]
-        far = np.sqrt(products(away.T, away.T))
-        arrives = spots.time + far / LIGHT_M_NS
-        first = np.searchsorted(times, arrives - gate[1] - SLACK_NS)
-        stop = np.searchsorted(times, arrives - gate[0] + SLACK_NS, side="right")
-        # Rays that are fired one after the other look into a cone; few spots are in it.
-        begins = np.arange(0, len(order), CELL_RAYS)
-        ahead = directions[order]
-        sums = np.add.reduceat(ahead, begins, axis=0)
-        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
-        least = np.minimum.reduceat(
-            products(axes[np.arange(len(order)) // CELL_RAYS].T, ahead.T), begins
+    def _received_from(
+        self, number: int, spec: ScanSpec, waiting: _WaitingRays, poses: CastPoses
+    ) -> ReceivedPulses:
+        """Return the foreign pulses that rays receive from the sensor `number`."""
+        max_range_m = self._survey.carried[number].sensor.max_range_m
+        reach_ns = (max_range_m + self._sensor.max_range_m) / LIGHT_M_NS
+        first_ns = waiting.fired[waiting.order[0]] - reach_ns
+        last_ns = waiting.fired[waiting.order[-1]] + waiting.gate[1]
+        spots = self._spots(number, spec, (first_ns, last_ns), poses)
+        row, spot, distance, range_m = self._sightings(waiting, spots)
+        towards = spots.position[spot] - waiting.origins[row]
+        times = waiting.fired[row] + spec.start_ns
+        visible = self.caster.is_visible(
+            waiting.origins[row], towards, range_m, times, poses.actor_trajectories
         )
-        opening = arccos(np.clip(least, -1, 1)) + arccos(self._cosine)
+        energy = self._energy(spots, spot[visible], towards[visible], range_m[visible])
+        return ReceivedPulses(row[visible], distance[visible], energy)
+
+    def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
+        """Return the spots in the fields of view of rays while the rays wait."""
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        spot, first, stop = self._candidates(waiting, spots)
+        max_count = int(np.maximum(stop - first, 0).sum())
+        sightings = stray_loops.ReceivedSpots(
+            row=np.empty(max_count, np.int64),
+            spot=np.empty(max_count, np.int64),
+            distance=np.empty(max_count),
+            range_m=np.empty(max_count),
+        )
+        count = stray_loops.receive(
+            stray_loops.SpotPairs(spot, first, stop),
+            stray_loops.ReceivingRays(
+                waiting.order,
+                owned(waiting.fired),
+                owned(waiting.origins),
+                owned(waiting.directions),
+            ),
+            stray_loops.LitSpots(owned(spots.time), owned(spots.position)),
+            stray_loops.ReceptionLimits(
+                self._cosine, self._sensor.min_range_m, self._sensor.max_range_m
+            ),
+            sightings,
+        )
+        return sightings.first(count)
+
+    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> tuple[Indices, Indices, Indices]:
+        """Return spots, and for each spot the rays that may receive its light.
+
+        The rays wait while the light of the spot arrives, and their cell looks towards the spot.
+        They are consecutive in `waiting.order`: returns start and stop.
+        """
+        times = waiting.fired[waiting.order]
+        nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
+        towards = spots.position - waiting.origins[waiting.order[nearest_firing]]
+        distance = np.sqrt(products(towards.T, towards.T))
+        arrival = spots.time + distance / LIGHT_M_NS
+        first = np.searchsorted(times, arrival - waiting.gate[1] - SLACK_NS)
+        stop = np.searchsorted(times, arrival - waiting.gate[0] + SLACK_NS, side="right")
+        axes, opening = self._cells(waiting.directions[waiting.order])
         with np.errstate(invalid="ignore", divide="ignore"):
-            opening_m = SLACK_NS * LIGHT_M_NS / far  # rays of a cell start at different places
+            slack = SLACK_NS * LIGHT_M_NS / distance  # rays of a cell start at different positions
         spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
-        off = arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
-        seen = ~(off > opening[cell] + opening_m[spot])
-        spot = spot[seen]
-        cell = cell[seen]
-        low = np.maximum(first[spot], cell * CELL_RAYS)
-        return spot, low, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+        angles = arccos(np.clip(products(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
+        in_view = ~(angles > opening[cell] + slack[spot])
+        spot = spot[in_view]
+        cell = cell[in_view]
+        first_row = np.maximum(first[spot], cell * CELL_RAYS)
+        return spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+
+    def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Return the axes (c, 3) and opening angles (c,), radians, of cones of consecutive rays.
+
+        Consecutive rays look into a narrow cone, and few spots are in the cone.
+        """
+        cell_starts = np.arange(0, len(directions), CELL_RAYS)
+        sums = np.add.reduceat(directions, cell_starts, axis=0)
+        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
+        min_cosine = np.minimum.reduceat(
+            products(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
+        )
+        return axes, arccos(np.clip(min_cosine, -1, 1)) + arccos(self._cosine)
 
     def _spots(
-        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: CastPoses
+        self, number: int, spec: ScanSpec, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
-        """Where the pulses of another sensor hit something, fired within a span of time."""
-        carried = self._survey.carried[other]
-        path = self._survey.path
-        sensor: Sensor = carried.sensor
-        firings = np.arange(*_fired_in(sensor, self._survey.steps_each[other], span))
-        begins = sensor.begins_ns(firings)
-        ahead = sensor.directions(firings)
-        starts = sensor.origins(firings)
-        starts = np.zeros_like(ahead) if starts is None else starts
-        fired = (begins[:, None] + sensor.beams.time_ns).reshape(-1)
-        ahead = turned(ahead.reshape(-1, 3), carried.mount.rotation)
-        starts = turned(starts.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
-        places, turns = path.poses(station, np.minimum(begins + sensor.lead_ns, path.duration_ns))
-        if turns is not None:
-            back = np.repeat(turns.transpose(0, 2, 1), sensor.channels, axis=0)
-            ahead = into_axes(ahead, back)
-            starts = into_axes(starts, back)
-        starts = starts + np.repeat(places, sensor.channels, axis=0)
-        now = CastPoses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
-        low = sensor.min_range_m
-        high = sensor.max_range_m
-        found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
-        ray = found.ray.astype(np.int64)
-        distance = found.distance
-        times = fired[ray] + start_ns
+        """Cast the pulses that another sensor fires within a span of time; return their spots."""
+        sensor: Sensor = self._survey.carried[number].sensor
+        firings = np.arange(*_firings_in(sensor, self._survey.steps_each[number], span))
+        firing_starts = sensor.begins_ns(firings)
+        fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
+        origins, directions = self._fired_rays(number, spec.station, firings, firing_starts)
+        trajectories = poses.actor_trajectories
+        hits = self.caster.scan(
+            Pattern(directions, origins),
+            CastPoses(np.zeros(3), clock=Clock(fired + spec.start_ns, np.zeros(1), trajectories)),
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+        )
+        ray = hits.ray.astype(np.int64)
+        distance = hits.distance
+        times = fired[ray] + spec.start_ns
         return _Spots(
             fired[ray] + distance / LIGHT_M_NS,
-            starts[ray] + distance[:, None] * ahead[ray],
-            self.surfaces.normals(found.triangle, times, poses.ways),
-            found.triangle,
+            origins[ray] + distance[:, None] * directions[ray],
+            self.surfaces.normals(hits.triangle, times, trajectories),
+            hits.triangle,
             distance,
         )
 
-    def _energy(self, spots: _Spots, spot: Indices, towards: Floats, far: Floats) -> Floats:
-        """Energies that are received of spots: (n,), as of a sensor's own pulses."""
+    def _fired_rays(
+        self, number: int, station: int, firings: Ints, firing_starts: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return origins and directions of the rays of firings, in the scene frame: (n, 3)."""
+        carried = self._survey.carried[number]
+        path = self._survey.path
+        sensor = carried.sensor
+        directions = sensor.directions(firings)
+        origins = sensor.origins(firings)
+        origins = np.zeros_like(directions) if origins is None else origins
+        directions = turned(directions.reshape(-1, 3), carried.mount.rotation)
+        origins = turned(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
+        times = np.minimum(firing_starts + sensor.lead_ns, path.duration_ns)
+        positions, rotations = path.poses(station, times)
+        if rotations is not None:
+            inverse = np.repeat(rotations.transpose(0, 2, 1), sensor.channels, axis=0)
+            directions = into_axes(directions, inverse)
+            origins = into_axes(origins, inverse)
+        return origins + np.repeat(positions, sensor.channels, axis=0), directions
+
+    def _energy(self, spots: _Spots, spot: Indices, towards: Floats, path_m: Floats) -> Floats:
+        """Return the energies received from spots (n,), on the scale of the sensor's pulses."""
         surfaces = self.surfaces
-        nm = self._sensor.optics.wavelength_nm
         triangle = spots.triangle[spot]
-        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / far
-        # The air on the way there and back.
-        both = self._survey.extinction(self._sensor) * (spots.distance[spot] + far)
+        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / path_m
+        # The air from the other sensor to the spot, and on to the receiver.
+        air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
-        table = surfaces.at(nm)
-        # A retro-reflector sends the light of a sensor back to that one alone.
+        table = surfaces.at(self._sensor.optics.wavelength_nm)
+        # A retro-reflector sends light back only to the sensor that sent the light.
         share = table.reflectance[kinds] * ~table.retro[kinds]
-        return np.asarray(share * cosine * at_right_angles(far) * exp(-both))
+        return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
-    """Row and number of each whole number of ranges (n,): (k,) each."""
-    each = np.maximum(stop - first, 0)
-    row = np.repeat(np.arange(len(each)), each)
-    return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(each) - each, each)
+    """Return the row and value of each integer of the ranges `first` to `stop` (n,): (k,) each."""
+    counts = np.maximum(stop - first, 0)
+    row = np.repeat(np.arange(len(counts)), counts)
+    return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
-    """First firing within a span of time, and one past the last."""
-    last = range(sensor.firings(steps - 1)[1])
-    begins = partial(begin_ns, sensor)
-    early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
-    return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)
+def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
+    """Return the firings with a beam within a span of time, nanoseconds: start and stop."""
+    firings = range(sensor.firings(steps - 1)[1])
+    start_of = partial(begin_ns, sensor)
+    slowest_ns = float(sensor.beams.time_ns.max())
+    start = bisect_left(firings, span[0] - slowest_ns, key=start_of)
+    return start, bisect_left(firings, span[1], key=start_of)
 
 
-def _pulses_meanwhile(survey: Survey, sensor: Sensor) -> float:
-    """Pulses of all sensors but one in the time in which that one fires once."""
+def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
+    """Return the number of foreign pulses for each pulse of a sensor."""
 
-    def rate(one: Sensor) -> float:
-        first, stop = one.firings(0)
-        begin, end = one.begins_ns(np.array([first, stop], np.int64))
-        return float((stop - first) * one.channels / (end - begin))
+    def rate(lidar: Sensor) -> float:
+        first, stop = lidar.firings(0)
+        begin, end = lidar.begins_ns(np.array([first, stop], np.int64))
+        return float((stop - first) * lidar.channels / (end - begin))
 
-    every = sum(rate(carried.sensor) for carried in survey.carried)
-    return every / rate(sensor) - 1
+    total = sum(rate(carried.sensor) for carried in survey.carried)
+    return total / rate(sensor) - 1

@@ -16,7 +16,10 @@ LOSS = Purpose(5, "whether a return is lost")
 
 
 class DetectionStep(PulseStep):
-    """Loses weak returns of waveforms, and a share of all; `SeparationStep` does that itself."""
+    """Drops weak returns of waveforms, and a share of all returns.
+
+    Without waveforms, `SeparationStep` drops them.
+    """
 
     role = Role.CHANGES
     reads = "ray", "amplitude"
@@ -24,14 +27,14 @@ class DetectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the noise loses returns and returns are found in waveforms."""
         return setup.noise.loses and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the detected returns."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        seen = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
-        return returns.take(seen)
+        detected_mask = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
+        return returns.take(detected_mask)
 
 
 def detected(
@@ -43,10 +46,10 @@ def detected(
     the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a fifth of
     the threshold 3 in 100,000.
     """
-    seen = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
+    detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
     if noise.detection_range_m is not None:
-        seen &= passes(noise, DETECTION, energy, scan, ray, number)
-    return seen
+        detected_mask &= passes(noise, DETECTION, energy, scan, ray, number)
+    return detected_mask
 
 
 def passes(

@@ -1,10 +1,10 @@
-"""Columns that are made on the CUDA device: only kept values cross the bus, in the types of files.
+"""Columns that are computed on the CUDA device: only their values cross the bus, in file types.
 
-The formulas are those of `BatchPoints`, with the same bits. If a survey has other columns too, its
-kept hits cross the bus as well, and NumPy makes those: energies in haze, azimuths and noise, since
-`exp` and `atan2` of a device differ from those of `elementary` in the last bit. So it does with the
-energies of hits on actors, for which it needs their poses; `SceneCaster` finds these hits,
-and the device merges them with its own.
+The formulas and bits are those of `BatchPoints`. If a survey has further columns, the reported hits
+cross the bus as well, and NumPy computes these columns: energies in haze, azimuths and noise, since
+`exp` and `atan2` of a device differ from `elementary` in the last bit. NumPy also computes the
+energies of hits on actors, which depend on the actors' poses; `SceneCaster` finds the hits on
+actors, and the device merges them with its hits.
 """
 
 from __future__ import annotations
@@ -36,55 +36,55 @@ OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
 _BLOCK = 128  # threads
 _ENERGIES = "intensity", "reflectance"
 _TRIANGLE = TABLE["triangle"]
-# In the order of columns.cu.
-_MADE = (
+# Columns that a device computes, in the order of columns.cu.
+_DEVICE_COLUMNS = (
     *AXES, CHANNEL, OBJECT,
     *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
 )  # fmt: skip
-_EQUAL = "sensor", "return_number", "returns", "cause"  # the same for all points
-_HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits for NumPy
+_CONSTANT_COLUMNS = "sensor", "return_number", "returns", "cause"  # the same for all points
+_HITS = np.uint32, np.float64, np.int32  # types of rays, distances and triangles for NumPy
 _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
 
-def _able(scene: Scene, survey: Survey) -> set[str]:
-    """Names of the columns that a device can make for a survey of a scene."""
+def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
+    """Return the names of the columns that a device can compute for a survey of a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
     several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
     shining = any(
         m.reflectance == "texture" or m.roughness is not None or (several and m.spectrum)
         for m in survey.materials
     )
-    able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
-    if scene.has_mixed_objects:  # of whose faces a device does not know the materials
+    able = {column.name for column in _DEVICE_COLUMNS} - {*(_ENERGIES if hazy or shining else ())}
+    if scene.has_mixed_objects:  # the device has no materials of faces
         able -= {*_ENERGIES, "class"}
     able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
-    """Whether NumPy makes a column, so that all kept hits leave the device."""
+    """Return True if NumPy computes a column, so that all reported hits leave the device."""
     names = {column.name for column in survey.stored_columns}
-    return not names <= _able(scene, survey) | {*_EQUAL}
+    return not names <= _device_column_names(scene, survey) | {*_CONSTANT_COLUMNS}
 
 
 @dataclass(frozen=True, eq=False)
 class DevicePoints:
-    """Columns of some consecutive scans of one station, see `BatchPoints`."""
+    """Columns of consecutive scans of a station, see `BatchPoints`."""
 
     scene: Scene
     survey: Survey
     specs: list[ScanSpec]
     counts: Ints  # of each scan
-    hits: Ints  # of each scan, kept or not
-    tally: tuple[Indices, Ints]
+    hits: Ints  # of each scan, also without a reported return
+    tally: tuple[Indices, Ints]  # triangles that were hit, and their hits
     columns: dict[str, AnyArray]  # by name
-    returns: BatchPoints | None  # on the host, if there are columns that NumPy makes
+    returns: BatchPoints | None  # on the host, if NumPy computes columns
 
     def __len__(self) -> int:
         return int(self.counts.sum())
 
     def column(self, column: Column) -> AnyArray:
-        """Values of a column."""
+        """Return the values of a column."""
         if column.name in self.columns:
             return self.columns[column.name]
         if self.returns is not None:
@@ -92,16 +92,16 @@ class DevicePoints:
         value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
-    def ends(self, rows: Ints) -> Floats:
-        """Positions of some points (k,), at least to the survey's precision: (k, 3)."""
+    def positions_of(self, rows: Ints) -> Floats:
+        """Return the positions of the points `rows` (k,), to the survey's precision: (k, 3)."""
         if self.returns is not None:
-            return self.returns.ends(rows)
+            return self.returns.positions_of(rows)
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         return cells * self.survey.precision_m
 
 
 class DeviceColumns:
-    """Casts surveys whose rays have one return each, and makes their columns on the device."""
+    """Casts surveys whose rays have a single return, and computes columns on the device."""
 
     def __init__(
         self, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
@@ -110,27 +110,27 @@ class DeviceColumns:
         self._scene = scene
         self._surfaces = surfaces
         self.survey = survey
-        wanted = {column.name for column in survey.stored_columns}
-        able = _able(scene, survey)
+        stored = {column.name for column in survey.stored_columns}
+        able = _device_column_names(scene, survey)
         self.all_hits = needs_hits(scene, survey)
         if self.all_hits and scene.actors:
             able -= {*_ENERGIES}
-        self.made = [column for column in _MADE if column.name in wanted & able]
-        self.energies = [column for column in self.made if column.name in _ENERGIES]
+        self.device_columns = [column for column in _DEVICE_COLUMNS if column.name in stored & able]
+        self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
         # Whether NumPy needs hits on actors.
         self.some_hits = bool(scene.actors and self.energies)
         self.bodies, _ = surfaces.bodies()
         self._counters = caster.counters()
-        self._sent: tuple[Any, ...] | None = None
-        self._turns: Any = None
+        self._surface_tables: tuple[Any, ...] | None = None
+        self._rotations: Any = None
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
-        """Return the same after instances have moved; what has not changed stays on the device."""
-        made = copy(self)
-        made._scene = scene
-        made._surfaces = surfaces
-        made._turns = None
-        return made
+        """Return columns of moved instances; unchanged tables stay on the device."""
+        maker = copy(self)
+        maker._scene = scene
+        maker._surfaces = surfaces
+        maker._rotations = None
+        return maker
 
     def returns(
         self,
@@ -140,38 +140,63 @@ class DeviceColumns:
         window: tuple[int, int],
         groups: Ints,
     ) -> DevicePoints:
-        """Cast scans, see `Rig.returns`."""
+        """Cast consecutive scans of a station, and compute their columns.
+
+        `window` are the first ray in the pattern and one past the last; `groups` are the first
+        rays of the scans.
+        """
         survey = self.survey
-        sensor = self.survey.carried[specs[0].sensor].sensor
+        sensor = survey.carried[specs[0].sensor].sensor
         every = survey.keep_every
-        reach = (sensor.min_range_m, sensor.max_range_m)
         scan = check_scan(
-            pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
-            keep_every=every, groups=groups, tally=True,
-        )  # fmt: skip
-        others = self._caster.on_actors(scan, poses) if poses.ways else None
-        if others is not None:  # rows of the actors' body
-            others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
-        making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
+            pattern,
+            **poses.caster_arguments,
+            window=window,
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+            keep_every=every,
+            groups=groups,
+            tally=True,
+        )
+        actor_hits = self._caster.on_actors(scan, poses) if poses.actor_trajectories else None
+        if actor_hits is not None:  # numbered within the body of all actors
+            actor_hits = replace(
+                actor_hits, triangle=actor_hits.triangle - np.int32(self.bodies[-1, 0])
+            )
+        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // every) + len(groups))
         try:
-            hits, tally = self._caster.caster.visit(scan, making.make, self._counters, others)
+            hits, tally = self._caster.caster.visit(scan, transfer.make, self._counters, actor_hits)
         finally:  # else the device would write to memory that goes back to the pool
-            columns, (ray, distance, triangle) = making.done()
+            columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        found = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
+        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
         returns = BatchPoints(
-            self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
+            self._scene,
+            survey,
+            self._surfaces,
+            specs,
+            scanned,
+            pattern=pattern,
+            start=window[0],
+            poses=poses,
         )
         if self.some_hits:
             for column in self.energies:
-                columns[column.name][making.rows] = column.make(returns)
-        counts = -(-hits // every)
-        on_host = returns if self.all_hits else None
-        return DevicePoints(self._scene, survey, specs, counts, hits, tally, columns, on_host)
+                columns[column.name][transfer.rows] = column.make(returns)
+        return DevicePoints(
+            self._scene,
+            survey,
+            specs,
+            -(-hits // every),
+            hits,
+            tally,
+            columns,
+            returns if self.all_hits else None,
+        )
 
     def tables(self, cupy: Any) -> tuple[Any, ...]:
-        """Tables of the surfaces for columns.cu, on the caster's device; see there."""
-        if self._sent is None:
+        """Return the tables of surfaces that columns.cu reads, on the caster's device."""
+        if self._surface_tables is None:
             surfaces = self._surfaces
             materials = self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
@@ -179,106 +204,128 @@ class DeviceColumns:
                 self.bodies, surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
-            self._sent = tuple(to_device(cupy, table) for table in tables)
-        if self._turns is None:
-            self._turns = to_device(cupy, self._surfaces.bodies()[1])
-        return *self._sent, self._turns
+            self._surface_tables = tuple(to_device(cupy, table) for table in tables)
+        if self._rotations is None:
+            self._rotations = to_device(cupy, self._surfaces.bodies()[1])
+        return *self._surface_tables, self._rotations
 
 
-class _Making:
-    """Columns of a batch on their way from the device to the host."""
+class _ColumnTransfer:
+    """Computes columns of a batch on the device, and sends the values to the host."""
 
     def __init__(
-        self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, most: int
+        self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, max_points: int
     ) -> None:
         self._maker = maker
         self._specs = specs
         self._groups = groups
-        self._most = most
-        self._begun: _Begun | None = None
+        self._max_points = max_points
+        self._transfer: _Transfer | None = None
         self._count = 0
-        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]  # rows, and as `_HITS`
+        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]  # rows, and types as `_HITS`
 
     def make(self, hits: DeviceHits) -> None:
-        """Make the columns of some hits, and send them to the host."""
+        """Compute the columns of hits, and send the values to the host."""
         if not len(hits):
             return
-        begun = self._begun = self._begun or self._begin(hits.cupy)
-        cp = hits.cupy
-        count = np.int64(len(hits))
-        asked = {*begun.out, *([_TRIANGLE] if begun.hits else [])}
-        made = {c: cp.empty(len(hits) if c in asked else 1, c.dtype) for c in _MADE}
-        wanted = np.int32(sum(1 << _MADE.index(column) for column in asked))
-        found = hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(), count
-        given = (*found, wanted, *begun.given, *made.values())
-        begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), given)
+        transfer = self._transfer = self._transfer or self._start(hits.cupy)
+        device_arrays = self._compute(hits, transfer)
         rows = slice(self._count, self._count + len(hits))
-        pairs = [(made[column], out[rows]) for column, out in begun.out.items()]
-        raw = hits.ray, hits.distance, made[_TRIANGLE]
-        pairs += [(array, out[rows]) for array, out in zip(raw, begun.hits, strict=False)]
-        begun.outbox.send(pairs)
+        pairs = [(device_arrays[column], host[rows]) for column, host in transfer.columns.items()]
+        hit_arrays = hits.ray, hits.distance, device_arrays[_TRIANGLE]
+        pairs += [
+            (array, host[rows]) for array, host in zip(hit_arrays, transfer.hits, strict=False)
+        ]
+        transfer.outbox.send(pairs)
         if self._maker.some_hits:
-            on = cp.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
-            some = (on, hits.ray[on], hits.distance[on], hits.triangle[on])
-            at, ray, distance, triangle = (array.get() for array in some)
-            triangle += np.int32(self._maker.bodies[-1, 0])
-            self._on_actors.append((self._count + at, ray, distance, triangle))
+            self._on_actors.append(self._actor_hits(hits))
         self._count += len(hits)
+
+    def _compute(self, hits: DeviceHits, transfer: _Transfer) -> dict[Column, Any]:
+        """Compute columns of hits on the device; unneeded columns have a single element."""
+        computed = {*transfer.columns, *([_TRIANGLE] if transfer.hits else [])}
+        arrays = {
+            column: hits.cupy.empty(len(hits) if column in computed else 1, column.dtype)
+            for column in _DEVICE_COLUMNS
+        }
+        flags = sum(1 << _DEVICE_COLUMNS.index(column) for column in computed)
+        arguments = (
+            hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(),
+            np.int64(len(hits)), np.int32(flags), *transfer.kernel_arguments, *arrays.values(),
+        )  # fmt: skip
+        transfer.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
+        return arrays
+
+    def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
+        """Return the rows of the hits on actors, and their rays, distances and triangles."""
+        on_actors = hits.cupy.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
+        columns = (on_actors, hits.ray[on_actors], hits.distance[on_actors],
+                   hits.triangle[on_actors])  # fmt: skip
+        rows, ray, distance, triangle = (array.get() for array in columns)
+        triangle += np.int32(self._maker.bodies[-1, 0])
+        return self._count + rows, ray, distance, triangle
 
     @property
     def rows(self) -> Ints:
         """Rows of the hits on actors."""
         return np.concatenate([rows for rows, *_ in self._on_actors])
 
-    def done(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for all columns; returns them by name, and what NumPy needs of hits, as `_HITS`."""
-        if self._begun is None:
-            return {c.name: np.zeros(0, c.dtype) for c in self._maker.made}, _NO_HITS[1:]
-        self._begun.outbox.wait()
-        # Page-locked memory has room for hits of all rays: where few hit, it is given back.
-        few = 2 * self._count < self._most
+    def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
+        """Wait for all columns; return arrays by name, and the hits for NumPy, as `_HITS`."""
+        if self._transfer is None:
+            return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
+        self._transfer.outbox.wait()
+        # Page-locked memory has room for hits of all rays: after few hits, it is given back.
+        copies = 2 * self._count < self._max_points
 
-        def kept(out: AnyArray) -> AnyArray:
-            return out[: self._count].copy() if few else out[: self._count]
+        def filled(host: AnyArray) -> AnyArray:
+            return host[: self._count].copy() if copies else host[: self._count]
 
-        columns = {column.name: kept(out) for column, out in self._begun.out.items()}
-        if self._begun.hits:
-            return columns, tuple(map(kept, self._begun.hits))
+        columns = {column.name: filled(host) for column, host in self._transfer.columns.items()}
+        if self._transfer.hits:
+            return columns, tuple(map(filled, self._transfer.hits))
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
-    def _begin(self, cupy: Any) -> _Begun:
-        """Send what the kernel reads besides hits."""
+    def _start(self, cupy: Any) -> _Transfer:
+        """Send the arguments of the kernel that are the same for all hits."""
+        maker = self._maker
+        kernel_arguments = self._kernel_arguments(cupy)
+        outbox = Outbox(cupy)
+        columns = {
+            column: outbox.room(self._max_points, column.dtype) for column in maker.device_columns
+        }
+        hits = [outbox.room(self._max_points, kind) for kind in _HITS] if maker.all_hits else []
+        kernel = _kernel(cupy, cupy.cuda.Device().id)
+        return _Transfer(kernel, kernel_arguments, outbox, columns, hits)
+
+    def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
+        """Return the arguments of the kernel between hits and columns, arrays on the device."""
         maker = self._maker
         specs = self._specs
-        survey = maker.survey
         sensor = maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, reflectance, retro, classes, turns = maker.tables(cupy)
+        bodies, owners, normals, reflectance, retro, classes, rotations = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
-        outbox = Outbox(cupy)
-        given = (
-            np.float64(survey.precision_m),
+        return (
+            np.float64(maker.survey.precision_m),
             cupy.asarray(self._groups), np.int32(len(specs)),
             cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
             np.int32(sensor.channels), np.int64(specs[0].start_ns),
-            bodies, owners, normals, turns,
+            bodies, owners, normals, rotations,
             reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
             np.float64(NEAREST_M), classes,
         )  # fmt: skip
-        out = {column: outbox.room(self._most, column.dtype) for column in maker.made}
-        hits = [outbox.room(self._most, kind) for kind in _HITS] if maker.all_hits else []
-        return _Begun(_kernel(cupy, cupy.cuda.Device().id), given, outbox, out, hits)
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
-    """What a batch needs from its first hits on."""
+class _Transfer:
+    """Kernel and arrays of a batch that has hits."""
 
     kernel: Any
-    given: tuple[Any, ...]  # arguments between hits and columns
+    kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
-    out: dict[Column, AnyArray]  # page-locked, as all of these
-    hits: list[AnyArray]  # as `_HITS`, if NumPy needs all of them
+    columns: dict[Column, AnyArray]  # on the host, page-locked
+    hits: list[AnyArray]  # as `_HITS`, page-locked, if NumPy needs all hits
 
 
 @lru_cache(maxsize=16)

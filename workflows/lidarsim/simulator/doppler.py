@@ -1,8 +1,8 @@
-"""Radial velocities: how fast the range of each return grows, as a coherent lidar measures it.
+"""Radial velocities: growth of the range of each return, as a coherent lidar measures it.
 
-The velocity of the point that was hit, less that of the ray's origin, along the ray: what the
+The velocity of the hit point minus the velocity of the ray's origin, along the ray, which the
 Doppler shift 2 v / wavelength of FMCW lidars shows (Hexsel, Vhavle and Chen 2022). Both are
-derivatives of the trajectories' own curves (`lidarsim.sensor.trajectory.velocities`).
+derivatives of the trajectories' curves (`lidarsim.sensor.trajectory.velocities`).
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from .motion import CastPoses
 from .surfaces import Surfaces
 
 VELOCITY = Purpose(40, "noise of a return's radial velocity")
-BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
+BLOCK_HITS = 1 << 13  # hits that are computed at a time, to fit a cache
 
 
 def approach(poses: CastPoses, ray: Integers, origins: Floats, directions: Floats) -> Floats:
-    """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
+    """Return the growth of the ranges of static points by the motion of the carrier, m/s: (n,).
 
-    Origins and unit directions are (n, 3), in the scene's axes.
+    Origins and unit directions of the rays are (n, 3), in the scene frame.
     """
-    out = np.zeros(len(ray))
+    rates = np.zeros(len(ray))
     if poses.carrier is None:
-        return out
+        return rates
     origins = np.broadcast_to(origins, directions.shape)
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
         drift = poses.drift(ray[block], origins[block])
-        out[block] = -products(drift.T, directions[block].T)
-    return out
+        rates[block] = -products(drift.T, directions[block].T)
+    return rates
 
 
 def radial_velocities(
@@ -50,32 +50,44 @@ def radial_velocities(
     Parameters
     ----------
     rays
-        Their origins and unit directions, (n, 3) each, in the scene's axes.
+        Origins and unit directions of the rays, (n, 3) each, in the scene frame.
     distance
-        (n,): where they end, metres; without noise.
+        (n,): lengths of the rays, metres; without noise.
     triangle
-        (n,): what they hit; what is in the air, -1, is at rest.
+        (n,): triangles at the ends; ends in the air, -1, are at rest.
     times
-        (n,): when they are fired, nanoseconds since the survey's start; for actors.
+        (n,): firing times, nanoseconds since the survey's start; for actors.
     """
     origins, directions = rays
-    out = approach(poses, ray, origins, directions)
-    if poses.ways:
-        velocity = velocities_of_ends(surfaces, poses.ways, rays, distance, triangle, times)
-        out += products(velocity.T, directions.T)
-    return out
+    rates = approach(poses, ray, origins, directions)
+    if poses.actor_trajectories:
+        velocity = velocities_of_ends(
+            surfaces, poses.actor_trajectories, rays, distance, triangle, times
+        )
+        rates += products(velocity.T, directions.T)
+    return rates
 
 
 def velocities_of_ends(
-    surfaces: Surfaces, ways: ActorTrajectories, rays: tuple[Floats, Floats], distance: Floats,
-    triangle: Ints32, times: Floats | Ints,
-) -> Floats:  # fmt: skip
-    """Return the velocities of where rays end, m/s: (n, 3); arguments as of `radial_velocities`."""
+    surfaces: Surfaces,
+    actor_trajectories: ActorTrajectories,
+    rays: tuple[Floats, Floats],
+    distance: Floats,
+    triangle: Ints32,
+    times: Floats | Ints,
+) -> Floats:
+    """Return the velocities of the surfaces at the ends of rays (n,), m/s: (n, 3).
+
+    `rays` are origins and unit directions (n, 3) in the scene frame; `distance` (n,) is in metres,
+    `times` (n,) are firing times in nanoseconds since the survey's start.
+    """
     directions = rays[1]
-    out = np.empty(rays[1].shape)
-    origins = np.broadcast_to(rays[0], out.shape)
-    for begin in range(0, len(out), BLOCK_HITS):
+    end_velocities = np.empty(rays[1].shape)
+    origins = np.broadcast_to(rays[0], end_velocities.shape)
+    for begin in range(0, len(end_velocities), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
         points = origins[block] + distance[block, None] * directions[block]
-        out[block] = surfaces.velocities(triangle[block], points, times[block], ways)
-    return out
+        end_velocities[block] = surfaces.velocities(
+            triangle[block], points, times[block], actor_trajectories
+        )
+    return end_velocities

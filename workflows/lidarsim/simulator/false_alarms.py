@@ -30,21 +30,21 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the receiver has false alarms."""
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `PulseStep.added`."""
+        """Return the mean number of false alarms while the receiver waits for a pulse."""
         return setup.noise.false_alarm_hz * setup.sensor.gate_s
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: a cause of each return, and rays."""
-        return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
+        """Return the memory of a cause for each return, and of the rays, in bytes."""
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the returns of a batch and the false alarms of its rays."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(rays)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.arrays import owned
+from ..base.arrays import Bools, Floats, owned
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
+from ..sensor import Fault
 from ..sensor.random_numbers import Purpose, uniform
 from .returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
@@ -15,7 +16,7 @@ PACKET = Purpose(61, "whether a packet is lost")
 
 
 class DirtStep(PulseStep):
-    """Takes energy from light that passes a dirty part of the window."""
+    """Weakens light that passes a dirty part of the window."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -24,36 +25,43 @@ class DirtStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the window of the sensor has dirt."""
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the hits with the energies behind the dirty window."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
-        share = np.ones(len(beams))
+        transmission = np.ones(len(beams))
         x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
-        for one in self.setup.faults("dirt").values():
-            begin, end = one.azimuth_deg or (0, 360)
-            half = ((end - begin) % 360 or 360) / 2
-            ends = begin + half, half, *(one.elevation_deg or (-90, 90))
-            sin, cos = sin_cos(np.radians(ends))
-            # Without angles of beams, which take long; a whole circle's sines are not exact.
-            there = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
-            there &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
-            if one.from_s or one.to_s is not None:
-                there &= one.during(batch.firings.times(beams))
-            share[there] *= required(one.transmission)
-        share = share.repeat(batch.each)
-        batch.hits, batch.air = (
-            one and one._replace(energy=required(one.energy) * share.take(one.ray))
-            for one in (returns, batch.air)
-        )
-        return required(batch.hits)
+        for fault in self.setup.faults("dirt").values():
+            in_spot = _in_spot(fault, x, y, z)
+            if fault.from_s or fault.to_s is not None:
+                in_spot &= fault.during(batch.firings.times(beams))
+            transmission[in_spot] *= required(fault.transmission)
+        transmission = transmission.repeat(batch.subrays_per_beam)
+        hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
+        batch.hits = hits
+        if batch.air is not None:
+            energy = required(batch.air.energy) * transmission.take(batch.air.ray)
+            batch.air = batch.air._replace(energy=energy)
+        return hits
+
+
+def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
+    """Return whether directions x, y, z (n,) pass the dirt of a fault: (n,)."""
+    begin, end = fault.azimuth_deg or (0, 360)
+    half = ((end - begin) % 360 or 360) / 2
+    lowest, highest = fault.elevation_deg or (-90, 90)
+    sin, cos = sin_cos(np.radians((begin + half, half, lowest, highest)))
+    # Computing the angles of beams would take long; sines of a full circle are not exact.
+    in_spot = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
+    in_spot &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
+    return in_spot
 
 
 class LossStep(PulseStep):
-    """Loses returns of dead channels and lost packets, and of scans that a frozen sensor lacks."""
+    """Drops returns of dead channels, lost packets, and scans that a frozen sensor has not made."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -62,31 +70,33 @@ class LossStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the sensor has dead channels, lost packets or frozen sweeps."""
         return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the returns that are not lost."""
         from . import fault_loops  # not before: numba takes half a second to import
 
         firings = batch.firings
         spec = batch.firings.spec
         seed = self.setup.noise.seed
-        before, now = spec.repeats or (spec.ahead, 0)
-        if spec.ahead != before - now:
+        repeated, current = spec.repeats or (spec.ahead, 0)
+        if spec.ahead != repeated - current:  # the sweep that is repeated lacks this scan
             return returns.take(np.zeros(0, np.intp))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
-        channel = np.zeros((len(faults), firings.sensor.channels), np.bool_)
-        firing = np.zeros((len(faults), len(firings.numbers)), np.bool_)
-        for row, (place, fault) in enumerate(faults.items()):
+        lost_channels = np.zeros((len(faults), firings.sensor.channels), np.bool_)
+        lost_firings = np.zeros((len(faults), len(firings.numbers)), np.bool_)
+        for row, (fault_number, fault) in enumerate(faults.items()):
             if fault.packet is None:
-                channel[row, required(fault.channels)] = True
+                lost_channels[row, required(fault.channels)] = True
             else:
                 packet = firings.numbers // fault.packet
-                drawn = uniform(seed, PACKET, spec.station, packet, place)
-                firing[row] = drawn < required(fault.share)
+                drawn = uniform(seed, PACKET, spec.station, packet, fault_number)
+                lost_firings[row] = drawn < required(fault.share)
         rows = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
-        count = fault_loops.remaining(ray, firings.times(ray), spans, firing, channel, rows)
+        count = fault_loops.remaining(
+            ray, firings.times(ray), spans, lost_firings, lost_channels, rows
+        )
         return returns if count == len(rows) else returns.take(rows[:count])

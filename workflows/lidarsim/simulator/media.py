@@ -34,143 +34,150 @@ from .surfaces import Surfaces
 
 LEAF = Purpose(30, "depth of leaves that light gets through")
 CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
-DEPTH = 8  # media around a place that are known at most
-PROBES_MOST = 256  # surfaces that a search for media around a place passes
-UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
+MAX_MEDIA = 8  # media around a point that are stored
+MAX_PROBES = 256  # surfaces that a search for the media around a point passes
+UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of the search; parallel to no edge of usual models
 
 # Random bits of rays for a purpose: (n,).
 Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
 class Rays(NamedTuple):
-    """Light of sub-rays that begins, and the trajectories of actors."""
+    """Light of sub-rays at its origin, and the trajectories of actors."""
 
     origins: Floats  # (n, 3)
     directions: Floats  # (n, 3)
     times: Floats  # (n,)
-    ways: ActorTrajectories
+    actor_trajectories: ActorTrajectories
 
 
 @dataclass
 class MediaStack:
-    """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
+    """Media around the light of sub-rays, the innermost first: (n, MAX_MEDIA); -1 for no medium."""
 
-    kinds: Ints32  # of their surfaces
-    triangles: Ints32  # where light came in
+    kinds: Ints32  # of the surfaces of the media
+    triangles: Ints32  # through which the light entered
 
     @classmethod
     def none(cls, count: int) -> MediaStack:
-        """Make them for light in the air."""
-        return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
+        """Return the stacks of light in the air."""
+        return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
     def __getitem__(self, rows: Integers) -> MediaStack:
-        """Select those of some sub-rays."""
+        """Return the stacks of selected sub-rays."""
         return MediaStack(self.kinds[rows], self.triangles[rows])
 
     def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Enter a medium each."""
-        for table, new in ((self.kinds, kinds), (self.triangles, triangles)):
+        """Add a medium within the media around light: a medium for each of `rows`."""
+        for table, values in ((self.kinds, kinds), (self.triangles, triangles)):
             table[rows, 1:] = table[rows, :-1]
-            table[rows, 0] = new
+            table[rows, 0] = values
 
     def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium each around those that are known; nothing where there are too many."""
-        place = (self.kinds[rows] >= 0).sum(axis=1)
-        free = place < DEPTH
-        self.kinds[rows[free], place[free]] = kinds[free]
-        self.triangles[rows[free], place[free]] = triangles[free]
+        """Add a medium around the media of each of `rows`; full stacks stay as they are."""
+        depth = (self.kinds[rows] >= 0).sum(axis=1)
+        free = depth < MAX_MEDIA
+        self.kinds[rows[free], depth[free]] = kinds[free]
+        self.triangles[rows[free], depth[free]] = triangles[free]
 
     def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Leave a medium each; returns which were known."""
-        same = self.kinds[rows] == kinds[:, None]
-        known = same.any(axis=1)
-        rows = rows[known]
-        place = same[known].argmax(axis=1)
-        column = np.arange(DEPTH)
-        column = column + (column >= place[:, None])
+        """Remove a medium from the stack of each of `rows`; return True where it was there."""
+        matches = self.kinds[rows] == kinds[:, None]
+        in_stack = matches.any(axis=1)
+        rows = rows[in_stack]
+        depth = matches[in_stack].argmax(axis=1)
+        column = np.arange(MAX_MEDIA)
+        column = column + (column >= depth[:, None])
         for table in (self.kinds, self.triangles):
             ended = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
             table[rows] = np.take_along_axis(ended, column, axis=1)
-        return known
+        return in_stack
 
 
 @dataclass
 class RayDifferentials:
-    """How the light of sub-rays has been bent and weakened: arrays (n, …)."""
+    """Refraction, attenuation and widening of the light of sub-rays: arrays (n, …)."""
 
-    index: Floats  # (n,): refractive index where it is
-    first: Floats  # (n,): and where it began
-    lost: Floats  # (n,): optical depth by attenuation, one way
-    places: Floats  # (n, 2, 3): derivatives of where it is, by its first direction
-    ways: Floats  # (n, 2, 3): and of where it goes
+    index: Floats  # (n,): refractive index at the light's position
+    initial_index: Floats  # (n,): refractive index at the light's origin
+    attenuation_depth: Floats  # (n,): optical depth by attenuation, one way
+    position_derivatives: Floats  # (n, 2, 3): of the position, by the initial direction
+    direction_derivatives: Floats  # (n, 2, 3): of the direction, by the initial direction
 
     @classmethod
-    def of(cls, directions: Floats, index: Floats) -> RayDifferentials:
-        """Make those of light that begins."""
-        ways = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
-        none = np.zeros(len(ways))
-        return cls(index.copy(), index, none, np.zeros_like(ways), ways)
+    def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
+        """Return the differentials of light at its origin, from directions (n, 3)."""
+        derivatives = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
+        none = np.zeros(len(derivatives))
+        return cls(index.copy(), index, none, np.zeros_like(derivatives), derivatives)
 
     def __getitem__(self, rows: Integers) -> RayDifferentials:
-        """Select those of some sub-rays."""
+        """Return the differentials of selected sub-rays."""
         return RayDifferentials(*selected(vars(self).values(), rows))
 
-    def go(self, step: Floats, attenuation: Floats) -> None:
-        """Go straight on so many metres (n,), where so much is lost, 1/m (n,)."""
-        self.places = self.places + step[:, None, None] * self.ways
-        self.lost = self.lost + attenuation * step
+    def advance(self, step: Floats, attenuation: Floats) -> None:
+        """Move the light straight on by steps (n,), metres, through an attenuation (n,), 1/m."""
+        shift = step[:, None, None] * self.direction_derivatives
+        self.position_derivatives = self.position_derivatives + shift
+        self.attenuation_depth = self.attenuation_depth + attenuation * step
 
-    def factor(self, directions: Floats, distance: Floats, extinction: float) -> Floats:
-        """Energy relative to that of light that went as far, straight through the air: (n,).
+    def energy_factor(self, directions: Floats, distance: Floats, extinction: float) -> Floats:
+        """Return the energy relative to light on a straight path of `distance` in the air: (n,).
 
-        Of light that is scattered at the end of a path, the receiver gets the share that its area
-        has of the cone's area there. By reciprocity, that area is that of the cone of the outgoing
-        light, times the square of the refractive index.
+        Light that is scattered at the end of a path reaches the receiver in proportion to the
+        receiver's area over the area of the cone of scattered light there. By reciprocity, the
+        latter is the area of the cone of the outgoing light, times the square of the refractive
+        index.
         """
-        one, other = self.places.transpose(1, 2, 0)
+        first_axis, second_axis = self.position_derivatives.transpose(1, 2, 0)
         a, b, c = directions.T
-        (x, y, z), (u, v, w) = one, other
+        x, y, z = first_axis
+        u, v, w = second_axis
         area = np.abs((y * w - z * v) * a + (z * u - x * w) * b + (x * v - y * u) * c)
-        area *= (self.index / self.first) ** 2
-        nearer = distance**2 / np.maximum(area, 1e-12)
-        # Where the air takes so much more than the media, its own factor is 0.
-        more = np.minimum(2 * (extinction * distance - self.lost), 700.0)
-        return np.asarray(nearer * exp(more))
+        area *= (self.index / self.initial_index) ** 2
+        spreading = distance**2 / np.maximum(area, 1e-12)
+        # Beyond the limit, the factor of the air itself is 0.
+        exponent = np.minimum(2 * (extinction * distance - self.attenuation_depth), 700.0)
+        return np.asarray(spreading * exp(exponent))
 
-    def turn(
-        self, before: Floats, after: Floats, normals: Floats, mirrored: Bools, index: Floats
+    def deflect(
+        self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools, index: Floats
     ) -> None:
-        """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
-        along, behind = (_aside(products(way.T, normals.T)) for way in (before, after))
-        # Each ray of a differentials arrives where it meets the plane.
-        shift = applied(self.places, normals) / along[:, None]
-        self.places = self.places - shift[..., None] * before[:, None]
+        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3).
+
+        `index` (n,) is the refractive index behind the surfaces, for light that is not mirrored.
+        """
+        incoming_cosine = _away_from_zero(products(incoming.T, normals.T))
+        outgoing_cosine = _away_from_zero(products(outgoing.T, normals.T))
+        # Neighbouring rays meet the plane of the surface before or behind the central ray.
+        shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
+        self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
-        bend = np.where(mirrored, 2.0, ratio - ratio**2 * along / behind)
-        slope = bend[:, None] * applied(self.ways, normals)
-        self.ways = ratio[:, None, None] * self.ways - slope[..., None] * normals[:, None]
+        bend = np.where(mirrored, 2.0, ratio - ratio**2 * incoming_cosine / outgoing_cosine)
+        slope = bend[:, None] * applied(self.direction_derivatives, normals)
+        derivatives = ratio[:, None, None] * self.direction_derivatives
+        self.direction_derivatives = derivatives - slope[..., None] * normals[:, None]
         self.index = np.where(mirrored, self.index, index)
 
 
 class Media:
-    """The media of a scene."""
+    """The media of a scene; `air_extinction` is the extinction of its air, 1/m."""
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air: float = 0.0
+        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air_extinction: float = 0.0
     ) -> None:
-        # its extinction, 1/m
         self._surfaces = surfaces
-        self.air = air
-        self.filled = table.leafy | table.refracts  # whether surfaces hold a medium
+        self.air_extinction = air_extinction
+        self.filled = table.leafy | table.refracts  # surfaces that enclose a medium
         self.leafy = bool(table.leafy.any())
-        self.bends = bool(table.refracts.any())
-        self.mirrors = table.refracts & (table.specular > 0)  # and where it is refracted
+        self.refracts = bool(table.refracts.any())
+        self.mirrors = table.refracts & (table.specular > 0)  # surfaces that refract and mirror
         self.grids = surfaces.grids
         self.instances = surfaces.instances
         owners = surfaces.material_kinds.object
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
-        # Of no surface, which has the number -1, nothing.
+        # The value of the kind -1, no surface, is 0: the last entry.
         self._area, self._index, self._attenuation = (
             np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
                                                   table.attenuation)
@@ -185,232 +192,289 @@ class Media:
                     "or a sphere."
                 )
         # Where sensors may be within media: an actor may be anywhere, and below a sheet is water.
-        stands = owners < len(scene.object_bounds)
-        standing = np.flatnonzero(self.filled & stands)
-        bounds = scene.object_bounds[owners[standing]]
-        bounds[~closed[standing], 0, 2] = -np.inf
-        if self.filled[~stands].any():
+        is_static = owners < len(scene.object_bounds)
+        static_kinds = np.flatnonzero(self.filled & is_static)
+        bounds = scene.object_bounds[owners[static_kinds]]
+        bounds[~closed[static_kinds], 0, 2] = -np.inf
+        if self.filled[~is_static].any():
             bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
         self._bounds = bounds
         for angle in self._angles if self.leafy else ():
-            projection(angle, np.ones(1))  # makes its table
+            projection(angle, np.ones(1))  # computes and caches the table of the angle
 
-    def sides(self, kinds: Ints32, along: Floats) -> Bools:
-        """Whether light enters surfaces, whose normals have the cosines `along` with it: (n,)."""
-        return np.asarray((along < 0) != self._inwards[kinds])
+    def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
+        """Return whether light enters bodies: (n,); `cosines` are between normals and light."""
+        return np.asarray((cosines < 0) != self._inwards[kinds])
 
-    def around(self, caster: SceneCaster, light: Rays) -> MediaStack:
-        """Find the media around the origins of light."""
-        found = MediaStack.none(len(light.origins))
-        within = np.zeros(len(light.origins), np.bool_)
-        if not len(within):
-            return found
-        least = light.origins.min(axis=0)
-        most = light.origins.max(axis=0)
-        near = ((self._bounds[:, 0] <= most) & (self._bounds[:, 1] >= least)).all(axis=1)
-        for low, high in self._bounds[near]:
-            within |= ((light.origins >= low) & (light.origins <= high)).all(axis=1)
-        rows = np.flatnonzero(within)
+    def stack_at(self, caster: SceneCaster, light: Rays) -> MediaStack:
+        """Return the media around the origins of light."""
+        stack = MediaStack.none(len(light.origins))
+        in_bounds = np.zeros(len(light.origins), np.bool_)
+        if not len(in_bounds):
+            return stack
+        lower = light.origins.min(axis=0)
+        upper = light.origins.max(axis=0)
+        overlapping = ((self._bounds[:, 0] <= upper) & (self._bounds[:, 1] >= lower)).all(axis=1)
+        for box_min, box_max in self._bounds[overlapping]:
+            in_bounds |= ((light.origins >= box_min) & (light.origins <= box_max)).all(axis=1)
+        rows = np.flatnonzero(in_bounds)
         if not len(rows):
-            return found
-        # Most rays start where the one before did.
+            return stack
+        # Most rays start at the same position and time as the ray before.
         origins = light.origins[rows]
         times = light.times[rows]
-        new = np.ones(len(rows), np.bool_)
-        new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
-        there = self._search(caster, origins[new], times[new], light.ways)
-        which = np.cumsum(new) - 1
-        found.kinds[rows] = there.kinds[which]
-        found.triangles[rows] = there.triangles[which]
-        return found
+        first_of_run = np.ones(len(rows), np.bool_)
+        first_of_run[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
+        searched = self._search(
+            caster, origins[first_of_run], times[first_of_run], light.actor_trajectories
+        )
+        search_rows = np.cumsum(first_of_run) - 1
+        stack.kinds[rows] = searched.kinds[search_rows]
+        stack.triangles[rows] = searched.triangles[search_rows]
+        return stack
 
     def _search(
-        self, caster: SceneCaster, origins: Floats, times: Floats, ways: ActorTrajectories
+        self,
+        caster: SceneCaster,
+        origins: Floats,
+        times: Floats,
+        actor_trajectories: ActorTrajectories,
     ) -> MediaStack:
-        """Look upwards: a medium that light leaves without having entered it is around it."""
-        surfaces = self._surfaces
-        around = MediaStack.none(len(origins))
+        """Find the media around origins (n, 3) by casting rays upwards.
+
+        A medium that a ray leaves without having entered it is around the origin of the ray.
+        """
+        surrounding = MediaStack.none(len(origins))
         entered = MediaStack.none(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
         rows = np.arange(len(origins))
-        away = caster.clear_m / up[2]
-        for _ in range(PROBES_MOST):
+        skip_m = caster.clear_m / up[2]
+        for _ in range(MAX_PROBES):
             if not len(rows):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
-            hits = caster.scan(light, now)
+            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            hits = caster.scan(light, poses)
             rows = rows[hits.ray]
             times = times[hits.ray]
-            origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
-            kinds = surfaces.kinds(hits.triangle)
-            normals = surfaces.normals(hits.triangle, times, ways)
-            media = self.filled[kinds]
-            comes = self.sides(kinds, products(normals.T, up[:, None])) & media
-            entered.enter(rows[comes], kinds[comes], hits.triangle[comes])
-            goes = np.flatnonzero(media & ~comes)
-            known = entered.leave(rows[goes], kinds[goes])
-            goes = goes[~known]
-            around.surround(rows[goes], kinds[goes], hits.triangle[goes])
-        return around
+            origins = origins[hits.ray] + (hits.distance[:, None] + skip_m) * up
+            normals = self._surfaces.normals(hits.triangle, times, actor_trajectories)
+            cosines = products(normals.T, up[:, None])
+            self._cross_probes(entered, surrounding, rows, hits.triangle, cosines)
+        return surrounding
 
-    def within(self, caster: SceneCaster, light: Rays, depths: Floats | None) -> LightInMedia:
-        """Return the state of light that begins; `depths` (n,) are those until a leaf."""
-        around = self.around(caster, light)
+    def _cross_probes(
+        self,
+        entered: MediaStack,
+        surrounding: MediaStack,
+        rows: Indices,
+        triangles: Ints32,
+        cosines: Floats,
+    ) -> None:
+        """Update the stacks of a search for probes `rows` that cross triangles."""
+        kinds = self._surfaces.kinds(triangles)
+        media = self.filled[kinds]
+        entering = self.enters(kinds, cosines) & media
+        entered.enter(rows[entering], kinds[entering], triangles[entering])
+        leaving = np.flatnonzero(media & ~entering)
+        was_entered = entered.leave(rows[leaving], kinds[leaving])
+        leaving = leaving[~was_entered]
+        surrounding.surround(rows[leaving], kinds[leaving], triangles[leaving])
+
+    def initial_state(
+        self, caster: SceneCaster, light: Rays, depths: Floats | None
+    ) -> LightInMedia:
+        """Return the state of light at its origin; `depths` (n,) are optical depths to a leaf."""
+        stack = self.stack_at(caster, light)
         differentials = (
-            RayDifferentials.of(light.directions, self.index(around)) if self.bends else None
+            RayDifferentials.from_directions(light.directions, self.index(stack))
+            if self.refracts
+            else None
         )
-        return LightInMedia(self, around, differentials, depths)
+        return LightInMedia(self, stack, differentials, depths)
 
-    def index(self, around: MediaStack) -> Floats:
-        """Refractive indices of the innermost media that have one: (n,)."""
-        indices = self._index[around.kinds]
+    def index(self, stack: MediaStack) -> Floats:
+        """Return the refractive index of the innermost medium with an index: (n,)."""
+        indices = self._index[stack.kinds]
         return _first(indices, indices > 0, 1.0)
 
-    def attenuation(self, around: MediaStack) -> Floats:
-        """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
-        refracts = self._index[around.kinds] > 0
-        return _first(self._attenuation[around.kinds], refracts, self.air)
+    def attenuation(self, stack: MediaStack) -> Floats:
+        """Return the extinction, 1/m: (n,): of the innermost refracting medium, or of the air."""
+        refracts = self._index[stack.kinds] > 0
+        return _first(self._attenuation[stack.kinds], refracts, self.air_extinction)
 
     def behind(
-        self, around: MediaStack, kinds: Ints32, triangles: Ints32, along: Floats
+        self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
-        """Media behind surfaces (n,), which light meets at the cosines `along`."""
-        behind = around[np.arange(len(kinds))]
-        enters = self.sides(kinds, along)
+        """Return the media behind surfaces (n,); `cosines` are between normals and light."""
+        behind = stack[np.arange(len(kinds))]
+        enters = self.enters(kinds, cosines)
         filled = self.filled[kinds]
-        comes = np.flatnonzero(filled & enters)
-        goes = np.flatnonzero(filled & ~enters)
-        behind.enter(comes, kinds[comes], triangles[comes])
-        behind.leave(goes, kinds[goes])
+        entering = np.flatnonzero(filled & enters)
+        leaving = np.flatnonzero(filled & ~enters)
+        behind.enter(entering, kinds[entering], triangles[entering])
+        behind.leave(leaving, kinds[leaving])
         return behind
 
-    def density(self, around: MediaStack, upright: Floats) -> Floats:
-        """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
-        density = self._area[around.kinds]
+    def density(self, stack: MediaStack, upright: Floats) -> Floats:
+        """Return the optical depth of leaves per metre, in each medium around light.
+
+        `upright` (n,) are the vertical parts of the light's directions. Returns (n, MAX_MEDIA).
+        """
+        density = self._area[stack.kinds]
         if density.any():
             for number, angle in enumerate(self._angles):
                 crossing = projection(angle, upright)[:, None]
-                density *= np.where(self._angle[around.kinds] == number, crossing, 1)
+                density *= np.where(self._angle[stack.kinds] == number, crossing, 1)
         return density
 
-    def bright(self, kinds: Ints32, upright: Floats) -> Floats:
-        """Mean cosine between light and the leaves of surfaces (n,) that it meets: (n,)."""
-        out = np.ones(len(kinds))
+    def leaf_cosines(self, kinds: Ints32, upright: Floats) -> Floats:
+        """Return the mean cosine between light and the leaves of crowns of kinds (n,): (n,)."""
+        cosines = np.ones(len(kinds))
         for number, angle in enumerate(self._angles):
-            out = np.where(self._angle[kinds] == number, brightness(angle, upright), out)
-        return out
+            cosines = np.where(self._angle[kinds] == number, brightness(angle, upright), cosines)
+        return cosines
+
+
+class GridPassage(NamedTuple):
+    """Passage of light through grids of voxels: arrays (k,)."""
+
+    rows: Indices  # of the light
+    metres: Floats  # to the leaf that the light meets; inf if there is no leaf
+    remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
+
+
+class Refraction(NamedTuple):
+    """Light behind surfaces: arrays (n,), vectors (n, 3)."""
+
+    directions: Floats
+    shares: Floats | float  # of the energy: transmitted, or mirrored where light is reflected
+    totally_reflected: Bools  # with directions as if there were no surface
 
 
 class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
     rows: Indices  # of the light
-    metres: Floats  # how far it gets
-    triangles: Ints32  # where it came into the crown
-    cosines: Floats  # mean ones between light and leaves
+    metres: Floats  # from the start of the span to the leaf
+    triangles: Ints32  # through which the light entered the crown
+    cosines: Floats  # mean cosine between light and leaves
 
 
 @dataclass
 class LightInMedia:
-    """Light on its way through media: those around it, and what they do to it."""
+    """State of light in media: stack of media, refraction, and optical depth to a leaf."""
 
     media: Media
-    around: MediaStack
-    differentials: RayDifferentials | None  # None if nothing refracts
-    left: Floats | None  # (n,): optical depth until a leaf; None if there are none
+    stack: MediaStack
+    differentials: RayDifferentials | None  # None if no medium refracts
+    remaining_depth: Floats | None  # (n,): optical depth to a leaf; None if there are no leaves
 
     def __getitem__(self, rows: Integers) -> LightInMedia:
-        """Select that of some sub-rays."""
+        """Return the state of selected sub-rays."""
         return LightInMedia(
-            self.media, *selected((self.around, self.differentials, self.left), rows)
+            self.media, *selected((self.stack, self.differentials, self.remaining_depth), rows)
         )
 
     @property
     def index(self) -> Floats | float:
-        """Refractive index where it is."""
+        """Refractive index at the position of the light."""
         return 1.0 if self.differentials is None else self.differentials.index
 
     def optical(self, step: Floats) -> Floats:
-        """Optical paths of so many metres (n,)."""
+        """Return the optical paths of steps (n,), metres."""
         return step if self.differentials is None else step * self.differentials.index
 
-    def meet(
+    def meet_leaves(
         self,
         origins: Floats,
         directions: Floats,
-        span: tuple[Floats, Floats],
+        starts_m: Floats,
+        ends_m: Floats,
         ray: Ints,
         draw: Draw,
     ) -> Leaves:
-        """Find which light meets a leaf within a span of its way, metres from its origin (n,)."""
-        if self.left is None:
+        """Return the leaves that light meets between distances from its origins, metres (n,)."""
+        if self.remaining_depth is None:
             none = np.zeros(0, np.intp)
             return Leaves(none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
         upright = np.minimum(np.abs(directions[:, 2]), 1)
-        density = self.media.density(self.around, upright)
-        length = span[1] - span[0]
-        among = None
+        density = self.media.density(self.stack, upright)
+        length = ends_m - starts_m
+        passage = None
         if self.media.grids is not None:
-            among = self._among_voxels(origins + span[0][:, None] * directions, directions, length,
-                                       density)  # fmt: skip
-        sums = np.cumsum(density, axis=1)
-        total = sums[:, -1]
-        depth = total * length
-        if among is not None:
-            there, far, rest = among
-            depth[there] = self.left[there] - rest
-        rows = np.flatnonzero(depth > self.left)
-        metres = self.left[rows] / total[rows]
-        if among is not None:
-            ends = np.full(len(depth), np.nan)
-            ends[there] = far
-            metres = np.where(np.isnan(ends[rows]), metres, ends[rows])
-        self.left = self.left - depth
-        # Where crowns overlap, a leaf is of one of them in proportion to its density.
-        share = (draw(CROWN, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
-        place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
-        cosines = self.media.bright(self.around.kinds[rows, place], upright[rows])
-        return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
+            starts = origins + starts_m[:, None] * directions
+            passage = self._pass_grids(starts, directions, length, density)
+        cumulative = np.cumsum(density, axis=1)
+        rows, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
+        layer = _crown_layers(draw(CROWN, ray[rows]), cumulative[rows])
+        cosines = self.media.leaf_cosines(self.stack.kinds[rows, layer], upright[rows])
+        return Leaves(rows, metres, self.stack.triangles[rows, layer], cosines)
 
-    def _among_voxels(
+    def _advance_to_leaves(
+        self, density: Floats, length: Floats, passage: GridPassage | None
+    ) -> tuple[Indices, Floats]:
+        """Reduce the remaining depth over lengths (n,), metres, of a density (n,), 1/m.
+
+        Returns the rows of light that meets a leaf, and the metres to the leaf.
+        """
+        assert self.remaining_depth is not None
+        depth = density * length
+        if passage is not None:
+            in_grids = passage.rows
+            depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
+        rows = np.flatnonzero(depth > self.remaining_depth)
+        metres = self.remaining_depth[rows] / density[rows]
+        if passage is not None:
+            metres_in_grids = np.full(len(depth), np.nan)
+            metres_in_grids[passage.rows] = passage.metres
+            metres = np.where(np.isnan(metres_in_grids[rows]), metres, metres_in_grids[rows])
+        self.remaining_depth = self.remaining_depth - depth
+        return rows, metres
+
+    def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
-    ) -> tuple[Indices, Floats, Floats]:
-        """Take light through grids, and put their optical depths for a metre into `density`.
+    ) -> GridPassage:
+        """Follow light through grids of voxels, and write their densities into `density`.
 
-        Those that it has are for a density of 1. Returns the rows of light in grids, how far it
-        gets, and the optical depth that is left then, as of `Grids.through`.
+        Before, `density` (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area
+        density of 1; afterwards, for the density of the grids.
         """
         grids = self.media.grids
-        around = self.around
-        assert grids is not None and self.left is not None
-        gridded = self.media.gridded[around.kinds]
+        stack = self.stack
+        assert grids is not None and self.remaining_depth is not None
+        gridded = self.media.gridded[stack.kinds]
         rows = np.flatnonzero(gridded.any(axis=1))
         gridded = gridded[rows]
-        place = np.argsort(~gridded, axis=1, kind="stable")
-        place = place[:, : gridded.sum(axis=1).max(initial=1)]
-        used = np.take_along_axis(gridded, place, axis=1)
-        triangles = np.take_along_axis(around.triangles[rows], place, axis=1)
-        which = np.where(used, self.media.instances(triangles), -1)
-        crossing = np.take_along_axis(density[rows], place, axis=1)
-        own = np.where(gridded, 0, density[rows])
-        even = np.cumsum(own, axis=1)[:, -1]
-        given = which, starts[rows], directions[rows], crossing, even, length[rows], self.left[rows]
-        metres, rest, found = grids.through(*given)
-        np.put_along_axis(own, place, np.where(used, found, np.take_along_axis(own, place, 1)), 1)
-        density[rows] = own
-        return rows, metres, rest
+        layers = np.argsort(~gridded, axis=1, kind="stable")
+        layers = layers[:, : gridded.sum(axis=1).max(initial=1)]
+        used = np.take_along_axis(gridded, layers, axis=1)
+        triangles = np.take_along_axis(stack.triangles[rows], layers, axis=1)
+        row_density = np.where(gridded, 0, density[rows])
+        metres, remaining_depth, grid_density = grids.through(
+            np.where(used, self.media.instances(triangles), -1),
+            starts[rows],
+            directions[rows],
+            np.take_along_axis(density[rows], layers, axis=1),
+            np.cumsum(row_density, axis=1)[:, -1],
+            length[rows],
+            self.remaining_depth[rows],
+        )
+        layer_density = np.where(used, grid_density, np.take_along_axis(row_density, layers, 1))
+        np.put_along_axis(row_density, layers, layer_density, 1)
+        density[rows] = row_density
+        return GridPassage(rows, metres, remaining_depth)
 
-    def go(self, step: Floats) -> None:
-        """Go straight on so many metres (n,)."""
+    def advance(self, step: Floats) -> None:
+        """Move the light straight on by steps (n,), metres."""
         if self.differentials is not None:
-            self.differentials.go(step, self.media.attenuation(self.around))
+            self.differentials.advance(step, self.media.attenuation(self.stack))
 
-    def factor(self, directions: Floats, distance: Floats) -> Floats | float:
-        """Energy relative to that of light that went as far, straight through the air: (n,)."""
+    def energy_factor(self, directions: Floats, distance: Floats) -> Floats | float:
+        """Return the energy relative to light on a straight path of `distance` in the air: (n,)."""
         if self.differentials is None:
             return 1.0
-        return self.differentials.factor(directions, distance, self.media.air)
+        return self.differentials.energy_factor(directions, distance, self.media.air_extinction)
 
     def cross(
         self,
@@ -418,62 +482,67 @@ class LightInMedia:
         triangles: Ints32,
         directions: Floats,
         normals: Floats,
-        along: Floats,
-        off: Bools,
-    ) -> tuple[Floats, Floats | float, Bools]:
-        """Take light through surfaces (n,), which it meets at the cosines `along`, or `off` them.
+        cosines: Floats,
+        reflected: Bools,
+    ) -> Refraction:
+        """Transmit light through surfaces (n,), or reflect the light of the mask `reflected`.
 
-        Returns
-        -------
-        Directions behind them (n, 3), shares of light that pass, or are mirrored where light is
-        refracted (n,), and whether all is reflected, with directions as if there were no surface.
+        `cosines` are between normals and directions. Reflected light keeps its direction here.
         """
-        before = self.around
-        self.around = self.media.behind(self.around, kinds, triangles, along)
+        outer = self.stack
+        self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
         if self.differentials is None:
-            return directions, 1.0, np.zeros(len(kinds), np.bool_)
-        ratio = self.media.index(self.around) / self.differentials.index
-        ahead, passes, whole = refracted(directions, normals, along, ratio)
-        stays = whole | off
-        self.around.kinds[stays] = before.kinds[stays]
-        self.around.triangles[stays] = before.triangles[stays]
-        bends = self.media.mirrors[kinds]
-        passes = np.where(whole & bends, 0.0, passes)
-        passes = np.where(off, np.where(bends, 1 - passes, 1.0), passes)
-        return np.where(off[:, None], directions, ahead), passes, whole
+            return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
+        ratio = self.media.index(self.stack) / self.differentials.index
+        behind = refracted(directions, normals, cosines, ratio)
+        stays = behind.totally_reflected | reflected
+        self.stack.kinds[stays] = outer.kinds[stays]
+        self.stack.triangles[stays] = outer.triangles[stays]
+        mirrors = self.media.mirrors[kinds]
+        shares = np.where(behind.totally_reflected & mirrors, 0.0, behind.shares)
+        shares = np.where(reflected, np.where(mirrors, 1 - shares, 1.0), shares)
+        outgoing = np.where(reflected[:, None], directions, behind.directions)
+        return Refraction(outgoing, shares, behind.totally_reflected)
 
-    def turn(self, before: Floats, after: Floats, normals: Floats, mirrored: Bools) -> None:
-        """Turn the bundles at flat surfaces, from directions (n, 3) to others."""
+    def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
+        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3)."""
         if self.differentials is not None:
-            self.differentials.turn(before, after, normals, mirrored, self.media.index(self.around))
+            self.differentials.deflect(
+                incoming, outgoing, normals, mirrored, self.media.index(self.stack)
+            )
 
 
-def refracted(
-    directions: Floats, normals: Floats, along: Floats, ratio: Floats
-) -> tuple[Floats, Floats, Bools]:
-    """Take light through surfaces by Snell's law; `ratio` (n,) is the index behind over before.
+def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
+    """Refract light at surfaces by Snell's law; `ratio` (n,) is the index behind over before.
 
-    Returns
-    -------
-    Directions behind them (n, 3), shares of light that pass (n,), and whether all is reflected,
-    with directions and shares as if there were no surface.
+    Totally reflected light has the direction and share that it would have without a surface.
     """
-    steep = np.maximum(np.abs(along), 1e-9)
-    inside = 1 - (1 - steep**2) / ratio**2
+    cosine = np.maximum(np.abs(cosines), 1e-9)
+    squared_cosine = 1 - (1 - cosine**2) / ratio**2
     bends = ratio != 1
-    whole = bends & (inside <= 0)
-    bends &= ~whole
-    against = np.where(along < 0, 1.0, -1.0)[:, None] * normals
-    root = np.sqrt(np.maximum(inside, 0))
-    bent = directions / ratio[:, None] + (steep / ratio - root)[:, None] * against
-    passes = np.where(bends, 1 - fresnel(steep, ratio), 1.0)
-    return np.where(bends[:, None], bent, directions), passes, whole
+    totally_reflected = bends & (squared_cosine <= 0)
+    bends &= ~totally_reflected
+    facing = np.where(cosines < 0, 1.0, -1.0)[:, None] * normals
+    root = np.sqrt(np.maximum(squared_cosine, 0))
+    bent = directions / ratio[:, None] + (cosine / ratio - root)[:, None] * facing
+    transmitted = np.where(bends, 1 - fresnel(cosine, ratio), 1.0)
+    outgoing = np.where(bends[:, None], bent, directions)
+    return Refraction(outgoing, transmitted, totally_reflected)
+
+
+def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
+    """Choose the crown of each leaf in proportion to the crowns' densities, by random bits (k,).
+
+    `cumulative` (k, MAX_MEDIA) are cumulative sums of densities. Returns indices in the stack.
+    """
+    share = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
 
 
 def depths(bits: NDArray[np.uint64]) -> Floats:
-    """Exponentially distributed numbers of mean 1, from random bits: (n,).
+    """Return exponentially distributed numbers of mean 1, from random bits: (n,).
 
-    By the number of halvings and a table of 32,768 logarithms, which is fast.
+    The logarithm is computed from the binary exponent and a table of 32,768 logarithms: fast.
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     part, halvings = np.frexp(share)
@@ -483,18 +552,18 @@ def depths(bits: NDArray[np.uint64]) -> Floats:
 
 @cache
 def _logs() -> Floats:
-    """Logarithms of equal steps from 1/2 to 1, with the sign changed, in single precision."""
+    """Return negative logarithms of equal steps from 1/2 to 1, in single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
 
 
-def _aside(cosine: Floats) -> Floats:
-    """Keep cosines away from 0."""
+def _away_from_zero(cosine: Floats) -> Floats:
+    """Replace cosines close to 0 by 1e-9."""
     return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
 
 
-def _first(values: Floats, wanted: AnyArray, default: float) -> Floats:
-    """Return the first wanted value of each row, or a default: (n,)."""
-    place = wanted.argmax(axis=1)
+def _first(values: Floats, mask: AnyArray, default: float) -> Floats:
+    """Return the first value of each row that is in the mask, or a default: (n,)."""
+    column = mask.argmax(axis=1)
     rows = np.arange(len(values))
-    return np.where(wanted[rows, place], values[rows, place], default)
+    return np.where(mask[rows, column], values[rows, column], default)

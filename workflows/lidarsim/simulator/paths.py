@@ -1,6 +1,6 @@
-"""Paths of light: casts sub-rays, and follows their light through glass and off mirrors.
+"""Paths of light: casts sub-rays, and follows the light through glass and off mirrors.
 
-Where a surface does both, or scatters light as well, the light is divided, and each part goes on.
+A surface that mirrors, transmits and scatters light divides it; the parts continue separately.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..sensor.random_numbers import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .actor_trajectories import ActorTrajectories
 from .doppler import approach, velocities_of_ends
-from .media import CROWN, LEAF, Draw, LightInMedia, Media, Rays, depths
+from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
 from .motion import CastPoses, Clock, along_rings
 from .returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
@@ -29,98 +29,109 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
 GHOST = CAUSES.index("ghost")
-PASSES_MOST = 16  # surfaces that light passes before it is dropped
-LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
-MIRRORED_MOST = 2  # times that light is mirrored, of which each may divide it
+MAX_PASSES = 16  # surfaces that light passes before it is dropped
+MAX_LEAFY_PASSES = 64  # if there are crowns: light passes the surface of a crown twice
+MAX_REFLECTIONS = 2  # of light, which a mirror may divide each time
 
 
 @dataclass
 class LightPaths:
-    """The light of sub-rays on its way: arrays (n,), vectors (n, 3)."""
+    """Light of sub-rays on its path: arrays (n,), vectors (n, 3)."""
 
     ray: Ints  # number of the sub-ray
     times: Floats
     origins: Floats
     directions: Floats
-    share: Floats  # that comes back, but for what the last surface scatters
-    before: Floats  # optical path up to the origin
-    # What mirrors did to the directions so far, (n, 3, 3), if there are any.
-    turns: Floats | None = None
-    mirrored: Bytes | None = None  # how many times it was, if there are mirrors
-    within: LightInMedia | None = None  # if there are media
-    # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
+    share: Floats  # of the energy that returns, without the scattering of the last surface
+    optical_start: Floats  # optical path up to the origin
+    # Products of the reflections so far, (n, 3, 3), if there are mirrors.
+    mirror_matrices: Floats | None = None
+    mirrored: Bytes | None = None  # number of reflections so far, if there are mirrors
+    in_media: LightInMedia | None = None  # if there are media
+    # Growth of the optical path, m/s, without the motion of its end, if there are velocities.
     range_rate: Floats | None = None
 
     def take(self, rows: Integers) -> LightPaths:
-        """Return the light of some rows."""
+        """Return the light of selected rows."""
         return LightPaths(*selected(vars(self).values(), rows))
 
-    def optical_end(self, step: Floats) -> Floats:
-        """Return the optical paths up to so many metres from the origins: (n,)."""
-        return self.before + (step if self.within is None else self.within.optical(step))
+    def optical_end(self, step_m: Floats) -> Floats:
+        """Return the optical paths up to distances (n,) from the origins, metres: (n,)."""
+        return self.optical_start + (
+            step_m if self.in_media is None else self.in_media.optical(step_m)
+        )
 
     @property
     def index(self) -> Floats | float:
         """Refractive index around the light."""
-        return 1.0 if self.within is None else self.within.index
+        return 1.0 if self.in_media is None else self.in_media.index
 
 
 class CastLight(NamedTuple):
-    """Light, and the surfaces that end it: arrays (n,)."""
+    """Light and the surfaces at its end: arrays (n,)."""
 
     light: LightPaths
-    clear: Floats  # where light is first, metres from the origin
-    step: Floats  # where the surface is, metres from the origin
+    start_m: Floats  # where a hit may be at the nearest, metres from the origin
+    step_m: Floats  # distance of the surface from the origin, metres
     triangle: Ints32
 
 
-class MetSurfaces(NamedTuple):
-    """How light meets surfaces and leaves: arrays (n,), vectors (n, 3)."""
+class SurfaceHits(NamedTuple):
+    """Hits of light on surfaces and leaves: arrays (n,), vectors (n, 3)."""
 
-    step: Floats  # metres from the origin
+    step_m: Floats  # metres from the origin
     triangle: Ints32
     distance: Floats  # optical path
     colour: UInts32 | None
     normals: Floats
-    along: Floats  # cosines of the angles between normals and directions, of either sign
+    cosines: Floats  # of the angles between normals and directions, of either sign
     kinds: Ints32  # rows of the table of materials
     energy: Floats  # received
     film: Bools | None  # whether there may be a film of water
     leaves: Indices  # rows where light meets a leaf within a crown
-    moved: Floats  # velocities of the surfaces; (0, 3) if they are not asked for
+    velocities: Floats  # of the surfaces; (0, 3) if they are not needed
 
 
-class SeenHits(NamedTuple):
-    """Hits that light makes at the surfaces that it meets, and where the light goes on."""
+class VisibleHits(NamedTuple):
+    """Hits that the sensor may see, and the surfaces from which light continues."""
 
     hits: PulseReturns
     normals: Floats  # (k, 3): of the hits, as the sensor sees them
-    passes: Bools  # (n,): whether light goes on through a surface
-    mirrors: Bools  # (n,): whether light goes on off a surface
+    transmits: Bools  # (n,): whether light continues through a surface
+    mirrors: Bools  # (n,): whether a surface mirrors light
 
 
-class LightEnds(NamedTuple):
-    """Surfaces that light goes through, or off: arrays (n,), vectors (n, 3)."""
+class Crossings(NamedTuple):
+    """Surfaces that transmit or mirror light: arrays (n,), vectors (n, 3)."""
 
-    step: Floats  # metres from the origin
+    step_m: Floats  # metres from the origin
     distance: Floats  # optical path
     triangle: Ints32
     normals: Floats
-    along: Floats  # cosines of the angles between normals and directions, of either sign
-    off: Bools  # whether the light goes off the surface
-    moved: Floats | None  # velocities of the surfaces: where one bends light, its path grows
+    cosines: Floats  # of the angles between normals and directions, of either sign
+    reflected: Bools  # whether the surface mirrors the light
+    velocities: Floats | None  # of the surfaces: a moving surface that bends light shifts the range
+
+
+class Deflection(NamedTuple):
+    """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
+
+    directions: Floats
+    share: Floats  # of the energy that returns
+    mirrored: Bools  # whether light is mirrored, also by total reflection
+    twice_normals: Floats  # normals times 2 where light is mirrored, else 0
 
 
 class OnwardLight(NamedTuple):
-    """Light behind the surfaces that it met: arrays (n,)."""
+    """Light behind the surfaces of its last hits: arrays (n,)."""
 
     light: LightPaths
-    clear: Floats  # where the surfaces are, metres from the origins, at or below 0
+    start_m: Floats  # distances of the surfaces from the origins, metres, at or below 0
     path: Pattern
 
 
 class CastStep(PulseStep):
-    """Finds where the light of sub-rays returns from."""
+    """Casts the sub-rays, and makes hits of the surfaces that their light meets."""
 
     role = Role.FRAME
     effects = (
@@ -141,44 +152,49 @@ class CastStep(PulseStep):
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
-        # Ghosts that can return less are left out.
+        # Ghosts of less energy are left out.
         self._faintest = FAINTEST * setup.noise.threshold
         white = np.ones(len(table.reflectance))
         self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
-        # Whether it matters where rays start, and not only where they go.
-        self._placed = self._coloured or setup.moving or setup.passing or self._media is not None
+        # Whether the origins of rays are needed, and not only their directions.
+        self._needs_origins = (
+            self._coloured
+            or setup.has_velocities
+            or setup.has_onward_light
+            or self._media is not None
+        )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
-        return setup.several
+        """Return True if a ray may have several returns, or no return."""
+        return setup.has_several_returns
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `PulseStep.added`: ghosts, if all around is there to be mirrored."""
-        return MIRRORED_MOST * setup.mirroring
+        """Return the greatest number of ghosts of a pulse: each reflection may add a ghost."""
+        return MAX_REFLECTIONS * setup.has_mirrors
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: sub-rays, more where light goes on or is bent, and returns."""
-        subray = 200 if not setup.passing else 1350 if setup.refracting else 650
-        casting = (subray + 200 * setup.moving) * sizes.subrays + 30 * sizes.returns
+        """Return the memory of sub-rays and hits, which is more if light continues or is bent."""
+        subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
+        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
         return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the hits of the sub-rays of a batch; `returns` are not used."""
         cast, rays = self._cast_first(batch)
         first_light = cast.light
-        parts: list[SeenHits] = []
-        for _ in range(LEAFY_PASSES_MOST if self._leafy else PASSES_MOST):
-            met = self._meet(cast, batch)
-            parts.append(self._see(cast.light, met))
-            onward = self._go_on(cast.light, met, parts[-1], batch.each)
+        parts: list[VisibleHits] = []
+        for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
+            surface_hits = self._meet(cast, batch)
+            parts.append(self._see(cast.light, surface_hits))
+            onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
             if onward is None:
                 break
-            cast = self._cast_again(onward, batch.here.ways)
+            cast = self._cast_again(onward, batch.subray_poses.actor_trajectories)
         return self._join(batch, parts, rays, first_light)
 
     @property
@@ -187,10 +203,10 @@ class CastStep(PulseStep):
         return self._media is not None and self._media.leafy
 
     @property
-    def _reach(self) -> float:
-        """How far rays are cast, metres.
+    def _reach_m(self) -> float:
+        """Length of cast rays, metres.
 
-        How far light goes in a crown depends on the other side of the crown, however far that is.
+        The way through a crown ends at the far side of the crown, at any distance.
         """
         return np.inf if self._leafy else self.setup.sensor.max_range_m
 
@@ -198,259 +214,390 @@ class CastStep(PulseStep):
         """Return the function that draws random bits of sub-rays for a purpose."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
-            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.each)
-            return raw(self._seed, purpose, scan, number, ray % batch.each)
+            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
+            return raw(self._seed, purpose, scan, number, ray % batch.subrays_per_beam)
 
         return draw
 
-    def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
-        """Cast the sub-rays of a batch; returns the light that meets something, and all rays.
+    # -- the first cast ----------------------------------------------------------------------
 
-        The rays are origins, if these matter, and directions, (6, n) or (3, n).
+    def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
+        """Cast the sub-rays of a batch; return the light that hits a surface, and all rays.
+
+        The rays are origins, if they are needed, and directions: (6, n) or (3, n).
         """
-        setup = self.setup
-        poses = batch.here
+        poses = batch.subray_poses
         first, stop = batch.window
-        nearest_m = setup.sensor.min_range_m
-        rays = np.empty((6 if self._placed or poses.ways else 3, stop - first))
+        nearest_m = self.setup.sensor.min_range_m
+        rows = 6 if self._needs_origins or poses.actor_trajectories else 3
+        rays = np.empty((rows, stop - first))
         hits = self.caster.scan(
-            batch.beams, poses, window=batch.window, t_min=nearest_m, t_max=self._reach, room=rays
+            batch.beams,
+            poses,
+            window=batch.window,
+            t_min=nearest_m,
+            t_max=self._reach_m,
+            room=rays,
         )
-        ray = hits.ray.astype(np.int64)
+        light = self._light_of_rays(hits.ray.astype(np.int64), rays, batch)
+        start_m = np.full(len(light.ray), nearest_m)
+        return CastLight(light, start_m, hits.distance, hits.triangle), rays
+
+    def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
+        """Return the light of rays that hit a surface, at the sensor."""
+        setup = self.setup
+        poses = batch.subray_poses
         directions = rays[-3:].take(ray, axis=1).T
         origins = np.broadcast_to(np.zeros(3), directions.shape)
-        if self._placed:
+        if self._needs_origins:
             origins = rays[:3].take(ray, axis=1).T
         count = len(ray)
         times = poses.times(ray)
         light = LightPaths(ray, times, origins, directions, np.ones(count), np.zeros(count))
         media = self._media
-        if setup.moving:
+        if setup.has_velocities:
             light.range_rate = approach(poses, ray, origins, directions)
-        if setup.mirroring:
+        if setup.has_mirrors:
             light.mirrored = np.zeros(count, np.uint8)
-        if batch.each > 1 and (setup.mirroring or (media is not None and media.bends)):
-            light.turns = np.broadcast_to(np.eye(3), (count, 3, 3))
+        deflected = setup.has_mirrors or (media is not None and media.refracts)
+        if batch.subrays_per_beam > 1 and deflected:
+            light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
-            left = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
-            media_rays = Rays(origins, directions, times, poses.ways)
-            light.within = media.within(self.caster, media_rays, left)
-        clear = np.full(count, nearest_m)
-        return CastLight(light, clear, hits.distance, hits.triangle), rays
+            leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
+            media_rays = Rays(origins, directions, times, poses.actor_trajectories)
+            light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
+        return light
 
-    def _meet(self, cast: CastLight, batch: PulseBatch) -> MetSurfaces:
-        """Find how light meets surfaces, or leaves and media before them."""
+    # -- hits --------------------------------------------------------------------------------
+
+    def _meet(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
+        """Return the hits of light on surfaces, or on leaves before the surfaces."""
         surfaces = self.surfaces
-        ways = batch.here.ways
-        light, clear, step, triangle = cast
-        within = light.within
-        leaves = np.zeros(0, np.intp)
-        if within is not None:
-            span = (clear, step)
-            met = within.meet(light.origins, light.directions, span, light.ray, self._draw(batch))
-            leaves = met.rows
-            step = step.copy()
-            step[leaves] = clear[leaves] + met.metres
-            triangle = triangle.copy()
-            triangle[leaves] = met.triangles
-        distance = light.optical_end(step)
+        actor_trajectories = batch.subray_poses.actor_trajectories
+        light = cast.light
+        cast, leaves = self._meet_leaves(cast, batch)
+        step_m = cast.step_m
+        triangle = cast.triangle
+        distance = light.optical_end(step_m)
         colour = None
         if self._coloured:
-            points = light.origins + step[:, None] * light.directions
-            colour = surfaces.colours(triangle, points, light.times, ways)
-        normals, along, kinds, energy, film = surfaces.lit(
-            triangle, light.directions, distance, self._light, light.times, ways, colour
+            points = light.origins + step_m[:, None] * light.directions
+            colour = surfaces.colours(triangle, points, light.times, actor_trajectories)
+        normals, cosines, kinds, energy, film = surfaces.lit(
+            triangle,
+            light.directions,
+            distance,
+            self._light,
+            light.times,
+            actor_trajectories,
+            colour,
         )
-        if len(leaves):
-            normals[leaves] = light.directions[leaves]  # no leaf continues another
-            leaf_colour = None if colour is None else colour[leaves]
-            energy[leaves] = surfaces.energy(
-                triangle[leaves], met.cosines, distance[leaves], self._light, leaf_colour
-            )
+        if leaves is not None and len(leaves.rows):
+            normals[leaves.rows] = light.directions[leaves.rows]  # no leaf continues another leaf
+            energy[leaves.rows] = self._leaf_energy(leaves, triangle, distance, colour)
         energy *= light.share
-        if within is not None:
-            within.go(step)
-            energy *= within.factor(light.directions, distance)
-        moved = np.zeros((0, 3))
-        if light.range_rate is not None:
-            rays = light.origins, light.directions
-            moved = velocities_of_ends(surfaces, ways, rays, step, triangle, light.times)
-        return MetSurfaces(
-            step, triangle, distance, colour, normals, along, kinds, energy, film, leaves, moved
+        if light.in_media is not None:
+            light.in_media.advance(step_m)
+            energy *= light.in_media.energy_factor(light.directions, distance)
+        return SurfaceHits(
+            step_m,
+            triangle,
+            distance,
+            colour,
+            normals,
+            cosines,
+            kinds,
+            energy,
+            film,
+            np.zeros(0, np.intp) if leaves is None else leaves.rows,
+            self._velocities(light, step_m, triangle, actor_trajectories),
         )
 
-    def _see(self, light: LightPaths, met: MetSurfaces) -> SeenHits:
-        """Return the hits of light at surfaces, and where the light goes on."""
+    def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
+        """Move the ends of light that meets a leaf to the leaf; None if there are no media."""
+        light = cast.light
+        if light.in_media is None:
+            return cast, None
+        leaves = light.in_media.meet_leaves(
+            light.origins,
+            light.directions,
+            cast.start_m,
+            cast.step_m,
+            light.ray,
+            self._draw(batch),
+        )
+        step_m = cast.step_m.copy()
+        step_m[leaves.rows] = cast.start_m[leaves.rows] + leaves.metres
+        triangle = cast.triangle.copy()
+        triangle[leaves.rows] = leaves.triangles
+        return cast._replace(step_m=step_m, triangle=triangle), leaves
+
+    def _leaf_energy(
+        self, leaves: Leaves, triangle: Ints32, distance: Floats, colour: UInts32 | None
+    ) -> Floats:
+        """Return the energies received from leaves (k,), from the arrays (n,) of all hits."""
+        rows = leaves.rows
+        leaf_colour = None if colour is None else colour[rows]
+        return self.surfaces.energy(
+            triangle[rows], leaves.cosines, distance[rows], self._light, leaf_colour
+        )
+
+    def _velocities(
+        self,
+        light: LightPaths,
+        step_m: Floats,
+        triangle: Ints32,
+        actor_trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the velocities of surfaces at hits, m/s: (n, 3); (0, 3) if not needed."""
+        if light.range_rate is None:
+            return np.zeros((0, 3))
+        return velocities_of_ends(
+            self.surfaces,
+            actor_trajectories,
+            (light.origins, light.directions),
+            step_m,
+            triangle,
+            light.times,
+        )
+
+    def _see(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
+        """Return the hits that the sensor may see, and the surfaces from which light continues."""
         materials = self.surfaces.at(self._light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
-            velocity = light.range_rate + light.index * products(met.moved.T, light.directions.T)
+            along_ray = products(surface_hits.velocities.T, light.directions.T)
+            velocity = light.range_rate + light.index * along_ray
         cause = None
         mirrored = light.mirrored
         if mirrored is not None:
             cause = np.where(mirrored > 0, np.uint8(GHOST), np.uint8(SURFACE))
         hits = PulseReturns(
-            light.ray, met.distance, met.triangle, met.energy, met.colour, cause, velocity
+            light.ray,
+            surface_hits.distance,
+            surface_hits.triangle,
+            surface_hits.energy,
+            surface_hits.colour,
+            cause,
+            velocity,
         )
-        normals = met.normals if light.turns is None else into_axes(met.normals, light.turns)
-        passes = materials.passes[met.kinds]
-        mirrors = np.zeros(len(met.kinds), np.bool_)
+        normals = surface_hits.normals
+        if light.mirror_matrices is not None:
+            normals = into_axes(normals, light.mirror_matrices)
+        transmits = materials.passes[surface_hits.kinds]
+        mirrors = np.zeros(len(surface_hits.kinds), np.bool_)
         if mirrored is not None:
-            smooth = (materials.specular > 0)[met.kinds] | (False if met.film is None else met.film)
-            mirrors = smooth & (mirrored < MIRRORED_MOST)
-        if light.within is None:
-            return SeenHits(hits, normals, passes, mirrors)
-        crowns = materials.leafy[met.kinds]  # whose surfaces send nothing back
-        crowns[met.leaves] = False
-        # Optical paths are longer than what was cast.
-        in_range = met.distance <= self.setup.sensor.max_range_m
+            film = False if surface_hits.film is None else surface_hits.film
+            smooth = (materials.specular > 0)[surface_hits.kinds] | film
+            mirrors = smooth & (mirrored < MAX_REFLECTIONS)
+        if light.in_media is None:
+            return VisibleHits(hits, normals, transmits, mirrors)
+        crowns = materials.leafy[surface_hits.kinds]  # whose surfaces reflect no light
+        crowns[surface_hits.leaves] = False
+        # Optical paths are longer than the rays that were cast.
+        in_range = surface_hits.distance <= self.setup.sensor.max_range_m
         rows = np.flatnonzero(in_range & ~crowns)
-        return SeenHits(
-            hits.take(rows), normals[rows], (passes | crowns) & in_range, mirrors & in_range
+        return VisibleHits(
+            hits.take(rows), normals[rows], (transmits | crowns) & in_range, mirrors & in_range
         )
 
-    def _go_on(
-        self, light: LightPaths, met: MetSurfaces, seen: SeenHits, each: int
-    ) -> OnwardLight | None:
-        """Return the light that goes on through surfaces or off them; None if there is none."""
-        from . import surface_loops  # not before: numba takes half a second to import
+    # -- light that continues ----------------------------------------------------------------
 
-        if not self.setup.passing:
+    def _continue(
+        self,
+        light: LightPaths,
+        surface_hits: SurfaceHits,
+        visible: VisibleHits,
+        subrays_per_beam: int,
+    ) -> OnwardLight | None:
+        """Return the light that surfaces transmit or mirror; None if there is no such light."""
+        if not self.setup.has_onward_light:
             return None
-        materials = self.surfaces.at(self._light.wavelength_nm)
-        through = np.flatnonzero(seen.passes)
-        rows = np.concatenate([through, np.flatnonzero(seen.mirrors)])
+        transmitted = np.flatnonzero(visible.transmits)
+        rows = np.concatenate([transmitted, np.flatnonzero(visible.mirrors)])
         if not len(rows):
             return None
-        off = np.arange(len(rows)) >= len(through)
-        order = along_rings(light.ray[rows] // each, self.setup.sensor.channels)
-        rows = rows[order]
-        off = off[order]
+        reflected = np.arange(len(rows)) >= len(transmitted)
+        order = along_rings(light.ray[rows] // subrays_per_beam, self.setup.sensor.channels)
+        rows, reflected, share = self._divide(light, surface_hits, rows[order], reflected[order])
+        onward = light.take(rows)
+        onward.share = share
+        crossings = Crossings(
+            surface_hits.step_m[rows],
+            surface_hits.distance[rows],
+            surface_hits.triangle[rows],
+            surface_hits.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
+            surface_hits.cosines[rows],
+            reflected,
+            None if light.range_rate is None else surface_hits.velocities[rows],
+        )
+        return self._cross(onward, crossings)
+
+    def _divide(
+        self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
+    ) -> tuple[Indices, Bools, Floats]:
+        """Compute the shares of the energy of light that surfaces transmit or mirror.
+
+        Returns the rows of light that is not too faint, whether the light is reflected, and its
+        share: (k,) each. `rows` and `reflected` are overwritten.
+        """
+        from . import surface_loops  # not before: numba takes half a second to import
+
+        materials = self.surfaces.at(self._light.wavelength_nm)
         bright = None
-        if materials.textured and met.colour is not None:
-            bright = luminance(met.colour[rows])
-        within = light.within
+        if materials.textured and surface_hits.colour is not None:
+            bright = luminance(surface_hits.colour[rows])
+        in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
-            within is not None and within.differentials
+            in_media is not None and in_media.differentials
         )
         share = np.empty(len(rows))
-        film = np.zeros(0, np.bool_) if met.film is None else met.film
+        film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.onward(
-            rows, off, met.kinds, met.along, materials.shares(met.kinds[rows], bright),
-            self._light.wet, film, light.share, met.distance, materials.specular,
-            materials.passes, ~materials.refracts, materials.leafy, self._brightest,
-            self._light.extinction, self._faintest if drops_faint else -1.0, share,
+            rows, reflected, surface_hits.kinds, surface_hits.cosines,
+            materials.shares(surface_hits.kinds[rows], bright), self._light.wet, film, light.share,
+            surface_hits.distance, materials.specular, materials.passes, ~materials.refracts,
+            materials.leafy, self._brightest, self._light.extinction,
+            self._faintest if drops_faint else -1.0, share,
         )  # fmt: skip
-        rows = rows[:count]
-        onward = light.take(rows)
-        onward.share = share[:count]
-        moved = None if light.range_rate is None else met.moved[rows]
-        ends = LightEnds(
-            met.step[rows],
-            met.distance[rows],
-            met.triangle[rows],
-            met.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
-            met.along[rows],
-            off[:count],
-            moved,
-        )
-        return self._behind(onward, ends)
+        return rows[:count], reflected[:count], share[:count]
 
-    def _cast_again(self, onward: OnwardLight, ways: ActorTrajectories) -> CastLight:
-        """Cast the light behind surfaces; returns what meets something in the sensor's range."""
-        light, clear, path = onward
-        farthest_m = self.setup.sensor.max_range_m
+    def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
+        """Cast the light behind surfaces; return the light that hits a surface within the range."""
+        light, start_m, path = onward
+        max_range_m = self.setup.sensor.max_range_m
         # Light takes no time: it travels 300 m in a microsecond.
-        now = CastPoses(np.zeros(3), clock=Clock(light.times, np.zeros(1), ways))
-        hits = self.caster.scan(path, now, t_max=self._reach)
+        clock = Clock(light.times, np.zeros(1), actor_trajectories)
+        poses = CastPoses(np.zeros(3), clock=clock)
+        hits = self.caster.scan(path, poses, t_max=self._reach_m)
         rows = hits.ray
-        cast = CastLight(light.take(rows), clear[rows], hits.distance, hits.triangle)
-        if self._leafy or farthest_m == np.inf:
+        cast = CastLight(light.take(rows), start_m[rows], hits.distance, hits.triangle)
+        if self._leafy or max_range_m == np.inf:
             return cast
-        in_range = np.flatnonzero(cast.light.optical_end(cast.step) <= farthest_m)
-        if len(in_range) == len(cast.step):
+        in_range = np.flatnonzero(cast.light.optical_end(cast.step_m) <= max_range_m)
+        if len(in_range) == len(cast.step_m):
             return cast
         return CastLight(
             cast.light.take(in_range),
-            cast.clear[in_range],
-            cast.step[in_range],
+            cast.start_m[in_range],
+            cast.step_m[in_range],
             cast.triangle[in_range],
         )
 
     def _join(
-        self, batch: PulseBatch, parts: list[SeenHits], rays: Floats, first_light: LightPaths
+        self, batch: PulseBatch, parts: list[VisibleHits], rays: Floats, first_light: LightPaths
     ) -> PulseReturns:
-        """Leave all hits to the steps behind, in the order of sub-rays, with their planes.
+        """Leave all hits to the later steps, in the order of sub-rays, with their planes.
 
-        `rays` are those of all sub-rays, and `first_light` that of the rays that met something.
+        `rays` are all sub-rays, and `first_light` is the light of the rays that hit a surface.
         """
         hits = joined([part.hits for part in parts])
         normals = parts[0].normals
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
-            if batch.each > 1:
+            if batch.subrays_per_beam > 1:
                 normals = np.concatenate([part.normals for part in parts])[order]
         batch.hits = hits
-        if batch.each > 1:
+        if batch.subrays_per_beam > 1:
             directions = first_light.directions
-            if parts[1:] or len(hits.ray) != len(first_light.ray):  # some ends beyond the range
+            if parts[1:] or len(hits.ray) != len(first_light.ray):  # hits beyond the range are out
                 directions = rays[-3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits
 
-    def _behind(self, light: LightPaths, ends: LightEnds) -> OnwardLight:
-        """Take light through the surfaces at its end, or off them."""
-        from . import surface_loops
-
-        within = light.within
-        normals = ends.normals
-        ahead = light.directions
-        share = light.share
-        mirrors = ends.off
-        index = light.index
-        if within is not None:
-            kinds = self.surfaces.kinds(ends.triangle)
-            ahead, transmitted, totally_reflected = within.cross(
-                kinds, ends.triangle, ahead, normals, ends.along, ends.off
-            )
-            share = share * transmitted**2
-            mirrors = mirrors | totally_reflected
-        mirrored = 2 * mirrors[:, None] * normals
-        ahead = ahead - ends.along[:, None] * mirrored
-        turns = light.turns
-        if turns is not None:
-            normals_as_seen = into_axes(normals, turns)
-            turns = turns - mirrored[:, :, None] * normals_as_seen[:, None]
-        cosine = np.abs(ends.along)
-        if within is not None:
-            within.turn(light.directions, ahead, normals, mirrors)
-            cosine = np.abs(products(normals.T, ahead.T))
-        range_rate = light.range_rate
-        if range_rate is not None and ends.moved is not None:  # a mirror that moves, too
-            arrives = products(ends.moved.T, light.directions.T)
-            leaves = products(ends.moved.T, ahead.T)
-            range_rate = range_rate + index * arrives - light.index * leaves
-        away = self.caster.clear_m / np.maximum(cosine, 1e-3)
-        starts = np.empty((3, len(away)))
-        units = owned(ahead.T)
-        surface_loops.set_off(
-            owned(light.origins.T), owned(light.directions.T), owned(ends.step), away, starts, units
-        )
-        path = Pattern(units.T, starts.T)
-        before = ends.distance + (away if within is None else within.optical(away))
-        if within is not None:
-            within.go(away)
+    def _cross(self, light: LightPaths, crossings: Crossings) -> OnwardLight:
+        """Return the light behind surfaces that transmit or mirror the light."""
+        incoming_index = light.index
+        deflection = self._deflect(light, crossings)
+        outgoing = deflection.directions
+        normals = crossings.normals
+        mirror_matrices = light.mirror_matrices
+        if mirror_matrices is not None:
+            normals_as_seen = into_axes(normals, mirror_matrices)
+            reflections = deflection.twice_normals[:, :, None] * normals_as_seen[:, None]
+            mirror_matrices = mirror_matrices - reflections
+        cosines = np.abs(crossings.cosines)
+        in_media = light.in_media
+        if in_media is not None:
+            in_media.deflect(light.directions, outgoing, normals, deflection.mirrored)
+            cosines = np.abs(products(normals.T, outgoing.T))
+        range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
+        clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
+        path, origins = _path_behind(light, crossings.step_m, clear_m, outgoing)
+        optical_m = clear_m if in_media is None else in_media.optical(clear_m)
+        if in_media is not None:
+            in_media.advance(clear_m)
         behind = LightPaths(
             light.ray,
             light.times,
-            starts.T,
+            origins,
             path.directions,
-            share,
-            before,
-            turns,
-            None if light.mirrored is None else light.mirrored + ends.off,
-            within,
+            deflection.share,
+            crossings.distance + optical_m,
+            mirror_matrices,
+            None if light.mirrored is None else light.mirrored + crossings.reflected,
+            in_media,
             range_rate,
         )
-        return OnwardLight(behind, -away, path)
+        return OnwardLight(behind, -clear_m, path)
+
+    def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
+        """Return the directions and shares of light behind surfaces that refract or mirror."""
+        outgoing = light.directions
+        share = light.share
+        mirrored = crossings.reflected
+        if light.in_media is not None:
+            refraction = light.in_media.cross(
+                self.surfaces.kinds(crossings.triangle),
+                crossings.triangle,
+                outgoing,
+                crossings.normals,
+                crossings.cosines,
+                crossings.reflected,
+            )
+            outgoing = refraction.directions
+            share = share * refraction.shares**2
+            mirrored = mirrored | refraction.totally_reflected
+        twice_normals = 2 * mirrored[:, None] * crossings.normals
+        outgoing = outgoing - crossings.cosines[:, None] * twice_normals
+        return Deflection(outgoing, share, mirrored, twice_normals)
+
+
+def _range_rate_behind(
+    light: LightPaths,
+    incoming_index: Floats | float,
+    velocities: Floats | None,
+    outgoing: Floats,
+) -> Floats | None:
+    """Return the growth of the optical path behind surfaces that move, m/s: (n,).
+
+    `incoming_index` is the refractive index before the surfaces, `light.index` behind them.
+    """
+    if light.range_rate is None or velocities is None:  # a mirror that moves shifts it, too
+        return light.range_rate
+    incoming_speed = products(velocities.T, light.directions.T)
+    outgoing_speed = products(velocities.T, outgoing.T)
+    return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
+
+
+def _path_behind(
+    light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
+) -> tuple[Pattern, Floats]:
+    """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).
+
+    `outgoing` are the directions of the rays, (n, 3).
+    """
+    from . import surface_loops
+
+    origins = np.empty((3, len(clear_m)))
+    directions = owned(outgoing.T)
+    surface_loops.set_off(
+        owned(light.origins.T),
+        owned(light.directions.T),
+        owned(step_m),
+        clear_m,
+        origins,
+        directions,
+    )
+    return Pattern(directions.T, origins.T), origins.T

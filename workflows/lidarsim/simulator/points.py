@@ -30,14 +30,14 @@ from .returns import required
 from .steps import received_causes
 from .surfaces import Surfaces, light_of
 
-BLOCK_HITS = 1 << 16  # that are looked at a time
-LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
+BLOCK_HITS = 1 << 16  # hits whose normals are computed at a time
+MIN_REMAINING = 1e-30  # share of light, so that quotients are finite in single precision
 
 
 class BatchPoints:
-    """Kept returns of some consecutive scans of one station, in (scan, ray) order.
+    """Reported returns of consecutive scans of a station, in (scan, ray) order.
 
-    Its attributes are arrays (n,) with a value for each return, computed on first use: the
+    The attributes are arrays (n,) with a value for each return, computed on first use: the
     sources of columns (`lidarsim.columns.table`).
     """
 
@@ -46,8 +46,9 @@ class BatchPoints:
         scene: Scene,
         survey: Survey,
         surfaces: Surfaces,
-        specs: list[ScanSpec],  # the firings of each follow those of the one before
-        found: Scanned,  # rays are numbered from 0 at the first firing
+        specs: list[ScanSpec],  # of consecutive firings
+        scanned: Scanned,  # rays are numbered from 0 at the first firing
+        *,
         pattern: Pattern,
         start: int,  # number of ray 0 within the pattern
         poses: CastPoses,
@@ -57,29 +58,28 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
-        # would be kept for each station of a batch.
-        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
+        # Triangles that were hit and their hits, (k,) each: counts of all triangles of the scene
+        # would take much memory, since they are stored for each station of a batch.
+        hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
         triangles = np.flatnonzero(hits)
         self.tally = triangles, hits[triangles]
-        # (scans,): of each, kept or not
-        self.found = found.returns
-        self.hits = found.hits
+        self.pulse_returns = scanned.returns
+        self.hits = scanned.hits  # (scans,): hits of each scan, also without a reported return
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
         self._poses = poses
-        self._fired = Firings.of(self.sensor, specs)
+        self._firings = Firings.from_scans(self.sensor, specs)
 
     def __len__(self) -> int:
-        return len(self.found.ray)
+        return len(self.pulse_returns.ray)
 
     def column(self, column: Column) -> AnyArray:
         """Values of a column."""
         return column.make(self)
 
-    def ends(self, rows: Ints) -> Floats:
-        """Positions of some returns (k,): (k, 3)."""
+    def positions_of(self, rows: Ints) -> Floats:
+        """Return the positions of the returns `rows` (k,), as `positions`: (k, 3)."""
         return self.positions[rows]
 
     # -- the ray -----------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class BatchPoints:
     @cached_property
     def counts(self) -> Ints:
         """Returns of each scan: (scans,)."""
-        cuts = np.searchsorted(self.found.ray, self._first_rays)
+        cuts = np.searchsorted(self.pulse_returns.ray, self._first_rays)
         return np.diff(np.append(cuts, len(self))).astype(np.int64)
 
     @cached_property
@@ -106,17 +106,17 @@ class BatchPoints:
     @cached_property
     def ray(self) -> Ints:
         """Number of the ray within its scan."""
-        return self.found.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
+        return self.pulse_returns.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
 
     @cached_property
     def channel(self) -> UInts32:
         """Beam of the sensor."""
-        return np.asarray(self.found.ray % np.uint32(self.sensor.channels), np.uint32)
+        return np.asarray(self.pulse_returns.ray % np.uint32(self.sensor.channels), np.uint32)
 
     @cached_property
     def firing(self) -> Ints:
         """Number of the firing, from the beginning of the station."""
-        return self.specs[0].firings[0] + self._number
+        return self.specs[0].firings[0] + self._firing_in_run
 
     @property
     def sensor_number(self) -> Bytes:
@@ -124,35 +124,41 @@ class BatchPoints:
         return np.full(len(self), self.specs[0].sensor, np.uint8)
 
     @cached_property
-    def _fired_ns(self) -> Ints:
-        return self._fired.times(self.found.ray)
+    def _firing_times_ns(self) -> Ints:
+        """Firing times, nanoseconds since the survey's start."""
+        return self._firings.times(self.pulse_returns.ray)
 
     @cached_property
     def time(self) -> Ints:
-        """Time of the ray as the sensor states it, nanoseconds since the survey's start."""
+        """Time of the ray by the sensor's clock, nanoseconds since the survey's start."""
         spec = self.specs[0]
-        stamp = self._fired_ns
+        stamp = self._firing_times_ns
         if spec.repeats is not None:
-            before, now = map(self.survey.begins_ns, spec.repeats)
-            stamp = stamp + round(now - before)
+            first, repeated = map(self.survey.begins_ns, spec.repeats)
+            stamp = stamp + round(repeated - first)
         jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
-        return sum((one.jumps_ns(stamp) for one in jumps), stamp)
+        return sum((jump.jumps_ns(stamp) for jump in jumps), stamp)
 
     @property
-    def _times(self) -> Ints:
-        """Firing times, where they matter, for actors."""
-        return self._fired_ns if self._poses.ways else np.zeros(len(self), np.int64)
+    def _actor_times_ns(self) -> Ints:
+        """Firing times, nanoseconds since the survey's start; zeros if there are no actors."""
+        return (
+            self._firing_times_ns
+            if self._poses.actor_trajectories
+            else np.zeros(len(self), np.int64)
+        )
 
     @cached_property
-    def _number(self) -> Ints:
-        """Number of the firing, from that of the first scan."""
-        return self.found.ray // np.int64(self.sensor.channels)
+    def _firing_in_run(self) -> Ints:
+        """Number of the firing, counted from the first firing of the first scan."""
+        return self.pulse_returns.ray // np.int64(self.sensor.channels)
 
     # -- positions ---------------------------------------------------------------------------
 
     @cached_property
     def _rays(self) -> tuple[Floats, Floats]:
-        return self._poses.rays(self._pattern, self.found.ray, self._start)
+        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays, in the scene frame."""
+        return self._poses.rays(self._pattern, self.pulse_returns.ray, self._start)
 
     @property
     def origins(self) -> Floats:
@@ -161,38 +167,38 @@ class BatchPoints:
 
     @property
     def directions(self) -> Floats:
-        """Unit directions in the scene's axes: (n, 3)."""
+        """Unit directions in the scene frame: (n, 3)."""
         return self._rays[1]
 
     @property
     def range(self) -> Floats:
         """Distance from the start of the ray, metres, with noise."""
-        return required(self.found.reported)
+        return required(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
         """Ends of the rays, metres, the scene's local coordinates: (n, 3).
 
-        A frozen sensor's points stay in its axes, and move with it.
+        Points of a frozen sensor stay fixed in the sensor frame, and move with the sensor.
         """
-        return self._moved(self._ends)
+        return self._after_freezing(self._scene_positions)
 
-    def _moved(self, points: Floats) -> Floats:
-        """Move points (n, 3) with the axes of a frozen sensor, since the sweep that it repeats."""
+    def _after_freezing(self, points: Floats) -> Floats:
+        """Move points (n, 3) with a frozen sensor from the repeated sweep to the current sweep."""
         if self.specs[0].repeats is None:
             return points
-        before, now = map(self.survey.pose, self.specs[0].repeats)
-        if before == now:
+        frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
+        if frozen_pose == current_pose:
             return points
-        inside = turned(np.subtract(points, before.position), before.turn.T)
-        return turned(inside, now.turn) + now.position
+        in_sensor = turned(np.subtract(points, frozen_pose.position), frozen_pose.turn.T)
+        return turned(in_sensor, current_pose.turn) + current_pose.position
 
     @cached_property
     def ray_origins(self) -> Floats:
         """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
-        return self._moved(self.origins) + self.scene.origin
+        return self._after_freezing(self.origins) + self.scene.origin
 
     @property
     def origin_x(self) -> Floats:
@@ -210,10 +216,11 @@ class BatchPoints:
         return self.ray_origins[:, 2]
 
     @cached_property
-    def _ends(self) -> Floats:
+    def _scene_positions(self) -> Floats:
+        """Ends of the rays when they were fired, metres, scene frame: (n, 3)."""
         origins, directions = self._rays
-        out = directions * self.range[:, None]
-        return np.add(out, origins, out=out)
+        positions = directions * self.range[:, None]
+        return np.add(positions, origins, out=positions)
 
     @cached_property
     def cells(self) -> Ints32:
@@ -225,11 +232,11 @@ class BatchPoints:
             with np.errstate(invalid="raise"):
                 cells[:] = np.rint(scaled, out=scaled).T
         except FloatingPointError:
-            far = np.abs(scaled).max() * self.survey.precision_m
+            extent_m = np.abs(scaled).max() * self.survey.precision_m
             step = self.survey.precision_m
             raise LidarError(
-                f"precision_m {step} is too fine for points {far:.0f} m from the "
-                f"origin: use at least {far / 2e9:.2g}."
+                f"precision_m {step} is too fine for points {extent_m:.0f} m from the "
+                f"origin: use at least {extent_m / 2e9:.2g}."
             ) from None
         return cells
 
@@ -249,49 +256,51 @@ class BatchPoints:
         return self.cells[2]
 
     @cached_property
-    def _rows(self) -> Ints:
-        """Of the pattern."""
-        return (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
+    def _pattern_rows(self) -> Ints:
+        """Row of the ray in the pattern."""
+        return (self._start + self.pulse_returns.ray.astype(np.int64)) % len(self._pattern)
 
     @cached_property
     def _sensor_directions(self) -> Floats:
-        return self._to_sensor(self._pattern.directions[self._rows])
+        """Unit directions in the sensor frame: (n, 3)."""
+        return self._to_sensor(self._pattern.directions[self._pattern_rows])
 
     @cached_property
     def sensor_positions(self) -> Floats:
-        """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
+        """Ends of the rays in the sensor frame at the firing, metres: (n, 3)."""
         return self._in_sensor(self.range)
 
     def _in_sensor(self, distance: Floats) -> Floats:
-        """Points of the rays at distances (n,), in the axes of the sensor, metres: (n, 3)."""
+        """Return points of the rays at distances (n,), sensor frame, metres: (n, 3)."""
         origins = self._pattern.origins
-        ends = self._pattern.directions[self._rows] * distance[:, None]
+        points = self._pattern.directions[self._pattern_rows] * distance[:, None]
         if origins is not None:
-            ends += origins[self._rows]
+            points += origins[self._pattern_rows]
         if not self._poses.by_head:
-            ends -= self.carried.mount.position
+            points -= self.carried.mount.position
         elif self.sensor.centre is not None:
-            ends += self.sensor.centre
-        return self._to_sensor(ends)
+            points += self.sensor.centre
+        return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
+        """Rotate vectors (n, 3) from the frame of the carrier, or the head, to the sensor frame."""
         if self._poses.by_head:
-            spins = self.sensor.spins(self._fired.numbers)
+            spins = self.sensor.spins(self._firings.numbers)
             assert spins is not None  # or the rig would not cast by head
-            (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
-            looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
-            return turned(looks, self.sensor.axes)
+            cos, sin = (values.take(self._firing_in_run) for values in spins)
+            x, y, z = vectors.T
+            in_head = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+            return turned(in_head, self.sensor.axes)
         mount = self.carried.mount.rotation
         return turned(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3) in the scene's axes to those of the sensor at the firing."""
-        inside = np.empty(vectors.shape[::-1])
+        """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
+        in_carrier = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
-            _, axes = self._poses.rays(Pattern(unit[None]), self.found.ray, self._start)
-            inside[axis] = products(vectors.T, axes.T)
-        return self._to_sensor(inside.T)
+            _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
+            in_carrier[axis] = products(vectors.T, axes.T)
+        return self._to_sensor(in_carrier.T)
 
     @cached_property
     def azimuth(self) -> Floats:
@@ -309,61 +318,63 @@ class BatchPoints:
     @property
     def triangle(self) -> Ints32:
         """Triangle of the scene."""
-        return self.found.triangle
+        return self.pulse_returns.triangle
 
     @cached_property
     def object(self) -> Ints32:
         """Object of the scene."""
-        return self._surfaces.objects(self.found.triangle)
+        return self._surfaces.objects(self.pulse_returns.triangle)
 
     @cached_property
     def _kinds(self) -> Ints32:
         """Kinds of surfaces, rows of the table of materials."""
         if not self.scene.has_mixed_objects:
             return self.object
-        return self._surfaces.kinds(self.found.triangle)
+        return self._surfaces.kinds(self.pulse_returns.triangle)
 
     @cached_property
     def cosine(self) -> Floats:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
 
-        It means nothing where there is no surface.
+        Undefined for returns without a surface.
         """
         return np.abs(self._lit[0])
 
     @cached_property
     def _facing(self) -> tuple[Floats, Floats]:
-        """Unit normals (n, 3), scene's axes, on the side that was hit, and cosines of incidence.
+        """Unit normals (n, 3), scene frame, on the side that was hit, and cosines of incidence.
 
-        NaN where there is no surface, of leaves within a crown, and of ghosts, whose rays arrive
-        from elsewhere.
+        NaN for returns without a surface, leaves within a crown, and ghosts, whose last ray starts
+        at a mirror.
         """
-        triangle = self.found.triangle
+        triangle = self.pulse_returns.triangle
         surfaces = self._surfaces
         normals = np.full((len(self), 3), np.nan)
         cosines = np.full(len(self), np.nan)
         on_surface = triangle >= 0
-        if self.found.cause is not None:
-            on_surface &= self.found.cause != GHOST
+        if self.pulse_returns.cause is not None:
+            on_surface &= self.pulse_returns.cause != GHOST
         if surfaces.materials.leafy.any():
             on_surface &= ~surfaces.materials.leafy[self._kinds]
         rows = np.flatnonzero(on_surface)
         for begin in range(0, len(rows), BLOCK_HITS):
             block = rows[begin : begin + BLOCK_HITS]
-            facing = surfaces.normals(triangle[block], self._times[block], self._poses.ways)
-            along = products(facing.T, self.directions[block].T)
-            facing[along > 0] *= -1
+            facing = surfaces.normals(
+                triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
+            )
+            products_with_rays = products(facing.T, self.directions[block].T)
+            facing[products_with_rays > 0] *= -1
             normals[block] = facing
-            cosines[block] = np.abs(along)
+            cosines[block] = np.abs(products_with_rays)
         return normals, cosines
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the axes of the survey's points: (n, 3)."""
+        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3)."""
         normals, _ = self._facing
         if self.survey.coordinates == "sensor":
             return self._world_to_sensor(normals)
-        return self._moved(normals) - self._moved(np.zeros((1, 3)))
+        return self._after_freezing(normals) - self._after_freezing(np.zeros((1, 3)))
 
     @property
     def normal_x(self) -> Floats:
@@ -382,39 +393,51 @@ class BatchPoints:
 
     @property
     def incidence_deg(self) -> Floats:
-        """Angle between the ray and the normal of its surface, degrees; NaN as of `normals`."""
+        """Angle between the ray and the normal of its surface, degrees; NaN as in `normals`."""
         return np.degrees(arccos(np.minimum(self._facing[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies; in blocks, for normals take room."""
-        light, (along, energy) = light_of(self.survey, self.sensor), np.empty((2, len(self)))
+        """Cosines of incidence, of either sign, and energies; in blocks, to save memory."""
+        light = light_of(self.survey, self.sensor)
+        cosines, energy = np.empty((2, len(self)))
         colours = self._colours if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
-            some = slice(begin, begin + BLOCK_HITS)
-            found = self.found.triangle[some], self.directions[some], self.found.distance[some]
-            more = None if colours is None else colours[some]
-            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
-            along[some] = lit.along
-            energy[some] = lit.energy
-        return along, energy
+            block = slice(begin, begin + BLOCK_HITS)
+            lit = self._surfaces.lit(
+                self.pulse_returns.triangle[block],
+                self.directions[block],
+                self.pulse_returns.distance[block],
+                light,
+                self._actor_times_ns[block],
+                self._poses.actor_trajectories,
+                None if colours is None else colours[block],
+            )
+            cosines[block] = lit.along
+            energy[block] = lit.energy
+        return cosines, energy
 
     @cached_property
     def intensity(self) -> Floats:
-        """Received energy, see `Surfaces.energy`."""
-        if self.found.energy is not None:
-            return self.found.energy
+        """Received energy, on the scale of `Surfaces.energy`."""
+        if self.pulse_returns.energy is not None:
+            return self.pulse_returns.energy
         return self._lit[1]
 
     @cached_property
     def _colours(self) -> UInts32:
-        """Packed colours."""
-        if self.found.colour is not None:
-            return self.found.colour
-        points = self._ends
-        if self.found.reported is not self.found.distance:
-            points = self.directions * self.found.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
+        """Packed colours of the surfaces, see `Surfaces.colours`."""
+        if self.pulse_returns.colour is not None:
+            return self.pulse_returns.colour
+        points = self._scene_positions
+        if self.pulse_returns.reported is not self.pulse_returns.distance:
+            points = self.directions * self.pulse_returns.distance[:, None] + self._rays[0]
+        return self._surfaces.colours(
+            self.pulse_returns.triangle,
+            points,
+            self._actor_times_ns,
+            self._poses.actor_trajectories,
+        )
 
     @property
     def red(self) -> Bytes:
@@ -432,69 +455,73 @@ class BatchPoints:
         return unpacked(self._colours)[:, 2]
 
     @property
-    def _recorded(self) -> Floats:
-        """Received energy, at most what fills the receiver."""
+    def _clipped_energy(self) -> Floats:
+        """Received energy, clipped at saturation."""
         return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
 
     @property
     def signal(self) -> NDArray[np.uint16]:
-        """Counts in proportion to the recorded energy."""
-        return np.minimum(np.rint(self._recorded * COUNTS), 65_535).astype(np.uint16)
+        """Counts in proportion to the clipped energy."""
+        return np.minimum(np.rint(self._clipped_energy * COUNTS), 65_535).astype(np.uint16)
 
     @property
     def reflectivity(self) -> Bytes:
-        """Recorded energy without the loss by distance, on the scale of the sensor's maker."""
-        lost = at_right_angles(self.found.distance)
-        return SCALES[self.sensor.optics.reflectivity].codes(self._recorded / lost)
+        """Clipped energy, corrected for the loss by distance, on the scale of the manufacturer."""
+        remaining = at_right_angles(self.pulse_returns.distance)
+        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
-        """Intensity without the loss by distance and air."""
-        lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
-        # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
-        return np.asarray(self.intensity / np.maximum(lost, LEAST_LEFT))
+        """Intensity, corrected for the loss by distance and air."""
+        remaining = at_right_angles(
+            self.pulse_returns.distance, self.survey.extinction(self.sensor)
+        )
+        # In thick fog or dust, no light returns from the distance at which a false alarm appears.
+        return np.asarray(self.intensity / np.maximum(remaining, MIN_REMAINING))
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
-        found = self.found
-        velocity = self.found.velocity
+        """Growth of the range, m/s, with noise; NaN for returns that the receiver adds."""
+        returns = self.pulse_returns
+        velocity = returns.velocity
         if velocity is None:
             velocity = radial_velocities(
                 self._surfaces,
                 self._poses,
-                found.ray.astype(np.int64),
+                returns.ray.astype(np.int64),
                 self._rays,
-                found.distance,
-                found.triangle,
-                self._times,
+                returns.distance,
+                returns.triangle,
+                self._actor_times_ns,
             )
-            if found.cause is not None:
-                velocity[np.isin(found.cause, received_causes())] = np.nan
+            if returns.cause is not None:
+                velocity[np.isin(returns.cause, received_causes())] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             scan = self.scan.astype(np.int64) + self.specs[0].ahead
-            drawn = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
-            velocity = velocity + noise.velocity_m_s * drawn
+            errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
+            velocity = velocity + noise.velocity_m_s * errors
         return velocity
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the echo in the waveform; without waveforms its energy."""
-        return self.intensity if self.found.amplitude is None else self.found.amplitude
+        """Height of the pulse in the waveform; without waveforms the energy."""
+        return (
+            self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
+        )
 
     @property
     def pulse_width(self) -> Floats:
-        """Full width at half maximum of the echo in the waveform, nanoseconds."""
-        if self.found.width is None:
+        """Full width at half maximum of the pulse in the waveform, nanoseconds."""
+        if self.pulse_returns.width is None:
             returns = self.survey.returns_each[self.specs[0].sensor]
             return np.full(len(self), returns.length_ns(self.sensor.optics))
-        return self.found.width
+        return self.pulse_returns.width
 
     @property
     def waveform(self) -> Records:
         """Recorded waveform, see `lidarsim.columns.waveforms.record`."""
-        table = required(self.found.waveform).copy()
+        table = required(self.pulse_returns.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
@@ -505,27 +532,29 @@ class BatchPoints:
     @property
     def return_number(self) -> Bytes:
         """Number among the reported returns of its pulse."""
-        return required(self.found.number)
+        return required(self.pulse_returns.number)
 
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return required(self.found.returns)
+        return required(self.pulse_returns.returns)
 
     @property
     def cause(self) -> Bytes:
-        """Why the return is there, see `CAUSES` of the table of columns."""
-        if self.found.cause is None:
+        """Cause of the return, see `CAUSES` in `lidarsim.columns.table`."""
+        if self.pulse_returns.cause is None:
             return np.zeros(len(self), np.uint8)
-        return self.found.cause
+        return self.pulse_returns.cause
 
     @property
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
         classes = self._surfaces.materials.semantic_class[self._kinds]
-        return classes if self.found.cause is None else np.where(self._kinds < 0, 0, classes)
+        return (
+            classes if self.pulse_returns.cause is None else np.where(self._kinds < 0, 0, classes)
+        )
 
     @property
     def material_number(self) -> Ints32:
-        """Number of the material's name among those of the scene; -1 for none."""
-        return self._surfaces.material_numbers(self.found.triangle)
+        """Number of the material's name among the names of the scene; -1 without a material."""
+        return self._surfaces.material_numbers(self.pulse_returns.triangle)

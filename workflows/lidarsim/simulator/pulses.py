@@ -83,7 +83,7 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
 
         all_beams = batch(0, rays)
-        if self._setup.several:
+        if self._setup.has_several_returns:
             unit = poses.rays_per_pose or self._setup.sensor.channels
             size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
             chunk_starts = range(0, rays, size)
@@ -93,7 +93,7 @@ class PulseCaster:
             scanned = self._cast_once(all_beams, groups, tally)
         returns = scanned.returns
         for step in self.steps:
-            if Role.OF_KEPT in step.role:
+            if Role.ON_REPORTED in step.role:
                 returns = step.apply(returns, all_beams)
         return self._within_range(scanned._replace(returns=returns), groups)
 
@@ -132,7 +132,7 @@ class PulseCaster:
         """Return the returns of a batch after all steps that act before returns are thinned out."""
         returns = PulseReturns.empty()
         for step in self.steps:
-            if Role.OF_KEPT not in step.role:
+            if Role.ON_REPORTED not in step.role:
                 returns = step.apply(returns, batch)
         return returns
 
@@ -172,17 +172,19 @@ class PulseCaster:
         distance = returns.distance
         triangle = returns.triangle
         colour = velocity = None
-        if setup.moving:
+        if setup.has_velocities:
             velocity = radial_velocities(
                 surfaces, poses, returns.ray, rays, distance, triangle, times
             )
         if surfaces.materials.textured:
             points = directions * distance[:, None]
             points += origins
-            colour = surfaces.colours(triangle, points, times, poses.ways)
+            colour = surfaces.colours(triangle, points, times, poses.actor_trajectories)
             del points  # which takes as much memory as the normals
         light = light_of(setup.survey, setup.sensor)
-        lit = surfaces.lit(triangle, directions, distance, light, times, poses.ways, colour)
+        lit = surfaces.lit(
+            triangle, directions, distance, light, times, poses.actor_trajectories, colour
+        )
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
     def _thin_out(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:

@@ -1,4 +1,4 @@
-"""Errors of ranges: noise, also of weak returns, range walk, and errors that last."""
+"""Errors of ranges: noise, also of weak returns, range walk, and lasting errors."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ CHANNEL = Purpose(60, "a channel's error of range")
 
 
 class RangeNoiseStep(PulseStep):
-    """Moves the ranges of the returns that are kept."""
+    """Adds errors to the ranges of reported returns."""
 
-    role = Role.OF_KEPT
+    role = Role.ON_REPORTED
     effects = "Weak returns and range walk", "Errors that last"
     reads = "ray", "distance", "energy", "amplitude", "number"
     writes = ("reported",)
@@ -26,11 +26,11 @@ class RangeNoiseStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return True if the noise changes ranges."""
         return setup.noise.moves_ranges
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the returns with their reported ranges."""
         # The leading edge of a clipped pulse is that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)
@@ -61,7 +61,7 @@ def noisy_ranges(
         sigma = np.sqrt(sigma * sigma + weak * weak)
     if noise.walk_m and energy is not None:
         distance = distance - range_walk(noise, energy)
-    if sigma.any():  # else random numbers would be drawn in vain
+    if sigma.any():  # random numbers take time
         distance = distance + sigma * normal(noise.seed, RANGE, scan, ray, number)
     return np.maximum(distance, 0)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,20 @@ from .waveform import Digitizer
 
 SAMPLES = Purpose(50, "stream of the samples of a waveform")
 SAMPLE = Purpose(51, "noise of a sample")
-BLOCK_SAMPLES = 1 << 20  # that are made at a time
+BLOCK_SAMPLES = 1 << 20  # samples that are computed at a time
+
+
+class Windows(NamedTuple):
+    """Windows of consecutive samples of waveforms: arrays (n,)."""
+
+    beam: Ints  # counted from the first beam of the batch
+    begin: Ints  # first sample, counted from firing
+    first_hit: Ints  # row of the first hit of the beam
+    stop_hit: Ints  # one past the row of the last hit of the beam
+
+    def take(self, rows: slice) -> Windows:
+        """Return the windows of a slice."""
+        return Windows(*(column[rows] for column in self))
 
 
 class RecordingStep(PulseStep):
@@ -31,100 +46,111 @@ class RecordingStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
-        return setup.recorded > 0
+        """Return True if waveforms are recorded."""
+        return setup.waveform_samples > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: samples that are made at a time, and the records."""
-        recorded = record(setup.recorded).itemsize * sizes.returns
-        made = 40 * min(sizes.subrays * setup.recorded, BLOCK_SAMPLES)
-        return Memory(casting=made + recorded, counting=2.3 * recorded)
+        """Return the memory of a block of samples, and of the records, in bytes."""
+        recorded = record(setup.waveform_samples).itemsize * sizes.returns
+        sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
+        return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`.
+        """Return the returns with their recorded waveforms.
 
-        A window begins where the echo of its first return does, and returns of the same pulse share
-        it as long as their echoes end within. Windows of a pulse that overlap hold the same
+        A window starts where the signal of its first return does. Later returns of the pulse share
+        the window while their signals stop within. Overlapping windows of a pulse hold the same
         samples.
         """
-        assert batch.hits is not None  # as there are sub-rays
-        hits = batch.hits
-        each = batch.each
-        noise = self.setup.noise
         digitizer = Digitizer.for_sensor(self.setup)
-        count = self.setup.recorded
-        beams = returns.ray - batch.start
-        keys = batch.keys
-        here = Keys(keys.scan, keys.scan_starts - batch.start)
-        out = np.zeros(len(beams), record(count))
-        out["sample_ps"] = round(1000 * digitizer.sample_ns)
-        when = returns.distance * digitizer.samples_per_m
-        first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
-        last = np.ceil(when).astype(np.int64) + digitizer.reach
-        place = numbers(beams)
-        begin = first.copy()
-        for number in range(1, int(place.max(initial=0)) + 1):
-            rows = np.flatnonzero(place == number)
-            shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
-            begin[rows] = np.where(shared, begin[rows - 1], first[rows])
-        new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
-        window = np.cumsum(new) - 1
-        beam = beams[new]
-        begins = begin[new]
-        low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
-        unit = max(count, each * (2 * digitizer.reach + 1))
-        size = max(1, BLOCK_SAMPLES // unit)
-        out["begin"] = begin
-        for start in range(0, len(beam), size):
-            block = slice(start, start + size)
-            samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
-            if noise.threshold:
-                scan, ray = here.scan_and_number(beam[block])
-                stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
-                number = begins[block, None] + np.arange(count)
-                drawn = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
-                samples += (noise.threshold / THRESHOLD_SIGMAS) * drawn
-            steps, exponents = digitised(np.minimum(samples, noise.full))
-            low_row, high_row = np.searchsorted(window, [start, start + size])
-            mine = window[low_row:high_row] - start
-            out["samples"][low_row:high_row] = steps[mine]
-            out["exponent"][low_row:high_row] = exponents[mine]
-        return returns._replace(waveform=out)
+        count = self.setup.waveform_samples
+        records = np.zeros(len(returns.ray), record(count))
+        records["sample_ps"] = round(1000 * digitizer.sample_ns)
+        windows, window_of_return = _windows(returns, batch, digitizer, count)
+        records["begin"] = windows.begin[window_of_return]
+        samples_per_window = max(count, batch.subrays_per_beam * (2 * digitizer.reach + 1))
+        size = max(1, BLOCK_SAMPLES // samples_per_window)
+        for start in range(0, len(windows.beam), size):
+            block = windows.take(slice(start, start + size))
+            samples = _sampled(batch, digitizer, block, count)
+            steps, exponents = digitised(self._received(samples, block, batch))
+            first, stop = np.searchsorted(window_of_return, [start, start + size])
+            rows = window_of_return[first:stop] - start
+            records["samples"][first:stop] = steps[rows]
+            records["exponent"][first:stop] = exponents[rows]
+        return returns._replace(waveform=records)
+
+    def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
+        """Add the receiver's noise to samples (windows, count) in place; return clipped samples."""
+        noise = self.setup.noise
+        if noise.threshold:
+            keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
+            scan, ray = keys.scan_and_number(windows.beam)
+            stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
+            number = windows.begin[:, None] + np.arange(samples.shape[1])
+            errors = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
+            samples += (noise.threshold / THRESHOLD_SIGMAS) * errors
+        return np.minimum(samples, noise.full)
 
 
-def _window(
-    hits: PulseReturns,
-    digitizer: Digitizer,
-    each: int,
-    begins: Ints,
-    low: Ints,
-    high: Ints,
-    count: int,
-) -> Floats:
-    """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
-    sizes = high - low
-    mine = np.repeat(np.arange(len(begins)), sizes)
-    rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
-    when = hits.distance[rows] * digitizer.samples_per_m
-    first = np.ceil(when - CUT * digitizer.sigma).astype(np.int64)  # that is not 0
-    time = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
-    height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
-    height *= required(hits.energy)[rows, None] / each
-    place = time - begins[mine, None]
-    inside = (place >= 0) & (place < count)
-    place += count * mine[:, None]
-    samples = np.bincount(place[inside], height[inside], minlength=len(begins) * count)
-    return samples.reshape(len(begins), count).astype(np.float64)
+def _window_starts(distance: Floats, pulse_row: Ints, digitizer: Digitizer, count: int) -> Ints:
+    """Return the first sample of the window of each return (n,), in samples after firing.
+
+    `pulse_row` numbers the returns of a pulse; windows have `count` samples.
+    """
+    time = distance * digitizer.samples_per_m
+    first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
+    last = np.ceil(time).astype(np.int64) + digitizer.reach
+    begin = first.copy()
+    for number in range(1, int(pulse_row.max(initial=0)) + 1):
+        rows = np.flatnonzero(pulse_row == number)
+        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+    return begin
+
+
+def _windows(
+    returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
+) -> tuple[Windows, Ints]:
+    """Return the windows of returns, of `count` samples each, and the window of each return."""
+    pulse_row = numbers(returns.ray)
+    begin = _window_starts(returns.distance, pulse_row, digitizer, count)
+    starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
+    beam = returns.ray[starts_window] - batch.start
+    ray = required(batch.hits).ray
+    first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
+    stop_hit = np.searchsorted(ray, (beam + 1) * batch.subrays_per_beam)
+    windows = Windows(beam, begin[starts_window], first_hit, stop_hit)
+    return windows, np.cumsum(starts_window) - 1
+
+
+def _sampled(batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int) -> Floats:
+    """Return the samples of the signals of hits in windows, without noise: (windows, count)."""
+    hits = required(batch.hits)
+    hit_counts = windows.stop_hit - windows.first_hit
+    window = np.repeat(np.arange(len(hit_counts)), hit_counts)
+    first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
+    rows = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
+    time = hits.distance[rows] * digitizer.samples_per_m
+    first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
+    sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
+    height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
+    height *= required(hits.energy)[rows, None] / batch.subrays_per_beam
+    sample = sample_times - windows.begin[window, None]
+    inside = (sample >= 0) & (sample < count)
+    sample += count * window[:, None]
+    samples = np.bincount(sample[inside], height[inside], minlength=len(hit_counts) * count)
+    return samples.reshape(len(hit_counts), count).astype(np.float64)
 
 
 def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples (n, k) to whole numbers from `ZERO`, of a power of two that holds all of each.
+    """Round samples (n, k) to integers around `ZERO`, in steps of a power of two for each row.
 
-    Returns them, uint16 (n, k), and the exponents (n,).
+    Returns the integers, uint16 (n, k), and the exponents of the steps (n,).
     """
-    most = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
-    _, exponents = np.frexp(most)
-    exponents = np.clip(np.where(most > 0, exponents, SILENT), SILENT, 127)
+    scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
+    _, exponents = np.frexp(scale)
+    exponents = np.clip(np.where(scale > 0, exponents, SILENT), SILENT, 127)
     steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
     return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)

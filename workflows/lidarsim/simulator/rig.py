@@ -25,24 +25,24 @@ from .pulses import PulseCaster
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 
-PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
+PATTERN_RAYS = 20_000_000  # stored rays of a head's period at most; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
-KEPT = 8  # turns whose rays are kept for the next images
+MAX_PATTERNS = 8  # patterns of firings that are stored for the next images
 
 
 class _Rays(NamedTuple):
-    """Rays of a sensor that are made once."""
+    """Rays of a sensor that are computed once and cast repeatedly."""
 
-    pattern: Pattern | None  # some firings, or one period of the head; None if that is too long
-    # Whether they are one firing in the axes of the head, each firing with a pose of its own; else
-    # they are in the axes of the carrier.
+    pattern: Pattern | None  # a firing, or a period of the head; None if the rays do not repeat
+    # Whether the rays are a firing in the frame of the head, with a pose for each firing; else
+    # they are in the frame of the carrier.
     by_head: bool = False
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
-    """Whether a sensor's rays are made once and cast again and again, and whether by its head.
+    """Return whether a sensor's rays are computed once and cast repeatedly, and whether by head.
 
-    By the head they are one firing, and each firing has a pose of its own.
+    Rays by head are the rays of a firing in the frame of the head; each firing has a pose.
     """
     fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
     by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
@@ -50,7 +50,7 @@ def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
 
 
 class Rig:
-    """Scene, survey and a ray caster that is ready; `backend` and the like as of `RayCaster`."""
+    """Scene, survey and ray caster, ready to cast; the options are arguments of `RayCaster`."""
 
     def __init__(
         self,
@@ -69,65 +69,67 @@ class Rig:
         self.scene = scene
         self.survey = survey
         self.options = options
-        self._ways = ActorTrajectories.of(scene.actors)
+        self._actor_trajectories = ActorTrajectories.of(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._caster = SceneCaster(scene, self._surfaces, like, **options)
         self._device: DeviceColumns | None = None
-        self._see()
+        self._prepare()
         check_trajectory(survey.path)
-        self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
-        self._firings: dict[tuple[int, int, int], Pattern] = {}  # {(sensor, first, stop): rays}
+        self._repeated_rays: dict[
+            tuple[int, bool], _Rays
+        ] = {}  # {(sensor, whether it moves): rays}
+        self._patterns: dict[tuple[int, int, int], Pattern] = {}  # {(sensor, first, stop): rays}
         for number in range(len(survey.carried)):
-            self._repeated(number, survey.path.moves)
+            self._rays_of_sensor(number, survey.path.moves)
 
-    def _repeated(self, number: int, moves: bool) -> _Rays:
-        """Rays of a sensor that are cast again and again, made on first use."""
-        made = self._made.get((number, moves))
-        if made is None:
+    def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
+        """Return the rays of a sensor that are cast repeatedly, computed on first use."""
+        rays = self._repeated_rays.get((number, moves))
+        if rays is None:
             sensor = self.survey.carried[number].sensor
             repeats, by_head = rays_repeat(sensor, moves)
-            made = _Rays(None)
+            rays = _Rays(None)
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                made = _Rays(pattern, by_head=True)
+                rays = _Rays(pattern, by_head=True)
             elif repeats:
-                made = _Rays(self._rays_of(number, 0, sensor.period or 0))
-            self._made[number, moves] = made
-        return made
+                rays = _Rays(self._pattern_of_firings(number, 0, sensor.period or 0))
+            self._repeated_rays[number, moves] = rays
+        return rays
 
     def with_survey(self, scene: Scene, survey: Survey) -> Rig:
-        """Return a rig of another survey of the same scene, perhaps with other actors.
+        """Return a rig of a new survey of the same scene, possibly with new actors.
 
-        The tree of all that stands still is shared.
+        The tree of static bodies is shared.
         """
         rig = copy(self)
         rig._assemble(scene, survey, self.options, self._caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
-        """Return the same rig with other trajectories of the actors; the trees are shared."""
+        """Return a rig with new trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._ways = ActorTrajectories.of(actors)
+        rig._actor_trajectories = ActorTrajectories.of(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
-        """Check that the trajectories of actors cover a time; LidarError if not."""
-        moving = np.flatnonzero([way.moves for way in self._ways])
+        """Raise LidarError unless the trajectories of all actors cover a span of time."""
+        moving = np.flatnonzero([trajectory.moves for trajectory in self._actor_trajectories])
         try:
             times = np.repeat([begin_ns, end_ns], len(moving)).astype(np.float64)
-            self._ways.poses(np.tile(moving, 2), times)
+            self._actor_trajectories.poses(np.tile(moving, 2), times)
         except LidarError:
             for number in moving:
-                self.scene.actors[number].check(begin_ns, end_ns)  # which names it
+                self.scene.actors[number].check(begin_ns, end_ns)  # its error names the actor
             raise
 
     def moved(self, owner: int, pose: Pose) -> Rig:
-        """Return the same rig with the instances of an object at a pose, see `Scene.moved`.
+        """Return a rig with the instances of an object at a pose, see `Scene.moved`.
 
-        The trees are shared: this rig must not cast any more, and no cast may be under way.
+        The trees are shared: this rig must not cast afterwards, and no cast may be under way.
         """
         rig = copy(self)
         rig.scene = self.scene.moved(owner, pose)
@@ -135,18 +137,24 @@ class Rig:
         assert shared is not None
         rows = np.flatnonzero(shared.owner == owner)
         rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._caster.place(rig._surfaces, shared, rows)
-        rig._see()
+        rig._caster.move_instances(rig._surfaces, shared, rows)
+        rig._prepare()
         return rig
 
-    def _see(self) -> None:
-        """Make what depends on where the surfaces are."""
-        given = self._caster, self.scene, self.survey, self._surfaces
-        self._pulses = [PulseCaster(number, *given) for number in range(len(self.survey.carried))]
+    def _prepare(self) -> None:
+        """Create the casters of pulses and of columns, which depend on the surfaces' positions."""
+        caster = self._caster
+        scene = self.scene
+        survey = self.survey
+        surfaces = self._surfaces
+        self._pulses = [
+            PulseCaster(number, caster, scene, survey, surfaces)
+            for number in range(len(survey.carried))
+        ]
         if self._device is not None:
-            self._device = self._device.moved(self.scene, self._surfaces)
-        elif self._caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
-            self._device = DeviceColumns(*given)
+            self._device = self._device.moved(scene, surfaces)
+        elif caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
+            self._device = DeviceColumns(caster, scene, survey, surfaces)
 
     @property
     def backend(self) -> str:
@@ -154,7 +162,7 @@ class Rig:
         return self._caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
+        """Return the rays of firings `first` to `stop` of a sensor, in the frame of its carrier."""
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
         mount = carried.mount
@@ -167,47 +175,37 @@ class Rig:
         return Pattern(directions, origins)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
-        """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
-        run: list[ScanSpec] = []
+        """Cast scans `first` to `stop` of the survey; yield the returns of each run of scans."""
+        specs: list[ScanSpec] = []
         for spec in map(self.survey.sent_scan, range(first, stop)):
-            here = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
-            last = run[-1] if run else spec
-            if run and here != (last.sensor, last.station, last.firings[1], last.repeats):
-                yield self.returns(run, self.survey.path)
-                run = []
-            run.append(spec)
-        if run:
-            yield self.returns(run, self.survey.path)
+            sequence = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
+            last = specs[-1] if specs else spec
+            if specs and sequence != (last.sensor, last.station, last.firings[1], last.repeats):
+                yield self.returns(specs, self.survey.path)
+                specs = []
+            specs.append(spec)
+        if specs:
+            yield self.returns(specs, self.survey.path)
 
     def returns(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0, *, tally: bool = True
     ) -> BatchPoints | DevicePoints:
-        """Cast scans of one station, the firings of each following those of the one before.
+        """Cast consecutive scans of a station.
 
-        The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
+        The carrier's poses are `late_ns` nanoseconds after the times of the firings. Hits of each
         triangle are counted if `tally`.
         """
         number = specs[0].sensor
-        survey = self.survey
-        whole, by_head = self._repeated(number, path.moves)
-        carried = survey.carried[number]
-        channels = carried.sensor.channels
+        repeated, by_head = self._rays_of_sensor(number, path.moves)
+        sensor = self.survey.carried[number].sensor
+        channels = sensor.channels
         first = specs[0].firings[0]
         stop = specs[-1].firings[1]
-        if path.moves or by_head:
-            poses = poses_of_firings(carried, path, specs[0].station, first, stop, late_ns)
-        else:
-            pose = path.pose(specs[0].station)
-            poses = CastPoses(np.array(pose.position), pose.rotation)
-        fired = Firings.of(carried.sensor, specs)
-        poses = self._timed(poses, fired)
-        if path.moves:
-            begins = carried.sensor.begins_ns(fired.numbers) + late_ns
-            carrier = Clock(begins, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
-            poses = replace(poses, carrier=carrier, station=specs[0].station)
-        if whole is not None:
-            pattern = whole
-            start = first * channels % len(whole)
+        firings = Firings.from_scans(sensor, specs)
+        poses = self._poses(firings, path, late_ns, by_head=by_head)
+        if repeated is not None:
+            pattern = repeated
+            start = first * channels % len(repeated)
         else:
             pattern = self.pattern(number, first, stop)
             start = 0
@@ -215,63 +213,118 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        scan = specs[0].scan + specs[0].ahead
-        found = self._pulses[number].scan(scan, pattern, poses, window, groups, fired, tally=tally)
-        return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
+        scanned = self._pulses[number].scan(
+            specs[0].scan + specs[0].ahead, pattern, poses, window, groups, firings, tally=tally
+        )
+        return BatchPoints(
+            self.scene,
+            self.survey,
+            self._surfaces,
+            specs,
+            scanned,
+            pattern=pattern,
+            start=start,
+            poses=poses,
+        )
 
-    def _timed(self, poses: CastPoses, fired: Firings) -> CastPoses:
-        """Return poses of firings with the times that actors need."""
+    def _poses(
+        self, firings: Firings, path: Trajectory, late_ns: float, *, by_head: bool
+    ) -> CastPoses:
+        """Return the poses of consecutive firings on a path, with the clocks that motion needs."""
+        spec = firings.spec
+        carried = self.survey.carried[spec.sensor]
+        if path.moves or by_head:
+            first = spec.firings[0]
+            stop = first + len(firings.numbers)
+            poses = poses_of_firings(carried, path, spec.station, first, stop, late_ns)
+        else:
+            pose = path.pose(spec.station)
+            poses = CastPoses(np.array(pose.position), pose.rotation)
+        poses = self._with_actor_clock(poses, firings)
+        if path.moves:
+            firing_starts = carried.sensor.begins_ns(firings.numbers) + late_ns
+            carrier = Clock(firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
+            poses = replace(poses, carrier=carrier, station=spec.station)
+        return poses
+
+    def _with_actor_clock(self, poses: CastPoses, firings: Firings) -> CastPoses:
+        """Return poses of firings with the clock of the actors, if there are actors."""
         if not self.scene.actors:
             return poses
-        begins = fired.sensor.begins_ns(fired.numbers) + fired.spec.start_ns
-        return replace(poses, clock=Clock(begins, fired.sensor.beams.time_ns, self._ways))
+        sensor = firings.sensor
+        firing_starts = sensor.begins_ns(firings.numbers) + firings.spec.start_ns
+        clock = Clock(firing_starts, sensor.beams.time_ns, self._actor_trajectories)
+        return replace(poses, clock=clock)
 
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Cast the same firings from many poses of a carrier that stands.
+        """Cast the same firings from several poses of a static carrier.
 
-        `specs` are scans of one station; the next pose has the numbers that follow theirs. The
-        poses, (k, 3) and (k, 3, 3), have been checked. Returns float32 (k, firings, channels):
-        ranges of the nearest reported returns, metres; inf where there are none.
+        `specs` are consecutive scans of one station; the scans of the next pose have the next
+        numbers. The poses, (k, 3) and (k, 3, 3), have been checked. Returns the ranges of the
+        nearest reported returns, metres: float32 (k, firings, channels); inf without a return.
         """
-        number = specs[0].sensor
-        sensor = self.survey.carried[number].sensor
+        sensor = self.survey.carried[specs[0].sensor].sensor
         first = specs[0].firings[0]
-        stop = specs[-1].firings[1]
-        pattern = self._rays_of(number, first, stop)
-        begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
+        pattern = self._pattern_of_firings(specs[0].sensor, first, specs[-1].firings[1])
         rays = len(pattern)
-        out = np.full((len(positions), rays), np.inf, np.float32)
-        each = max(1, IMAGE_RAYS // max(rays, 1))  # poses that are cast at a time
-        for begin in range(0, len(positions), each):
-            block = slice(begin, begin + each)
-            image = out[block].reshape(-1)
-            count = len(image) // rays
+        ranges_m = np.full((len(positions), rays), np.inf, np.float32)
+        poses_per_block = max(1, IMAGE_RAYS // max(rays, 1))
+        for begin in range(0, len(positions), poses_per_block):
+            block = slice(begin, begin + poses_per_block)
             poses = CastPoses(
                 positions[block], None if rotations is None else rotations[block], rays
             )
-            fired = Firings.of(sensor, specs, count)
-            poses = self._timed(poses, fired)
-            groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
-            scan = specs[0].scan + specs[0].ahead + begin * len(specs)
-            window = (0, len(image))
-            caster = self._pulses[number]
-            found = caster.scan(scan, pattern, poses, window, groups, fired, tally=False).returns
-            assert found.reported is not None  # of kept returns
-            nearest = found.number == 1
-            image[found.ray[nearest]] = found.reported[nearest]
-        return out.reshape(len(positions), -1, sensor.channels)
+            image = ranges_m[block].reshape(-1)
+            self._cast_images(specs, pattern, poses, begin * len(specs), image)
+        return ranges_m.reshape(len(positions), -1, sensor.channels)
 
-    def _rays_of(self, number: int, first: int, stop: int) -> Pattern:
-        """Rays of some firings in the axes of the carrier."""
+    def _cast_images(
+        self,
+        specs: list[ScanSpec],
+        pattern: Pattern,
+        poses: CastPoses,
+        first_scan: int,
+        image: Floats32,
+    ) -> None:
+        """Write the ranges of the same firings from several poses into `image`.
+
+        `image` has the rays of a pose behind those of the pose before; `first_scan` is the number
+        of the first scan, counted from `specs[0]`.
+        """
+        sensor = self.survey.carried[specs[0].sensor].sensor
+        rays = len(pattern)
+        count = len(image) // rays
+        firings = Firings.from_scans(sensor, specs, count)
+        first = specs[0].firings[0]
+        scan_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
+        returns = (
+            self._pulses[specs[0].sensor]
+            .scan(
+                specs[0].scan + specs[0].ahead + first_scan,
+                pattern,
+                self._with_actor_clock(poses, firings),
+                (0, len(image)),
+                (rays * np.arange(count)[:, None] + scan_rays).reshape(-1),
+                firings,
+                tally=False,
+            )
+            .returns
+        )
+        assert returns.reported is not None  # steps have set the ranges of reported returns
+        nearest = returns.number == 1
+        image[returns.ray[nearest]] = returns.reported[nearest]
+
+    def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
+        """Return the rays of firings in the frame of the carrier, stored for the next images."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first
             first = first % sensor.period
-        made = self._firings.get((number, first, stop))
-        if made is None:
-            if len(self._firings) >= KEPT:
-                self._firings.clear()
-            made = self._firings[number, first, stop] = self.pattern(number, first, stop)
-        return made
+        pattern = self._patterns.get((number, first, stop))
+        if pattern is None:
+            if len(self._patterns) >= MAX_PATTERNS:
+                self._patterns.clear()
+            pattern = self._patterns[number, first, stop] = self.pattern(number, first, stop)
+        return pattern

@@ -1,4 +1,4 @@
-"""The simulator as a function: one sensor in a scene, sweep by sweep."""
+"""The simulator as a function: a sensor in a scene, sweep by sweep."""
 
 from __future__ import annotations
 
@@ -41,36 +41,36 @@ from .rig import Rig
 from .scene_caster import check_backend_here
 from .surfaces import warn_of_grey
 
-SCANS_MOST = 1 << 31  # the type of the column `scan`
-START_MOST_S = 9e9  # times are int64, nanoseconds
-Number = Annotated[int, Field(ge=0, lt=SCANS_MOST)]
-Start = Annotated[float | None, Field(ge=0, lt=START_MOST_S)]
+MAX_SCANS = 1 << 31  # the type of the column `scan`
+MAX_START_S = 9e9  # times are int64, nanoseconds
+Number = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
+Start = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
 
 class Scanner:
-    """A sensor in a scene, which scans when it is called: no cluster, no files.
+    """A sensor in a scene that scans in this process, without a cluster or files.
 
-    It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
-    of that number of a survey along the same trajectory, with the same random numbers if the sensor
-    is the survey's first. Scanners of equal names and equal seeds of their noise repeat the random
-    numbers of each other. Threads may share a scanner. A pickled copy gives the same bytes, as in a
-    task of Dask: the copy makes its own trees, and goes on where the scanner was.
+    A scanner returns the bytes of a survey of the same scans: sweep `number` is the revolution (or
+    frame) with this number of a survey along the same trajectory, with the same random numbers if
+    the sensor is the first of the survey. Scanners with the same name and seed of noise have the
+    same random numbers. Threads may share a scanner. A pickled copy returns the same bytes, as in a
+    task of Dask: the copy builds its trees, and continues with the numbers of the scanner.
 
     Parameters
     ----------
     scene
-        What is scanned.
+        The scanned scene.
     sensor
-        The lidar, or the lidar `Mounted` on a carrier: then poses are the carrier's.
+        The lidar, or the lidar `Mounted` on a carrier: then poses are poses of the carrier.
     name
-        Name of the sensor, which is part of all random numbers: give each sensor of a robot its
-        own. A `Mounted` has a name already.
+        Name of the sensor, which is part of all random numbers: give the sensors of a robot
+        different names. A `Mounted` has a name already.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
     fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
     spray_g_m3
-        As of `Survey`.
+        As in `Survey`.
     backend
-        "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
+        "cuda", "embree", "numpy", or "auto" for the first of the three that can be used.
     threads
         CPU threads to cast with; None for all cores.
     device
@@ -124,7 +124,7 @@ class Scanner:
             sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)],
             poses=[CENTRE],
             steps=1,
-            precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's, as below
+            precision_m=precision_m,  # type: ignore[arg-type]  # None: of the sensor, as below
             columns=columns,
             coordinates=coordinates,
             materials=materials,
@@ -139,10 +139,10 @@ class Scanner:
             spray_g_m3=spray_g_m3,
         )
         warn_of_grey(scene, survey)
-        self._begin(scene, survey, {"backend": backend, "threads": threads, "device": device})
+        self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
-    def _begin(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
-        """Make the rig; `options` are those of `Rig`."""
+    def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
+        """Build the rig; `options` are arguments of `Rig`."""
         check_backend_here(options["backend"])
         try:
             self._rig = Rig(scene, survey, **options)
@@ -155,20 +155,20 @@ class Scanner:
         if scene.instances is not None:
             self._movable[scene.instances.owner] = True
             self._movable[scene.face_object] = False
-        # Sweeps share the caster, and copies are moved in it.
+        # Sweeps share the caster, in which instances are moved.
         self._lock = threading.Condition()
-        self._casts = 0
-        self._moves = 0
+        self._casts = 0  # sweeps under way
+        self._moves = 0  # moves of instances under way or waiting
         self._unnumbered = 0  # sweeps and images without a number so far
 
     def __getstate__(self) -> dict[str, Any]:
         with self._lock:
             rig = self._rig
-            made_of = {"scene": rig.scene, "survey": rig.survey, "options": rig.options}
-            return {"made_of": made_of, "unnumbered": self._unnumbered}
+            arguments = {"scene": rig.scene, "survey": rig.survey, "options": rig.options}
+            return {"arguments": arguments, "unnumbered": self._unnumbered}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._begin(**state["made_of"])
+        self._assemble(**state["arguments"])
         self._unnumbered = state["unnumbered"]
 
     def __repr__(self) -> str:
@@ -188,20 +188,21 @@ class Scanner:
         number: Number | None = None,
         start_s: Start = None,
     ) -> Cloud:
-        """Scan once around.
+        """Scan a sweep: a revolution of the head, or a frame.
 
         Parameters
         ----------
         pose
-            Pose of a sensor that stands, or the trajectory of one that moves: each beam is fired
-            from where it is at its own time. In the scene's local coordinates.
+            Pose of a static sensor, or trajectory of a moving sensor: each beam is fired from the
+            pose at the time of the beam. In the scene's local coordinates.
         number
-            Number of the turn, or frame, from 0. It chooses the firings, since a head turns on
-            where its last turn has ended, and the random numbers. Without, the firings and times
-            are those of turn 0, and each call has random numbers of its own.
+            Number of the revolution, or frame, from 0. The number selects the random numbers and
+            the firings, since a revolution starts at the azimuth at which the last revolution has
+            stopped. By default, firings and times are those of revolution 0, and each call has
+            new random numbers.
         start_s
-            When the turn begins, seconds since the start of the trajectory, and of those of
-            actors. By default when it does in a survey: `number` times the duration of a turn.
+            Start of the revolution, seconds since the start of the trajectories of the sensor and
+            the actors. By default as in a survey: `number` times the duration of a revolution.
 
         Returns
         -------
@@ -211,9 +212,9 @@ class Scanner:
         Raises
         ------
         LidarError
-            If the trajectory, or that of an actor, does not last as long as the sweep.
+            If the trajectory of the sensor or an actor is shorter than the sweep.
         """
-        path = _path(pose)
+        path = _trajectory_of(pose)
         with self._casting() as rig:
             specs, late_ns = self._specs(rig, number, start_s, 1)
             begin_ns, end_ns = _span_ns(rig, specs)
@@ -232,43 +233,46 @@ class Scanner:
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
         part = columns_of([returns])
-        # A device writes to page-locked memory with room for all rays: the next sweep needs it.
-        made = {column.name: part.columns[column.name] for column in table[1:]}
-        own = {name: v if v.flags.owndata else v.copy() for name, v in made.items()}
-        part = replace(part, columns={**part.columns, **own})
+        # A device writes to page-locked memory with room for all rays, which the next sweep needs.
+        columns = {column.name: part.columns[column.name] for column in table[1:]}
+        owned_columns = {
+            name: values if values.flags.owndata else values.copy()
+            for name, values in columns.items()
+        }
+        part = replace(part, columns={**part.columns, **owned_columns})
         return part.cloud(table, survey.precision_m, origin)
 
     @checked
     def ranges(
         self, poses: Pose | ArrayLike, *, number: Number | None = None, start_s: Start = None
     ) -> Floats32:
-        """Ranges that the sensor measures from many poses at one time, as images.
+        """Return images of the ranges that the sensor measures from several poses.
 
-        This is the fastest way to scan: no points are made.
+        This is the fastest way to scan: no points are computed.
 
         Parameters
         ----------
         poses
-            One pose, or a list; positions (k, 3), metres; or matrices (k, 4, 4) from the axes of
-            the sensor, or of its carrier, to the scene's. The sensor stands at each.
+            A pose or a list of poses; positions (k, 3), metres; or matrices (k, 4, 4) from the
+            frame of the sensor, or of its carrier, to the scene frame. The sensor is static.
         number
-            Number of the turn; as of `sweep`. The image of pose i has the random numbers of turn
-            ``number + i``.
+            Number of the revolution, as in `sweep`. The image of pose i has the random numbers of
+            revolution ``number + i``.
         start_s
-            When the turn begins, for actors; as of `sweep`.
+            Start of the revolution, for actors, as in `sweep`.
 
         Returns
         -------
         float32 (k, firings, channels)
-            Range of the nearest reported return of each ray, metres; inf where nothing returns.
+            Range of the nearest reported return of each ray, metres; inf without a return.
 
         Raises
         ------
         LidarError
-            If the poses are no such list or array, a number is not finite, or a matrix mirrors or
-            deforms.
+            If the poses are neither such a list nor array, a number is not finite, or a matrix
+            mirrors or deforms.
         """
-        positions, rotations = _placed(poses)
+        positions, rotations = _poses_of(poses)
         with self._casting() as rig:
             specs, _ = self._specs(rig, number, start_s, len(positions))
             if not len(positions):
@@ -276,24 +280,23 @@ class Scanner:
                 return np.empty((0, firings, specs[0].channels), np.float32)
             rays = sum(spec.ray_count for spec in specs)
             try:
-                made = check_poses(positions, rotations, rays, rays * len(positions), None)
+                checked_poses = check_poses(positions, rotations, rays, rays * len(positions), None)
             except ValueError as error:
                 raise LidarError(str(error)) from error
-            return rig.ranges(specs, made.positions, made.rotations)
+            return rig.ranges(specs, checked_poses.positions, checked_poses.rotations)
 
     @checked
     def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
-        """Place an actor or a copy; sweeps that have begun see it where it was.
+        """Move an actor or an instance; sweeps under way still see the earlier pose.
 
         Parameters
         ----------
         name
-            Of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy of a
-            scenario.
+            Name of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy
+            of a scenario.
         pose
-            Where it stands from now on: of its mesh's own axes, in the scene's local coordinates.
-            An instance keeps its scale. An actor may also get a trajectory, which it follows from
-            time 0 on.
+            New pose of the mesh's frame, in the scene's local coordinates. An instance keeps its
+            scale. An actor may also get a trajectory, which it follows from time 0 on.
 
         Raises
         ------
@@ -301,11 +304,11 @@ class Scanner:
             If there is no such actor or instance, an instance would move during a sweep, or a
             rotation of the trajectory mirrors or deforms.
         """
-        path = _path(pose)
+        path = _trajectory_of(pose)
         scene = self._rig.scene
-        standing = len(scene.names)
+        object_count = len(scene.names)
         number = self._numbers.get(name, -1)
-        if 0 <= number < standing and self._movable[number]:
+        if 0 <= number < object_count and self._movable[number]:
             if path.moves:
                 raise LidarError(
                     f"{name!r} is a SceneInstance, which stands still during a sweep: give a pose, "
@@ -313,21 +316,21 @@ class Scanner:
                 )
             self._move_instance(number, path.pose(0))
             return
-        if number < standing:
-            names = [*list(self._numbers)[standing:], *compress(scene.names, self._movable)]
+        if number < object_count:
+            names = [*list(self._numbers)[object_count:], *compress(scene.names, self._movable)]
             hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
             if number >= 0:
                 hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
             raise LidarError(f"There is no actor or instance {name!r}.{hint}")
         with self._lock:
-            self._actors[number - standing] = replace(
-                self._actors[number - standing], trajectory=path
-            )
+            actor = self._actors[number - object_count]
+            self._actors[number - object_count] = replace(actor, trajectory=path)
             self._rig = self._rig.with_actors(tuple(self._actors))
 
     def _move_instance(self, number: int, pose: Pose) -> None:
+        """Move an instance after the sweeps under way; new sweeps wait meanwhile."""
         with self._lock:
-            self._moves += 1  # sweeps that have not begun wait
+            self._moves += 1  # new sweeps wait
             try:
                 self._lock.wait_for(lambda: not self._casts)
                 self._rig = self._rig.moved(number, pose)
@@ -338,12 +341,15 @@ class Scanner:
     def _specs(
         self, rig: Rig, number: int | None, start_s: float | None, count: int
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
+        """Return the scans of a revolution, and its delay relative to a survey, nanoseconds.
+
+        Without a `number`, `count` sweeps are counted, each with new random numbers.
+        """
         sensor = rig.survey.sensor
         ahead = 0
         steps = sensor.steps_of_turn(number or 0)
-        if steps.stop > SCANS_MOST:
-            raise LidarError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+        if steps.stop > MAX_SCANS:
+            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
         if number is None:
             with self._lock:
                 ahead = self._unnumbered * len(steps)
@@ -359,7 +365,7 @@ class Scanner:
 
     @contextmanager
     def _casting(self) -> Iterator[Rig]:
-        """Rig as it is now; meanwhile instances stay where they are."""
+        """Yield the current rig; instances are not moved until the context exits."""
         with self._lock:
             self._lock.wait_for(lambda: not self._moves)
             self._casts += 1
@@ -373,25 +379,27 @@ class Scanner:
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
-    """When the first and the last firing of scans begin, nanoseconds."""
+    """Return the start times of the first and the last firing of scans, nanoseconds."""
     sensor = rig.survey.sensor
-    ends = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
-    begin, end = (sensor.begins_ns(ends) + (sensor.lead_ns + specs[0].start_ns)).tolist()
+    first_and_last = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
+    begin, end = (sensor.begins_ns(first_and_last) + (sensor.lead_ns + specs[0].start_ns)).tolist()
     return begin, end
 
 
-def _path(given: Any) -> Trajectory:
-    path: Trajectory = given if hasattr(given, "poses") else Stations((pose_of("pose", given),))
+def _trajectory_of(pose: Any) -> Trajectory:
+    """Return a trajectory as is, or the trajectory of a static pose."""
+    path: Trajectory = pose if hasattr(pose, "poses") else Stations((pose_of("pose", pose),))
     return path
 
 
-def _placed(poses: Any) -> tuple[Floats, Floats | None]:
-    """Positions (k, 3) and rotations (k, 3, 3), or None."""
+def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
+    """Return positions (k, 3) and rotations (k, 3, 3), or None for poses without rotations."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
-        made = [pose_of("a pose", pose) for pose in poses]
-        return np.array([pose.position for pose in made]), np.array([pose.turn for pose in made])
+        valid_poses = [pose_of("a pose", pose) for pose in poses]
+        positions = np.array([pose.position for pose in valid_poses])
+        return positions, np.array([pose.turn for pose in valid_poses])
     try:
         table = np.asarray(poses, np.float64)
     except (TypeError, ValueError):

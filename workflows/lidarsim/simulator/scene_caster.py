@@ -1,13 +1,13 @@
 """The ray caster of a whole scene: the static scene, its instances, and moving actors.
 
-Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt: see
-`raybeam.moving`.
+Each ray is transformed to the frame of an actor at the time of the ray, so that no tree is ever
+rebuilt: see `raybeam.moving`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,28 +40,38 @@ from .motion import CastPoses, Clock
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
-SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
+SHORT = 1e-3  # share of a distance: a ray that ends by so little before a point reaches the point
 
 
-def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
-    """Refuse a backend that this machine lacks, before a local cluster is started for it."""
-    # An interrupt during the import of an extension module would look like a missing one.
+class _ActorShapes(NamedTuple):
+    """Shapes of actors; actors of the same mesh share a shape."""
+
+    casters: tuple[RayCaster | Deforming, ...]
+    boxes: Floats  # (s, 2, 3): bounds of the shapes, metres
+    part_triangles: Ints32  # (s, p): first triangle of each part of a shape
+    shape: Indices  # (a,): shape of each actor
+
+
+def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
+    """Refuse a backend that this machine lacks, before a local cluster is started."""
+    # An interrupt during the import of an extension module would look like a missing module.
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
-    if wanted not in backends:
-        hint = did_you_mean(wanted, backends) or f" There are {', '.join(backends)}."
-        raise LidarError(f"There is no backend {wanted!r}.{hint}")
-    if backends[wanted]:
-        raise LidarError(f"Backend {wanted!r} cannot be used here: {backends[wanted]}. {advice}")
+    if backend not in backends:
+        hint = did_you_mean(backend, backends) or f" There are {', '.join(backends)}."
+        raise LidarError(f"There is no backend {backend!r}.{hint}")
+    if backends[backend]:
+        raise LidarError(f"Backend {backend!r} cannot be used here: {backends[backend]}. {advice}")
 
 
 class SceneCaster:
     """Casts scans like `RayCaster.scan`, including hits on actors.
 
-    Triangles of instances are numbered after those of the scene, and those of actors after both.
-    Rays that touch no actor give the same bits as without actors. Where the actors are, the poses
-    of a scan say. A tally is by the counters of `surfaces`. `options` are those of `RayCaster`. The
-    caster of another `like` this one, of the same scene but for actors, is shared.
+    Triangles of instances are numbered after the triangles of the scene, triangles of actors after
+    both. Rays that touch no actor give the same bits as without actors. The poses of a scan have
+    the trajectories of the actors. A tally is by the counters of `surfaces`. `options` are
+    arguments of `RayCaster`. `like` is a caster of the same scene, possibly with other actors,
+    whose trees are shared.
     """
 
     def __init__(
@@ -69,13 +79,14 @@ class SceneCaster:
     ) -> None:
         self._surfaces = surfaces
         self._shared = scene.instances
-        self._begins: Ints32 | None = None  # of each body of the caster
+        self._first_triangles: Ints32 | None = None  # of each body of the caster
         self._faces = faces = len(scene.faces)
         if self._shared is not None:
-            begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
-            self._begins = np.append([0] * bool(faces), begins).astype(np.int32)
+            first_triangles = faces + np.cumsum([0, *self._shared.sizes[:-1]])
+            self._first_triangles = np.append([0] * bool(faces), first_triangles).astype(np.int32)
             faces += self._shared.triangles
-        # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
+        # Distance behind a surface at which light continues, so as not to hit the surface again:
+        # Embree's rounding is up to a quarter of this distance.
         reach = np.float32(np.abs(scene.bounds).max())
         self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
         self._media = surfaces.media
@@ -86,10 +97,11 @@ class SceneCaster:
             self.caster = like.caster
         self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
-        self._firsts = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)  # triangles
+        # First triangle of each actor.
+        self._actor_triangles = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def place(self, surfaces: Surfaces, shared: Instances, rows: Indices) -> None:
-        """Move some instances to where they are now; no scan may be under way."""
+    def move_instances(self, surfaces: Surfaces, shared: Instances, rows: Indices) -> None:
+        """Move instances `rows` to their transforms in `shared`; no scan may be under way."""
         first = self.caster.instance_count - len(shared)
         for row in rows:
             self.caster.move(first + int(row), shared.transforms[row])
@@ -97,10 +109,13 @@ class SceneCaster:
         self._shared = shared
 
     def counters(self) -> tuple[Ints, int]:
-        """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
+        """Return the counters of bodies for `RayCaster.visit`, and their number.
+
+        Each instance has a counter, see `Scene.counters`. Array (bodies, 2).
+        """
         shared = 0 if self._shared is None else len(self._shared)
-        own = self.caster.instance_count - shared
-        rows = [[0, 1]] * own + [[self._faces + number, 0] for number in range(shared)]
+        static_count = self.caster.instance_count - shared
+        rows = [[0, 1]] * static_count + [[self._faces + number, 0] for number in range(shared)]
         return np.array([*rows, [shared, 1]], np.int64), self._surfaces.counters
 
     @property
@@ -121,26 +136,33 @@ class SceneCaster:
         tally: bool = False,
         room: Floats | None = None,
     ) -> ScanReturns:
-        """See `RayCaster.scan`; the poses have a clock if there are actors."""
-        start, stop = (0, len(pattern)) if window is None else window
+        """Cast rays of a pattern as `RayCaster.scan`, and also on actors.
+
+        The arguments are those of `RayCaster.scan`. If there are actors, the poses have a clock.
+        """
         common: dict[str, Any] = {
-            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max, "room": room,
-        }  # fmt: skip
-        if self._begins is None and self._shapes is None:
+            **poses.caster_arguments,
+            "window": (0, len(pattern)) if window is None else window,
+            "t_min": t_min,
+            "t_max": t_max,
+            "room": room,
+        }
+        if self._first_triangles is None and self._shapes is None:
             return self.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
-        found = self.caster.scan(pattern, **common)
-        if self._begins is not None:
-            found = replace(found, triangle=found.triangle + self._begins[found.instance])
-        ray = found.ray.astype(np.int64)
-        distance = found.distance
-        triangle = found.triangle
-        if self._shapes is not None:
+        hits = self.caster.scan(pattern, **common)
+        if self._first_triangles is not None:
+            hits = replace(hits, triangle=hits.triangle + self._first_triangles[hits.instance])
+        if self._shapes is None:
+            ray = hits.ray.astype(np.int64)
+            distance = hits.distance
+            triangle = hits.triangle
+        else:
             scan = check_scan(pattern, **common)
-            ray, distance, triangle = self._with_actors(found, scan, poses)
-        begins = np.zeros(1, np.int64) if groups is None else groups
-        cuts = np.append(np.searchsorted(ray, begins), len(ray))
+            ray, distance, triangle = self._with_actors(hits, scan, poses)
+        group_starts = np.zeros(1, np.int64) if groups is None else groups
+        cuts = np.append(np.searchsorted(ray, group_starts), len(ray))
         counts = np.diff(cuts)
         counted = None
         if tally:
@@ -148,106 +170,123 @@ class SceneCaster:
                 self._surfaces.counter(triangle), minlength=self._surfaces.counters
             )
         if keep_every > 1:
-            place = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
-            kept = np.flatnonzero(place % keep_every == 0)
-            ray = ray[kept]
-            distance = distance[kept]
-            triangle = triangle[kept]
+            number_in_group = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
+            rows = np.flatnonzero(number_in_group % keep_every == 0)
+            ray = ray[rows]
+            distance = distance[rows]
+            triangle = triangle[rows]
         none = np.zeros(len(ray), np.int32)
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
 
-    def free(
+    def is_visible(
         self,
         origins: Floats,
         towards: Floats,
         distance: Floats,
         times: Floats,
-        ways: ActorTrajectories,
+        actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
-        free = np.ones(len(distance), np.bool_)
+        """Return whether points are visible from origins (n, 3), at firing times (n,): (n,).
+
+        `towards` are vectors from the origins to the points, (n, 3), of lengths `distance` (n,).
+        """
+        visible = np.ones(len(distance), np.bool_)
         if len(distance):
-            now = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
-            found = self.scan(Pattern(towards / distance[:, None], origins), now)
-            free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
-        return free
+            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            hits = self.scan(Pattern(towards / distance[:, None], origins), poses)
+            visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - SHORT)
+        return visible
 
     def _with_actors(
-        self, found: ScanReturns, scan: Scan, poses: CastPoses
+        self, static_hits: ScanReturns, scan: Scan, poses: CastPoses
     ) -> tuple[Ints, Floats, Ints32]:
-        """Rays, distances and triangles of all hits, those on actors among them."""
+        """Return rays, distances and triangles of the nearest hits on static bodies and actors."""
         from . import surface_loops  # not before: numba takes half a second to import
 
-        before = np.full(len(scan), np.inf)
-        before[found.ray] = found.distance
-        on, numbers = self._nearest(scan, poses, before)
+        static_distance = np.full(len(scan), np.inf)
+        static_distance[static_hits.ray] = static_hits.distance
+        nearest, shapes = self._nearest(scan, poses, static_distance)
         ray = np.empty(len(scan), np.int64)
         distance = np.empty(len(scan))
         triangle = np.empty(len(scan), np.int32)
-        given = found.ray, found.triangle, *on, *numbers
-        count = surface_loops.merge(*given, ray, distance, triangle)
+        count = surface_loops.merge(
+            static_hits.ray,
+            static_hits.triangle,
+            *nearest,
+            shapes.part_triangles,
+            shapes.shape,
+            self._actor_triangles,
+            ray,
+            distance,
+            triangle,
+        )
         return ray[:count], distance[:count], triangle[:count]
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""
-        hits, (parts, shape, firsts) = self._nearest(scan, poses)
+        hits, shapes = self._nearest(scan, poses)
         ray = np.flatnonzero(hits.body >= 0)
-        body = hits.body[ray]
+        actor = hits.body[ray]
         triangle = hits.triangle[ray]
-        triangle = triangle + parts[shape[body], hits.instance[ray]] + firsts[body]
+        part_triangle = shapes.part_triangles[shapes.shape[actor], hits.instance[ray]]
+        triangle = triangle + part_triangle + self._actor_triangles[actor]
         return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
 
     def _nearest(
-        self, scan: Scan, poses: CastPoses, before: Floats | None = None
-    ) -> tuple[Nearest, tuple[Ints32, Indices, Ints32]]:
-        """Nearest hits on actors, before distances (n,), and what makes their triangles' numbers.
-
-        First triangles of parts, (s, p), shapes (a,) and first triangles (a,) of actors.
-        """
+        self, scan: Scan, poses: CastPoses, limit: Floats | None = None
+    ) -> tuple[Nearest, _ActorShapes]:
+        """Return the nearest hits on actors, before distances `limit` (n,), and the shapes."""
         assert self._shapes is not None
-        casters, boxes, parts, shape = self._shapes
-        ways = poses.ways
-        frames = lambda body, times: ways.played(body, times)[0]  # noqa: E731
-        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table, frames)
-        return hits_on(moving, scan, poses.times, before), (parts, shape, self._firsts)
+        trajectories = poses.actor_trajectories
+
+        def frames(actor: Ints, times: Floats) -> Floats:
+            """Return the frames of animations of actors at times, which deform their meshes."""
+            return trajectories.played(actor, times)[0]
+
+        moving = Moving(
+            self._shapes.casters,
+            self._shapes.boxes,
+            self._shapes.shape,
+            trajectories.presence_ns,
+            trajectories.table,
+            frames,
+        )
+        return hits_on(moving, scan, poses.times, limit), self._shapes
 
 
 def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
-    """Build the trees of all that stands still, with vertices of the scene's faces."""
+    """Build the trees of static bodies, with `vertices` of the scene's faces."""
     if scene.instances is None:
         return RayCaster(vertices, scene.faces, **options)
-    own = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
+    static_instances = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
     meshes = [_mesh_of(part) for part in scene.instances.parts]
-    placed = zip(scene.instances.part, scene.instances.transforms, strict=True)
-    return RayCaster.of(
-        [*own, *(Instance(meshes[part], matrix) for part, matrix in placed)], **options
-    )
+    instances = [
+        Instance(meshes[part], matrix)
+        for part, matrix in zip(scene.instances.part, scene.instances.transforms, strict=True)
+    ]
+    return RayCaster.of([*static_instances, *instances], **options)
 
 
 def _mesh_of(part: MeshPart) -> Mesh:
+    """Return the mesh of a part, with the mask of its texture, if any."""
     opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
     return Mesh(part.vertices, part.faces, opacity)
 
 
-def _shapes(
-    actors: tuple[Actor, ...], options: dict[str, Any]
-) -> tuple[tuple[RayCaster | Deforming, ...], Floats, Ints32, Indices] | None:
-    """Shapes of actors: casters, boxes (s, 2, 3), first triangles of parts (s, p), and whose (a,).
-
-    None without actors.
-    """
+def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
+    """Build the casters of the shapes of actors; None without actors."""
     if not actors:
         return None
     meshes, shape = shapes_of(actors)
     parts = [[*parts_of(mesh)] for mesh in meshes]
-    firsts = np.zeros((len(meshes), max(map(len, parts))), np.int32)
-    for row, own in zip(firsts, parts, strict=True):
-        row[1 : len(own)] = np.cumsum([len(part.faces) for part in own])[:-1]
+    part_triangles = np.zeros((len(meshes), max(map(len, parts))), np.int32)
+    for row, mesh_parts in zip(part_triangles, parts, strict=True):
+        row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]
     casters = tuple(
         Deforming(mesh.animation.vertices, mesh.faces)
         if mesh.animation
-        else RayCaster.of([Instance(_mesh_of(part)) for part in own], **options)
-        for mesh, own in zip(meshes, parts, strict=True)
+        else RayCaster.of([Instance(_mesh_of(part)) for part in mesh_parts], **options)
+        for mesh, mesh_parts in zip(meshes, parts, strict=True)
     )
     boxes = np.array([(mesh.animation or mesh).bounds for mesh in meshes])
-    return casters, boxes, firsts, shape
+    return _ActorShapes(casters, boxes, part_triangles, shape)

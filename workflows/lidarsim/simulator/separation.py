@@ -202,14 +202,18 @@ class SeparationStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether rays may have no return or several, and there are no waveforms."""
-        return setup.several and not setup.in_waveforms
+        return setup.has_several_returns and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of the hits of a batch."""
         setup = self.setup
-        shown = "all" if setup.receives_more else setup.reporting.mode  # then `SelectionStep`
+        shown = (
+            "all" if setup.has_received_returns else setup.reporting.mode
+        )  # then `SelectionStep`
         reporting = Reporting(shown, setup.noise, batch.keys, batch.start)
-        return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, reporting)
+        return separated(
+            returns, setup.half_pulse_m, batch.subrays_per_beam, batch.planes, batch.air, reporting
+        )
 
 
 class SelectionStep(PulseStep):
@@ -221,7 +225,7 @@ class SelectionStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether the receiver adds or joins returns before it selects."""
-        return setup.receives_more
+        return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the reported returns of a batch."""

@@ -99,7 +99,7 @@ class SprayStep(PulseStep):
             return returns
         from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
 
-        subrays = batch.each
+        subrays = batch.subrays_per_beam
         count = (batch.stop - batch.start) * subrays
         reach_m = light_reach(self._materials, self.surfaces, returns, count)
         crossings = self._crossings(batch, reach_m.reshape(-1, subrays).max(axis=1))
@@ -128,7 +128,7 @@ class SprayStep(PulseStep):
         while row < len(crossings.beam):
             hits = room_for_hits(1024 + len(crossings.beam))
             row, count = spray_loops.sample_clumps(
-                row, crossings, batch.each, tables, keys, reach_m, hits
+                row, crossings, batch.subrays_per_beam, tables, keys, reach_m, hits
             )
             parts.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
         clumps = joined(parts)
@@ -143,9 +143,11 @@ class SprayStep(PulseStep):
 
         assert self._clumps is not None
         ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
-        times = batch.here.times(ring_order * batch.each)
-        spray_boxes = self._boxes(batch.here.ways, times.min(), times.max())
-        rays = np.concatenate([vectors.T.take(ring_order, axis=1) for vectors in batch.middles])
+        times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
+        spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
+        rays = np.concatenate(
+            [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
+        )
         reach_m = np.minimum(reach_m[ring_order], self._clumps[1][0, -1])
         cell, box, cell_rays = near_boxes(
             rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())

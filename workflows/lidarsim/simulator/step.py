@@ -31,24 +31,24 @@ from .surfaces import Surfaces
 
 
 class Role(Flag):
-    """What a step does to pulses; each step declares at least one flag."""
+    """Kinds of effects of a step on pulses; each step declares a flag or several."""
 
-    AIMS = auto()  # turns beams before they are cast
-    ABOUT_AXIS = auto()  # turns them in azimuth and elevation of the head, not in any two axes
-    CHANGES = auto()  # a ray may then have no return, several, another energy or a waveform
-    RECEIVES = auto()  # likewise, by returns that the receiver adds or joins before it selects
-    OF_KEPT = auto()  # acts on the returns that are kept, of all batches together
+    AIMS = auto()  # deflects beams before they are cast
+    ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
+    CHANGES = auto()  # a ray may then have no return, several, a changed energy or a waveform
+    RECEIVES = auto()  # as CHANGES, by returns that the receiver adds or joins before it selects
+    ON_REPORTED = auto()  # acts on the reported returns of all batches together
     FRAME = auto()  # casts rays, makes returns of hits or selects returns, for the other steps
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """One sensor of a survey in a scene, by which steps are chosen."""
+    """A sensor of a survey in a scene, by which the steps are chosen."""
 
     scene: Scene
     survey: Survey
     number: int  # of the sensor
-    # Roles of all steps that apply, but for `Role.FRAME`; None while these steps are chosen.
+    # Roles of all steps that apply, without `Role.FRAME`; None until the steps are chosen.
     roles: Role | None
 
     @property
@@ -63,38 +63,38 @@ class Setup:
 
     @property
     def reporting(self) -> Returns:
-        """Beam of the sensor, and which returns are reported."""
+        """Beam of the sensor, and the mode that selects the reported returns."""
         return self.survey.returns_each[self.number]
 
     @property
-    def gap_m(self) -> float:
+    def half_pulse_m(self) -> float:
         """Half of the pulse's length, metres."""
         return self.reporting.of(self.sensor.optics)[1]
 
     @property
-    def moving(self) -> bool:
+    def has_velocities(self) -> bool:
         """Whether returns have radial velocities."""
         return any(column.name == VELOCITY for column in self.survey.stored_columns)
 
     @property
     def leafy(self) -> bool:
-        """Whether anything is full of leaves."""
-        leaves = any(m.leaf_area_density is not None for m in self.survey.materials)
-        return leaves or bool(self.scene.has_voxels.any())
+        """Whether the scene has crowns: bodies or voxels with leaves."""
+        crowns = any(m.leaf_area_density is not None for m in self.survey.materials)
+        return crowns or bool(self.scene.has_voxels.any())
 
     @property
-    def passing(self) -> bool:
-        """Whether light goes on through surfaces or off surfaces."""
+    def has_onward_light(self) -> bool:
+        """Whether surfaces transmit or mirror light."""
         glass = any(m.transparent == "pass" for m in self.survey.materials)
-        return glass or self.mirroring or self.leafy
+        return glass or self.has_mirrors or self.leafy
 
     @property
-    def mirroring(self) -> bool:
+    def has_mirrors(self) -> bool:
         """Whether surfaces mirror light."""
         return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
 
     @property
-    def refracting(self) -> bool:
+    def refracts(self) -> bool:
         """Whether light is refracted."""
         return any(m.refractive_index is not None for m in self.survey.materials)
 
@@ -104,25 +104,25 @@ class Setup:
         return self.reporting.waveform != "none"
 
     @property
-    def recorded(self) -> int:
+    def waveform_samples(self) -> int:
         """Samples of the recorded waveform of each return."""
         return self.survey.waveform_samples
 
     @property
-    def several(self) -> bool:
-        """Whether a ray that hits something may have no return, or several; else it has one."""
+    def has_several_returns(self) -> bool:
+        """Whether a ray that hits a surface may have no return or several, instead of a single."""
         if self.has(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
-        return self.reporting.subrays > 1 or self.passing or dark or self.noise.loses
+        return self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses
 
     @property
-    def receives_more(self) -> bool:
-        """Whether the receiver adds to the returns of a pulse or joins some, before it selects."""
+    def has_received_returns(self) -> bool:
+        """Whether the receiver adds or joins returns of a pulse before the selection."""
         return self.has(Role.RECEIVES)
 
     def has(self, roles: Role) -> bool:
-        """Return whether a step that applies has one of some roles.
+        """Return True if a step that applies has a role among `roles`.
 
         Raises
         ------
@@ -134,26 +134,26 @@ class Setup:
         return bool(self.roles & roles)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return the faults of some kinds of the sensor, see `Survey.faults_of`."""
+        """Return the faults of the sensor of these kinds, by their numbers in the survey."""
         return self.survey.faults_of(self.number, *kinds)
 
 
 class Sizes(NamedTuple):
-    """Numbers of what takes memory, if all rays hit something."""
+    """Numbers of rays and returns in memory, if all rays hit a surface."""
 
     rays: int
     beams: float  # cast at a time
     subrays: int  # of the beams that are cast at a time
     returns: float  # of all rays
-    points: float  # returns that are kept
+    points: float  # returns that become points
 
 
 class Memory(NamedTuple):
     """Peak memory of casting, in bytes."""
 
-    kept: float = 0.0  # until columns are made
-    casting: float = 0.0  # while some beams are cast
-    counting: float = 0.0  # then, while all returns are counted and thinned out
+    retained: float = 0.0  # until columns are made
+    casting: float = 0.0  # while the beams of a batch are cast
+    counting: float = 0.0  # afterwards, while all returns are counted and thinned out
 
 
 class Emitter:
@@ -162,8 +162,8 @@ class Emitter:
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
         carried = setup.survey.carried[setup.number]
-        # The axis that the head turns about, in the carrier's axes: of an oval beam, sub-rays lie
-        # across it and towards it.
+        # Axis of the head's revolutions, carrier frame: the sub-rays of an oval beam lie across
+        # the axis and towards the axis.
         axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
         self._axis = turned(axis, carried.mount.rotation)[0]
         self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
@@ -171,7 +171,7 @@ class Emitter:
     def __len__(self) -> int:
         return len(self.beam)
 
-    def divided(
+    def subrays_of(
         self,
         pattern: Pattern,
         offsets: Floats | None = None,
@@ -179,9 +179,18 @@ class Emitter:
         *,
         by_head: bool = False,
     ) -> Pattern:
-        """Return the sub-rays of beams, or of some rows, with offsets of angles, radians.
+        """Return the sub-rays of beams.
 
-        `by_head` says that the beams are in the axes of the head, not in those of the carrier.
+        Parameters
+        ----------
+        pattern
+            Rays in the middles of the beams.
+        offsets
+            (n, 2): angles that are added to the directions of the beams, radians.
+        rows
+            (n,): rows of `pattern` that are divided; by default all.
+        by_head
+            Whether the beams are in the frame of the head, not of the carrier.
         """
         if len(self) == 1 and offsets is None:
             return pattern
@@ -192,7 +201,7 @@ class Emitter:
 
 @dataclass(eq=False)
 class PulseBatch:
-    """Consecutive beams, and what steps leave for later ones."""
+    """Consecutive beams, and the results of steps for later steps."""
 
     keys: Keys
     start: int  # number of the first beam, counted as in the keys
@@ -205,18 +214,18 @@ class PulseBatch:
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
     hits: PulseReturns | None = None  # of all sub-rays with surfaces
     planes: Planes | None = None  # of `hits`
-    air: PulseReturns | None = None  # hits in the air, which are not among `hits`
+    air: PulseReturns | None = None  # hits in the air, apart from `hits`
 
-    def turn(self, offsets: Floats) -> None:
+    def deflect(self, offsets: Floats) -> None:
         """Add angles to the directions of the beams before they are cast, (n, 2), radians.
 
-        With `Role.ABOUT_AXIS` these are angles of azimuth and elevation, else across and up.
+        With `Role.ABOUT_AXIS` the angles are azimuth and elevation, else across and up.
         """
-        before = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
-        self.offsets = before + offsets
+        earlier = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
+        self.offsets = earlier + offsets
 
     def select(self, rows: Indices) -> PulseReturns:
-        """Leave some of the hits of sub-rays, and their planes; returns the hits that are left."""
+        """Keep the selected rows of `hits` and `planes`; return the remaining hits."""
         assert self.hits is not None
         self.hits = self.hits.take(rows)
         if self.planes is not None:
@@ -225,46 +234,48 @@ class PulseBatch:
         return self.hits
 
     @property
-    def each(self) -> int:
-        """Sub-rays of a beam."""
+    def subrays_per_beam(self) -> int:
+        """Number of sub-rays of a beam."""
         return len(self.emitter)
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the beams, and maybe of other beams."""
+        """Sub-rays of the beams; without offsets, of the whole pattern: see `window`."""
         rows = np.arange(self.first + self.start, self.first + self.stop)
-        some = None if self.offsets is None else rows
-        return self.emitter.divided(self.pattern, self.offsets, some, by_head=self.poses.by_head)
+        pattern_rows = None if self.offsets is None else rows
+        return self.emitter.subrays_of(
+            self.pattern, self.offsets, pattern_rows, by_head=self.poses.by_head
+        )
 
     @property
     def rows(self) -> slice:
-        """Rows of the beams' firings; a batch begins and ends with a firing."""
-        each = self.firings.sensor.channels
-        return slice(self.start // each, self.stop // each)
+        """Rows of the beams' firings; a batch consists of complete firings."""
+        channels = self.firings.sensor.channels
+        return slice(self.start // channels, self.stop // channels)
 
     @property
     def window(self) -> tuple[int, int]:
-        """First row of the sub-rays in `beams`, and one past the last."""
-        row = 0 if self.offsets is not None else (self.first + self.start) * self.each
-        return row, row + (self.stop - self.start) * self.each
+        """Rows of the sub-rays of this batch in `beams`: start and stop."""
+        row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
+        return row, row + (self.stop - self.start) * self.subrays_per_beam
 
     @cached_property
-    def here(self) -> CastPoses:
+    def subray_poses(self) -> CastPoses:
         """Poses of the sub-rays."""
-        return self.poses.part(self.start, self.stop, self.each)
+        return self.poses.part(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property
-    def middles(self) -> tuple[Floats, Floats]:
+    def central_rays(self) -> tuple[Floats, Floats]:
         """Origins and directions (n, 3) of the rays in the middles of the beams."""
-        rows = np.arange(self.stop - self.start) * self.each
-        origins, directions = self.here.rays(self.beams, rows, self.window[0])
+        rows = np.arange(self.stop - self.start) * self.subrays_per_beam
+        origins, directions = self.subray_poses.rays(self.beams, rows, self.window[0])
         return np.broadcast_to(origins, directions.shape), directions
 
 
 class PulseStep(ABC):
-    """An effect on pulses, made once for each sensor to which it applies.
+    """An effect on the pulses of a sensor.
 
-    A subclass without a `role` is a TypeError: nothing would know when to apply the step.
+    A subclass without a `role` is a TypeError: the role decides how rays are cast.
     """
 
     role: ClassVar[Role]
@@ -286,11 +297,11 @@ class PulseStep(ABC):
     @staticmethod
     @abstractmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the step acts on a sensor; else it costs nothing and changes no byte."""
+        """Return True if the step acts on a sensor, else False."""
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """Return how many returns the step adds to a pulse, on average."""
+        """Return the mean number of returns that the step adds to a pulse."""
         return 0.0
 
     @staticmethod
@@ -300,8 +311,8 @@ class PulseStep(ABC):
 
     @abstractmethod
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch as they are after the step.
+        """Return the returns of a batch after the step.
 
-        Before returns are made of hits, these are the hits of sub-rays. A step that changes the
-        hits assigns them to `batch.hits` as well, and selects some by `batch.select`.
+        Before returns are made of hits, `returns` are the hits of sub-rays. A step that changes
+        the hits assigns the result to `batch.hits` as well, and selects hits by `batch.select`.
         """

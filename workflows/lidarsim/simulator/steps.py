@@ -23,7 +23,7 @@ from .step import PulseStep, Role, Setup
 from .stray_light import StrayLightStep
 from .waveform import WaveformStep
 
-# Where none applies, each ray has one return, its hit.
+# If no step applies, each ray has one return, its hit.
 STEPS: list[type[PulseStep]] = [
     AngleNoiseStep,
     RippleStep,
@@ -59,7 +59,7 @@ def steps_of(setup: Setup) -> list[type[PulseStep]]:
 
 
 def received_causes() -> list[int]:
-    """Return the causes of returns of which no light comes from a point that moves."""
+    """Return the causes of returns that the receiver adds: no light returned from their points."""
     return [cause for step in STEPS if Role.RECEIVES in step.role for cause in step.causes]
 
 
@@ -71,15 +71,14 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
     step
         A subclass of `PulseStep`.
     before
-        The step before which pulses pass the new one. By default, beams are turned just before
+        The step before which pulses pass the new step. By default, beams are deflected just before
         they are cast, hits of sub-rays changed just before returns are made of the hits, returns
-        received just before they saturate the receiver, and kept returns changed at the end.
+        received just before they saturate the receiver, and reported returns changed at the end.
 
     Raises
     ------
     ValueError
-        If the step would have no effect at its position, is of `Role.FRAME`, or is among the
-        steps already.
+        If the step would have no effect at its position, is of `Role.FRAME`, or is a step already.
 
     Examples
     --------
@@ -104,7 +103,7 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
     if Role.FRAME in step.role:
         raise ValueError(f"step {step.__name__} of {Role.FRAME} cannot be added: set other roles")
     if before is None:
-        before = next((other for role, other in _POSITIONS if role in step.role), None)
+        before = next((following for role, following in _POSITIONS if role in step.role), None)
     position = len(STEPS) if before is None else STEPS.index(before)
     for role, first, last in _SPANS:
         if role in step.role and not STEPS.index(first) < position <= STEPS.index(last):

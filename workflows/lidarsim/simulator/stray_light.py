@@ -55,7 +55,7 @@ class StrayLightStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of a cause of each return, and of rays, in bytes."""
-        return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch with the returns of stray light."""
@@ -64,7 +64,7 @@ class StrayLightStep(PulseStep):
         noise = self.setup.noise
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
-        times = batch.here.times((rays - batch.start) * batch.each)
+        times = batch.subray_poses.times((rays - batch.start) * batch.subrays_per_beam)
         light = self._strongest(batch, times)
         row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
         scan, number = batch.keys.scan_and_number(rays[row])
@@ -73,9 +73,13 @@ class StrayLightStep(PulseStep):
         in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
         row = row[in_range]
         distance = distance[in_range]
-        origins, _ = batch.middles
-        visible = self.caster.free(
-            origins[row], light.points[row], distance, times[row], batch.here.ways
+        origins, _ = batch.central_rays
+        visible = self.caster.is_visible(
+            origins[row],
+            light.points[row],
+            distance,
+            times[row],
+            batch.subray_poses.actor_trajectories,
         )
         visible &= ~self._has_return(returns, rays[row], distance)
         row = row[visible]
@@ -88,7 +92,7 @@ class StrayLightStep(PulseStep):
         """Return the strongest stray light of the rays in the middles of beams."""
         from . import stray_loops  # not before: numba takes half a second to import
 
-        origins, directions = batch.middles
+        origins, directions = batch.central_rays
         count = batch.stop - batch.start
         light = stray_loops.StrayLight(
             np.zeros(count), np.zeros((count, 3)), np.zeros(count, np.bool_)
@@ -105,7 +109,7 @@ class StrayLightStep(PulseStep):
             rotations = None
             positions = np.zeros(3)
             if actor is not None:
-                positions, rotations = batch.here.ways[actor].poses(0, times)
+                positions, rotations = batch.subray_poses.actor_trajectories[actor].poses(0, times)
             cells = _ray_cells(
                 into_axes(origins - positions, rotations), into_axes(directions, rotations)
             )
@@ -135,7 +139,7 @@ class StrayLightStep(PulseStep):
         for number in range(int((last - first).max(initial=0))):
             rows = np.flatnonzero(first + number < last)
             return_distance = returns.distance[first[rows] + number]
-            close[rows] |= np.abs(return_distance - distance[rows]) <= self.setup.gap_m
+            close[rows] |= np.abs(return_distance - distance[rows]) <= self.setup.half_pulse_m
         return close
 
 

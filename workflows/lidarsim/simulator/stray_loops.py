@@ -99,6 +99,12 @@ class ReceivedSpots(NamedTuple):
     distance: Floats  # at which the spot seems to be, metres
     range_m: Floats  # at which the spot is
 
+    def first(self, count: int) -> ReceivedSpots:
+        """Return the first rows, which a loop has written."""
+        return ReceivedSpots(
+            self.row[:count], self.spot[:count], self.distance[:count], self.range_m[:count]
+        )
+
 
 @inlined
 def _angle(cosine):

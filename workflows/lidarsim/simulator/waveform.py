@@ -40,7 +40,7 @@ class WaveformStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns in the waveforms of the hits of a batch."""
         digitizer = Digitizer.for_sensor(self.setup)
-        in_waveforms = returns_in(returns, digitizer, batch.each, batch.planes)
+        in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
 
 

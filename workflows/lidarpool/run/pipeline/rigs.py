@@ -190,5 +190,5 @@ def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
     there = (np.arange(samples) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
     out = np.full((len(returns.specs), samples, 3), np.nan, np.float32)
     if len(returns):
-        out[there] = returns.ends(rows[there])
+        out[there] = returns.positions_of(rows[there])
     return out
