@@ -26,7 +26,7 @@ from lidarsim.simulator.saturation import saturated
 from lidarsim.simulator.separation import Reporting, separated
 from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps import setup_of
-from lidarsim.simulator.surfaces import Light, Surfaces
+from lidarsim.simulator.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.waveform import Digitizer, returns_in
 
 GAP = 0.75
@@ -234,7 +234,7 @@ def test_energies_are_those_of_the_twin(extinction):
     materials = (Material("0", 0.3), RETRO)
     meshes = [quad(f"{k}", a, b, c, c + a - b) for k, (a, b, c) in enumerate(corners)]
     surfaces = Surfaces(Scene.from_meshes(meshes), materials)
-    light = Light(905.0, extinction)
+    light = SensorLight(905.0, extinction)
     wall = rng.integers(0, 2, 1000)
     distance = rng.uniform(0.5, 200, 1000)
     ahead = rng.normal(size=(1000, 3))
@@ -243,8 +243,8 @@ def test_energies_are_those_of_the_twin(extinction):
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
     lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
     assert lit.kinds.tolist() == wall.tolist()
-    assert np.allclose(lit.along, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
-    cosine = np.abs(lit.along)
+    assert np.allclose(lit.cosines, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
+    cosine = np.abs(lit.cosines)
     back = np.where(wall == 1, 0.8 * 220, 0.3 * cosine)
     rows = zip(back.tolist(), distance.tolist(), strict=True)
     expected = [twin.energy_of(*row, extinction) for row in rows]

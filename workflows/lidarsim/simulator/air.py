@@ -151,7 +151,9 @@ class WeatherStep(PulseStep):
         """
         first, stop = beams
         count = (stop - first) * subrays
-        reach = light_reach(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count)
+        reach = light_reach(
+            self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
+        )
         parts: list[SampledHits] = []
         for kind, seed in zip(self._kinds, self._seeds, strict=True):
             if kind is not None:
@@ -172,7 +174,7 @@ class WeatherStep(PulseStep):
 
     def _refracting(self, hits: PulseReturns) -> Indices:
         """Return rows of hits that refract light; of each ray the first, third, … are entries."""
-        refracts = self.surfaces.at(self._wavelength_nm).refracts
+        refracts = self.surfaces.at_wavelength(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
         refracting = refracts[self.surfaces.kinds(hits.triangle)]

@@ -283,7 +283,7 @@ class CrosstalkStep(PulseStep):
         # The air from the other sensor to the spot, and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
-        table = surfaces.at(self._sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
         # A retro-reflector sends light back only to the sensor that sent the light.
         share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))

@@ -148,7 +148,7 @@ class CastStep(PulseStep):
         sensor = setup.sensor
         self._light = light_of(survey, sensor)
         self._seed = setup.noise.seed
-        table = surfaces.at(sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
@@ -363,7 +363,7 @@ class CastStep(PulseStep):
 
     def _see(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
         """Return the hits that the sensor may see, and the surfaces from which light continues."""
-        materials = self.surfaces.at(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
             along_ray = products(surface_hits.velocities.T, light.directions.T)
@@ -443,7 +443,7 @@ class CastStep(PulseStep):
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
-        materials = self.surfaces.at(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         bright = None
         if materials.textured and surface_hits.colour is not None:
             bright = luminance(surface_hits.colour[rows])
@@ -453,13 +453,28 @@ class CastStep(PulseStep):
         )
         share = np.empty(len(rows))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
-        count = surface_loops.onward(
-            rows, reflected, surface_hits.kinds, surface_hits.cosines,
-            materials.shares(surface_hits.kinds[rows], bright), self._light.wet, film, light.share,
-            surface_hits.distance, materials.specular, materials.passes, ~materials.refracts,
-            materials.leafy, self._brightest, self._light.extinction,
-            self._faintest if drops_faint else -1.0, share,
-        )  # fmt: skip
+        count = surface_loops.divide_light(
+            rows,
+            reflected,
+            surface_loops.OnwardHits(
+                surface_hits.kinds,
+                surface_hits.cosines,
+                film,
+                light.share,
+                surface_hits.distance,
+            ),
+            materials.shares(surface_hits.kinds[rows], bright),
+            surface_loops.OnwardOptics(
+                materials.specular, materials.passes, ~materials.refracts, materials.leafy
+            ),
+            surface_loops.OnwardLimits(
+                self._light.wet,
+                self._brightest,
+                self._light.extinction,
+                self._faintest if drops_faint else -1.0,
+            ),
+            share,
+        )
         return rows[:count], reflected[:count], share[:count]
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
@@ -592,7 +607,7 @@ def _path_behind(
 
     origins = np.empty((3, len(clear_m)))
     directions = owned(outgoing.T)
-    surface_loops.set_off(
+    surface_loops.start_behind(
         owned(light.origins.T),
         owned(light.directions.T),
         owned(step_m),

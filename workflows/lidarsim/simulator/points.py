@@ -413,7 +413,7 @@ class BatchPoints:
                 self._poses.actor_trajectories,
                 None if colours is None else colours[block],
             )
-            cosines[block] = lit.along
+            cosines[block] = lit.cosines
             energy[block] = lit.energy
         return cosines, energy
 

@@ -112,7 +112,7 @@ def _half_way(hit, neighbour, inverse_m, neighbours):
 
 
 @stage
-def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901 - a compiled loop
+def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901, PLR0914 - a compiled loop
     """Clear `marks.apart` at the hits of a beam where the surface of the hit before continues.
 
     The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,

@@ -141,7 +141,7 @@ def returns_without_surface(
 
 
 def merged(returns: PulseReturns, additions: PulseReturns) -> PulseReturns:
-    """Return both tables of returns as one table, in the order of rays and distances."""
+    """Merge two tables of returns, in the order of rays and distances."""
     if not len(additions.ray):
         return returns
     hits = joined([returns, additions])

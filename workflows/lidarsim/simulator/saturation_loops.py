@@ -25,7 +25,7 @@ class Pulses(NamedTuple):
 
 @compiled()
 def join_full(pulses, remains):
-    """Join the returns of a pulse that overlap if one of the returns is full; mark what `remains`.
+    """Join overlapping returns of a pulse where a return is full; mark the returns that remain.
 
     Of joined returns the highest remains, with the energy of all joined returns, and with the edges
     and the smallest distance of the full returns, which are written to `pulses`.

@@ -53,7 +53,9 @@ def separated(
     air: PulseReturns | None = None,
     reporting: Reporting | None = None,
 ) -> PulseReturns:
-    """Return the returns of hits: a beam's hits within a distance of the next are one return.
+    """Join the hits of each beam that a receiver cannot tell apart, and return the returns.
+
+    A beam's hits within `gap_m` of the next hit are a single return.
 
     So are hits of neighbouring sub-rays on one surface, however far apart the hits are: a beam that
     grazes a road illuminates all of the road between the hits. The energy of a return is the sum
@@ -166,7 +168,7 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
 
 
 def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> SubrayHits:
-    """Return hits as loops take them, with velocities if returns have velocities."""
+    """Return hits for loops, with velocities on request."""
     from .separation_loops import SubrayHits
 
     velocity = hits.velocity if with_velocity else None
@@ -207,12 +209,16 @@ class SeparationStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of the hits of a batch."""
         setup = self.setup
-        shown = (
-            "all" if setup.has_received_returns else setup.reporting.mode
-        )  # then `SelectionStep`
-        reporting = Reporting(shown, setup.noise, batch.keys, batch.start)
+        # If the receiver adds or joins returns, `SelectionStep` selects.
+        mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
+        reporting = Reporting(mode, setup.noise, batch.keys, batch.start)
         return separated(
-            returns, setup.half_pulse_m, batch.subrays_per_beam, batch.planes, batch.air, reporting
+            returns,
+            setup.half_pulse_m,
+            batch.subrays_per_beam,
+            batch.planes,
+            batch.air,
+            reporting,
         )
 
 
@@ -224,7 +230,7 @@ class SelectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the receiver adds or joins returns before it selects."""
+        """Return whether the receiver adds or joins returns before the selection."""
         return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

@@ -211,9 +211,9 @@ def _sort_by_distance(pulse_hits, count):
 
 @inlined
 def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
-    """Mark at which of the first hits in `scratch` returns start, and write the hits' columns.
+    """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
 
-    `apart` says whether hits are farther apart than the receiver's gap. A surface that continues
+    `count` is the number of hits, and `apart` says whether hits are farther apart than the receiver's gap. A surface that continues
     from sub-ray to sub-ray is in a single return.
     """
     row = scratch.hits.row
@@ -301,7 +301,7 @@ def _detected(energy, scan, beam, number, receiver, starts):
 
 @inlined
 def _keep_detected(begin, stop, scan, number_in_scan, receiver, starts, output):
-    """Keep the detected returns of a beam, rows `begin` to `stop`; return the row after them."""
+    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row."""
     count = begin
     for k in range(begin, stop):
         if _detected(output.energy[k], scan, number_in_scan, k - begin, receiver, starts):
@@ -330,7 +330,7 @@ def _mark(energy, begin, stop, mode, shown):
 
 @inlined
 def _keep_reported(begin, stop, mode, scratch, output):
-    """Keep the returns of a beam that a mode reports; return the row after the kept returns."""
+    """Keep the returns of a beam that a mode reports; return the next free row."""
     for k in range(begin, stop):
         scratch.energy[k - begin] = output.energy[k]
     _mark(scratch.energy, 0, stop - begin, mode, scratch.shown)

@@ -71,7 +71,7 @@ class SprayStep(PulseStep):
         self._extinction = kind.extinction / LARGE
         self._step = 1 / kind.slope
         self._clumps = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
-        self._materials = surfaces.at(sensor.optics.wavelength_nm)
+        self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         # (actors, 2, 3): lowest corner of the box around a mesh, and halves of the box's sides.
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
         self._sizes = np.array([(mesh.min(axis=0), np.ptp(mesh, axis=0) / 2) for mesh in meshes])
@@ -94,7 +94,7 @@ class SprayStep(PulseStep):
         return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch after spray: attenuated behind it, and with hits in it."""
+        """Return the hits of a batch after spray, which attenuates light and adds hits."""
         if self._clumps is None:
             return returns
         from . import pulse_loops, spray_loops  # not before: numba takes half a second to import

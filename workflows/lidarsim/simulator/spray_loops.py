@@ -66,7 +66,7 @@ def _ball_radii(boxes):
 
 
 @inlined
-def _span_in_box(boxes, b, to_middle, direction, reach_m):
+def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
     """Return where a ray enters and leaves a box, metres, in this order if the ray meets the box.
 
     `to_middle` is the vector from the ray's start to the middle of the box.
@@ -166,7 +166,7 @@ def _guide(ranges, width_m):
 
 
 @compiled()
-def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914 - a compiled loop
+def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914, PLR0915 - a compiled loop
     """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
 
     `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
@@ -226,7 +226,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
 
 @compiled()
 def attenuate(crossings, subrays, extinction, reach, hits):
-    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray before them.
+    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray.
 
     `reach` (beams * subrays,) is the range that the light of each sub-ray reaches, metres.
     """

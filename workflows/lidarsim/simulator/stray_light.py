@@ -33,7 +33,7 @@ FAINTEST = 0.1  # of the threshold: fainter light is never detected, see `detect
 
 
 class StrayLightStep(PulseStep):
-    """Adds the light of retro-reflectors that beams beside them receive."""
+    """Adds stray light of retro-reflectors beside beams."""
 
     role = Role.RECEIVES
     effects = ("Blooming",)
@@ -74,12 +74,9 @@ class StrayLightStep(PulseStep):
         row = row[in_range]
         distance = distance[in_range]
         origins, _ = batch.central_rays
+        trajectories = batch.subray_poses.actor_trajectories
         visible = self.caster.is_visible(
-            origins[row],
-            light.points[row],
-            distance,
-            times[row],
-            batch.subray_poses.actor_trajectories,
+            origins[row], light.points[row], distance, times[row], trajectories
         )
         visible &= ~self._has_return(returns, rays[row], distance)
         row = row[visible]
@@ -104,7 +101,7 @@ class StrayLightStep(PulseStep):
             float(self._light.extinction),
         )
         chosen = np.zeros(NEAREST_TRIANGLES, np.int64)
-        table = self.surfaces.at(self._light.wavelength_nm)
+        table = self.surfaces.at_wavelength(self._light.wavelength_nm)
         for actor, clusters in groupby(self._clusters, key=lambda cluster: cluster.actor):
             rotations = None
             positions = np.zeros(3)
@@ -127,8 +124,8 @@ class StrayLightStep(PulseStep):
         """Return the triangles of a cluster for loops."""
         from .stray_loops import RetroTriangles
 
-        ones = np.ones(len(cluster.triangles))
-        back = table.scattered(self.surfaces.kinds(cluster.triangles), ones, ones)
+        white = np.ones(len(cluster.triangles))
+        back = table.scattered(self.surfaces.kinds(cluster.triangles), white, white)
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
@@ -163,7 +160,7 @@ class _Bounds(NamedTuple):
 
 @dataclass(frozen=True)
 class _RetroCluster:
-    """Triangles of retro-reflectors that are near to each other."""
+    """A cluster of triangles of retro-reflectors."""
 
     triangles: Ints32  # (k,): numbers
     corners: Floats  # (k, 3, 3): in the scene frame, or in the frame of an actor

@@ -33,7 +33,7 @@ class RayCells(NamedTuple):
 
 
 class RetroTriangles(NamedTuple):
-    """Triangles of retro-reflectors that are near to each other."""
+    """A cluster of triangles of retro-reflectors."""
 
     corners: Floats  # (t, 3, 3)
     middles: Floats  # (t, 3)
@@ -60,7 +60,7 @@ class StrayLight(NamedTuple):
 
 
 class SpotPairs(NamedTuple):
-    """Spots, and the rays that may see them: (p,) each."""
+    """Pairs of a spot and the rays that may see the spot: (p,) each."""
 
     spot: Ints
     first: Ints  # first and last rays, as rows of `ReceivingRays.order`
@@ -77,7 +77,7 @@ class ReceivingRays(NamedTuple):
 
 
 class LitSpots(NamedTuple):
-    """Spots that pulses of other sensors light."""
+    """Spots on surfaces, lit by pulses of foreign sensors."""
 
     time_ns: Floats  # (s,)
     positions: Floats  # (s, 3)
@@ -243,7 +243,7 @@ def _choose_triangles(middles, ray, chosen):
 
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
-    """Write the light of a triangle to ray `k` if it is stronger than `strongest`."""
+    """Write the light of a triangle to ray `k` if the light is stronger than the `strongest`."""
     middles = triangles.middles
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
@@ -263,8 +263,8 @@ def _add_light(k, t, ray, triangles, limits, strongest):
 
 
 @compiled()
-def find_stray_light(rays, triangles, limits, chosen, strongest):
-    """Write the light of `triangles` to rays that receive more of it than their `strongest`.
+def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
+    """Write the light of `triangles` to rays where the light is stronger than the `strongest`.
 
     `rays` are `RayCells`, `triangles` `RetroTriangles`, `limits` `StrayLimits`, and `strongest` is
     `StrayLight`. The light comes from the point of the triangles that is nearest to a ray by angle.

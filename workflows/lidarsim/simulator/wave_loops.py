@@ -350,8 +350,8 @@ def _guess_gaussians(wave, scratch):
     count = 0
     for s in range(1, length - 1):
         minimum = curvature[s] < curvature[s - 1] and curvature[s] <= curvature[s + 1]
-        high = samples[s] >= FAINT * wave.top
-        if minimum and high and -curvature[s] * variance >= CURVED * wave.top:
+        visible = samples[s] >= FAINT * wave.top
+        if minimum and visible and -curvature[s] * variance >= CURVED * wave.top:
             scratch.minima[count] = s
             count += 1
     return count
@@ -418,7 +418,7 @@ def _sort_gaussians(scratch, count, faintest):
 
 @stage
 def _join_gaussians(wave, scratch, count, stops, peaks):
-    """Write sorted Gaussians, close ones joined, to `stops` and `peaks`; return their number."""
+    """Join close Gaussians, write the result to `stops` and `peaks`, and return its size."""
     sigma = wave.sigma
     time = scratch.time
     height = scratch.height
@@ -572,16 +572,18 @@ def divide(hits, sigma_m, neighbours, parts):  # noqa: PLR0914 - a compiled loop
 def room_for(length: int) -> SearchScratch:
     """Return scratch memory for waveforms of up to `length` samples."""
     size = 3 * TOGETHER
-    best, guess, trial = np.empty((3, 3, TOGETHER))
-    slopes, new_slopes = np.empty((2, size, length))
-    residual, new_residual = np.empty((2, length))
-    stops, minima = np.empty((2, length), np.int64)
-    samples, curvature, x, y, time, height, width = np.empty((7, length))
-    lower = np.empty((size, size))
-    step = np.empty(size)
-    fit = FitScratch(best, guess, trial, lower, slopes, new_slopes, residual, new_residual, step)
-    gaussians = GaussianScratch(curvature, minima, x, y, time, height, width, fit)
-    return SearchScratch(samples, np.empty((3, length)), stops, gaussians)
+    fit = FitScratch(
+        *np.empty((3, 3, TOGETHER)),
+        np.empty((size, size)),
+        *np.empty((2, size, length)),
+        *np.empty((2, length)),
+        np.empty(size),
+    )
+    gaussians = GaussianScratch(
+        np.empty(length), np.empty(length, np.int64), *np.empty((5, length)), fit
+    )
+    peaks = np.empty((3, length))
+    return SearchScratch(np.empty(length), peaks, np.empty(length, np.int64), gaussians)
 
 
 @inlined
