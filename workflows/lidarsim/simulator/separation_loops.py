@@ -213,8 +213,8 @@ def _sort_by_distance(pulse_hits, count):
 def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
     """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
 
-    `count` is the number of hits, and `apart` says whether hits are farther apart than the receiver's gap. A surface that continues
-    from sub-ray to sub-ray is in a single return.
+    `count` is the number of hits, and `apart` says whether hits are farther apart than the
+    receiver's gap. A surface that continues from sub-ray to sub-ray is in a single return.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance

@@ -573,14 +573,25 @@ def room_for(length: int) -> SearchScratch:
     """Return scratch memory for waveforms of up to `length` samples."""
     size = 3 * TOGETHER
     fit = FitScratch(
-        *np.empty((3, 3, TOGETHER)),
-        np.empty((size, size)),
-        *np.empty((2, size, length)),
-        *np.empty((2, length)),
-        np.empty(size),
+        best=np.empty((3, TOGETHER)),
+        guess=np.empty((3, TOGETHER)),
+        trial=np.empty((3, TOGETHER)),
+        lower=np.empty((size, size)),
+        slopes=np.empty((size, length)),
+        new_slopes=np.empty((size, length)),
+        residual=np.empty(length),
+        new_residual=np.empty(length),
+        step=np.empty(size),
     )
     gaussians = GaussianScratch(
-        np.empty(length), np.empty(length, np.int64), *np.empty((5, length)), fit
+        curvature=np.empty(length),
+        minima=np.empty(length, np.int64),
+        x=np.empty(length),
+        y=np.empty(length),
+        time=np.empty(length),
+        height=np.empty(length),
+        width=np.empty(length),
+        fit=fit,
     )
     peaks = np.empty((3, length))
     return SearchScratch(np.empty(length), peaks, np.empty(length, np.int64), gaussians)
