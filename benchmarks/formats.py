@@ -45,7 +45,7 @@ def make(folder, points):
     """Write a cloud of so many points in 100 sweeps of a sensor that moves, and the sweeps."""
     track = Track([0, 100], [[0, 0, 1], [300, 50, 1]])
     survey = Survey(Sensor.grid(360, 4), trajectory=track, steps=36 * TURNS, columns=COLUMNS)
-    Sweeps.of(survey, Scene.seed()).save(folder / "sweeps.npz")
+    Sweeps.from_survey(survey, Scene.seed()).save(folder / "sweeps.npz")
     rng = np.random.default_rng(1)
     scan = np.arange(points) * (36 * TURNS) // points
     around = np.arange(points) * 1e-3

@@ -92,7 +92,8 @@ def write(place, name):
     scans = TURNS * 36
     car = Actor(box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
     scene = lp.Scene.seed().with_actors((car,))
-    sweeps = Sweeps.of(lp.Survey(lp.Sensor.grid(360, 4), trajectory=track, steps=scans), scene)
+    survey = lp.Survey(lp.Sensor.grid(360, 4), trajectory=track, steps=scans)
+    sweeps = Sweeps.from_survey(survey, scene)
     rng = np.random.default_rng(1)
     count = TURNS * POINTS
     data = DataSet(Storage.at(place), name)

@@ -85,7 +85,7 @@ def cloud_of(survey: Survey, scene: Scene) -> Cloud:
     rig = Rig(scene, survey, "embree")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.of(survey, scene)
+    sweeps = Sweeps.from_survey(survey, scene)
     return replace(cloud, sweeps=lambda: sweeps)
 
 

@@ -36,7 +36,7 @@ def the_sweeps(scene: Scene) -> Sweeps:
     lidar = Sensor.grid(360, 4)
     sensors = [Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front"), Mounted(lidar, name="rear/left")]
     survey = Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS, columns=["ray"])
-    return Sweeps.of(survey, scene)
+    return Sweeps.from_survey(survey, scene)
 
 
 def points_of(scene: Scene, number: int) -> Cloud:

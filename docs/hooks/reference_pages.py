@@ -15,7 +15,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
-from lidarsim.columns.ply_format import held_type
+from lidarsim.columns.ply_format import file_type
 from lidarsim.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 
 # Sections in the order of a scenario file, and what stands in the sections of another.
@@ -185,7 +185,7 @@ def _columns_table(columns: tuple[Column, ...]) -> str:
     rows = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for column in columns:
         kind = np.dtype(column.dtype).name
-        held = held_type(column).name
+        held = file_type(column).name
         if column in AXES:
             kind = "float64"
             held = "float32; float64 where needed"

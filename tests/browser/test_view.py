@@ -58,7 +58,7 @@ def view(cloud):
     pictured = PictureContent(
         scene, sensor_positions(survey), hits, rays, duration_ns=survey.duration_ns
     )
-    sweeps = Sweeps.of(survey, scene)
+    sweeps = Sweeps.from_survey(survey, scene)
     assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
     return View(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
 

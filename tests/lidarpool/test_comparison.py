@@ -247,7 +247,7 @@ SURVEY = Survey(SENSOR, poses=[(0, 0, 1), (5, 2, 1.5), (9, 9, 1)], steps=36, pre
 def written(tmp_path_factory):
     """A survey of three sweeps in all formats: a result's folder, and what is exported of it."""
     folder = tmp_path_factory.mktemp("result")
-    sweeps = Sweeps.of(SURVEY, Scene.seed())
+    sweeps = Sweeps.from_survey(SURVEY, Scene.seed())
     azimuth = np.arange(360)[:, None]
     elevation = np.linspace(-30, 30, LAYERS)
     ranges = 10 + 2 * np.sin(np.radians(azimuth)) + 0 * elevation
@@ -404,7 +404,7 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
     speed = 8.0
     track = lidarpool.Track([0, 1], [[0, 0, 1], [speed, 0, 1]])
     survey = Survey(SENSOR, trajectory=track, steps=36, precision_m=1e-4)
-    sweeps = Sweeps.of(survey, Scene.seed())
+    sweeps = Sweeps.from_survey(survey, Scene.seed())
     ray = np.repeat(np.arange(360 * LAYERS), 2)  # two returns each
     firing, channel = np.divmod(ray, LAYERS)
     ranges = 10 + 20 * rng.integers(0, 2, len(ray) // 2)[:, None] + [0, 5]  # posts before walls

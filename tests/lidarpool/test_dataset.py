@@ -238,7 +238,7 @@ def test_a_manifest_says_what_became_of_a_job_and_what_made_it(job, sweeps, tmp_
 def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     """One of each: a file of Parquet is not a sweep, and has no boxes of actors."""
     one = Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=SCANS)
-    only = Sweeps.of(one, scene)
+    only = Sweeps.from_survey(one, scene)
     cloud = job(0)
     cloud = cloud[cloud.scan < SCANS]
     assert len(only) == 1 and only.actors

@@ -81,7 +81,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def sweeps(survey, scene) -> Sweeps:
-    return Sweeps.of(survey, scene)
+    return Sweeps.from_survey(survey, scene)
 
 
 @pytest.fixture(scope="module")
@@ -477,7 +477,7 @@ def test_a_start_and_a_coordinate_system_are_in_files_that_hold_them(
 ):
     """Also after `sweeps.npz`, of which an export reads them."""
     start = datetime(2026, 11, 21, 12, 0, tzinfo=timezone(timedelta(hours=2)))
-    Sweeps.of(replace(survey, start=start, epsg=25832), scene).save(tmp_path / "s.npz")
+    Sweeps.from_survey(replace(survey, start=start, epsg=25832), scene).save(tmp_path / "s.npz")
     dated = Sweeps.load(tmp_path / "s.npz")
     Format("laz").write(tmp_path / "a.laz", cloud, dated)
     las = laspy.read(tmp_path / "a.laz")
@@ -529,7 +529,7 @@ def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
     for steps, sweep, scan, when_s in ((54, 1, 45, 0.125), (54, 3, 99, 0.275), (36, 0, 9, 0.026)):
         poses = [(0, 0, 0), (5, 0, 0)][: 1 + (steps == 54)]
         survey = Survey(Sensor.grid(360, 4), poses, steps=steps)
-        sweeps = Sweeps.of(survey, scene)
+        sweeps = Sweeps.from_survey(survey, scene)
         points = Cloud(np.zeros((1, 3)), {"scan": [scan], "object": [car]})
         boxes = Boxes.of(sweeps, sweep, points)
         assert boxes.points.tolist() == [1]
@@ -548,7 +548,7 @@ def test_boxes_of_tilted_sensors_hold_the_points_of_one_turn(scene, tmp_path, ti
         Mounted(Sensor.grid(360, 4), mount, name) for mount, name in zip(mounts, "ab", strict=True)
     ]
     survey = Survey(sensors=sensors, poses=[(0, 0, 0)], steps=36)
-    sweeps = Sweeps.of(survey, scene)
+    sweeps = Sweeps.from_survey(survey, scene)
     rng = np.random.default_rng(3)
     scan = np.repeat([25, 61], 200)
     when = np.rint([survey.begins_ns(one) for one in scan])
@@ -798,7 +798,7 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
 
     sweeps = drive.sweeps()
     second = drive[drive["scan"] >= 36]
-    turn = sweeps.pose.turns[1]
+    turn = sweeps.pose.rotations[1]
     place = sweeps.pose.positions[1]
     pcd = PointCloud.from_path(tmp_path / "pcd/000001.pcd")
     types = get_typestore(Stores.ROS2_HUMBLE)

@@ -114,7 +114,7 @@ def made(tmp_path_factory):
             survey = SURVEYS[name]
             folder = tmp_path_factory.mktemp("images") / "images"
             cloud = cloud_of(survey)
-            sweeps = Sweeps.of(survey, SCENE)
+            sweeps = Sweeps.from_survey(survey, SCENE)
             Format("images").write(folder, cloud, sweeps)
             kept[name] = cloud, sweeps, images_of(folder)
         return kept[name]
@@ -230,10 +230,10 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
     thinned = replace(SURVEYS["still"], keep_every=2)
     cloud = cloud_of(thinned)
     with pytest.raises(LidarError, match="keep_every 1 and the column ray"):
-        Format("images").write(tmp_path / "i", cloud, Sweeps.of(thinned, SCENE))
+        Format("images").write(tmp_path / "i", cloud, Sweeps.from_survey(thinned, SCENE))
     own = replace(SURVEYS["still"], sensor=Upward(GRID.beams, GRID.head), trajectory=None)
     cloud = cloud_of(own)
-    sweeps = Sweeps.of(own, SCENE)
+    sweeps = Sweeps.from_survey(own, SCENE)
     Format("images").write(tmp_path / "own", cloud, sweeps)
     sweeps.save(tmp_path / "sweeps.npz")
     with pytest.raises(LidarError, match="of your own they are written with the run only"):

@@ -78,7 +78,7 @@ def test_a_node_publishes_what_a_bag_holds(tmp_path):
     message = node["message_of"](cloud, 0, header, kinds)
     columns = ["intensity", "time"]
     survey = Survey(load_sensor("velodyne/vlp16"), [pose], columns=columns, coordinates="sensor")
-    write_mcap(tmp_path / "a.mcap", cloud, Sweeps.of(survey, scene), "velodyne")
+    write_mcap(tmp_path / "a.mcap", cloud, Sweeps.from_survey(survey, scene), "velodyne")
     with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         [(connection, _, written)] = bag.messages(
             [c for c in bag.connections if "points" in c.topic]

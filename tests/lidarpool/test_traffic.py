@@ -78,7 +78,7 @@ def test_an_actor_is_refused_held_or_absent_beyond_its_trajectory():
 def sweeps_of_three():
     survey = Survey(load_sensor("velodyne/vlp16"), poses=[(0, 0, 1.0)], steps=108)
     scene = Scene.from_meshes([FLOOR]).with_actors([passing("absent", (0.05, 0.15))])
-    return Sweeps.of(survey, scene)
+    return Sweeps.from_survey(survey, scene)
 
 
 def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_path):

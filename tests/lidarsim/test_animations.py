@@ -434,7 +434,7 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
     survey = Survey(Sensor.grid(900, 40), [(0, 0, 1)], steps=36 * 4, keep_every=1,
                     columns=["time", "intensity", "reflectivity", "class"],
                     materials=[Material("Person*", semantic_class=7), Material("*")])  # fmt: skip
-    sweeps = Sweeps.of(survey, scene)
+    sweeps = Sweeps.from_survey(survey, scene)
     found = made(survey, scene, "embree")
     assert sweeps.actor_bounds.shape == (2, 4, 2, 3)
     positions = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m

@@ -29,7 +29,7 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
+from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, optional_columns, stored
 from lidarsim.simulator.points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
@@ -45,11 +45,13 @@ def test_the_table_describes_every_column():
 
 def test_columns_are_chosen_by_name_once_and_in_order():
     own = Column("mine", "u1", "", "", lambda returns: 0)
-    assert chosen([]) == ()
-    found = chosen(["range", own, "time", "range", own, TABLE["time"], "ring", "channel", "scan"])
+    assert optional_columns([]) == ()
+    found = optional_columns(
+        ["range", own, "time", "range", own, TABLE["time"], "ring", "channel", "scan"]
+    )
     assert [column.name for column in found] == ["range", "mine", "time"]
     assert stored(found) == (*ALWAYS, *found)
-    assert chosen(OPTIONAL) == OPTIONAL
+    assert optional_columns(OPTIONAL) == OPTIONAL
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,7 @@ def test_columns_are_chosen_by_name_once_and_in_order():
 )
 def test_columns_that_cannot_be_chosen(columns, message):
     with pytest.raises(LidarError, match=message):
-        chosen(columns)
+        optional_columns(columns)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "1st", "a-b", "../x"])
@@ -78,7 +80,7 @@ def test_a_column_is_called_by_an_identifier(name):
 def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp_path):
     column = Column("a", "u1", "", "", file_name=name)
     with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
-        chosen([column])
+        optional_columns([column])
     with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
         save_cloud(Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)), tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
@@ -351,5 +353,5 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along(cluster_c
 
 def test_a_vector_is_chosen_as_a_whole():
     with pytest.raises(LidarError, match="normal_x, normal_y, normal_z are one vector"):
-        chosen(["normal_z"])
-    assert len(chosen(SURFACE)) == 7
+        optional_columns(["normal_z"])
+    assert len(optional_columns(SURFACE)) == 7

@@ -192,7 +192,7 @@ def test_a_frozen_sensor_sends_the_last_sweep_again(bare):
 def test_a_frozen_sensor_takes_its_points_along():
     """They stay where they were in its axes: in the world, they move as it does."""
     survey = replace(DRIVE, faults=[FAULTS["frozen"]], precision_m=0.001)
-    sweeps = Sweeps.of(survey, ROOM)
+    sweeps = Sweeps.from_survey(survey, ROOM)
     found = cast(survey)
     places = np.stack([found[axis] for axis in "xyz"], axis=1) * survey.precision_m
     inside = [
@@ -224,7 +224,7 @@ def test_a_time_jump_shifts_stamps_alone(bare):
 
 def test_images_find_the_rays_of_frozen_sweeps():
     survey = replace(DRIVE, faults=[FAULTS["frozen"]], keep_every=1)
-    sweeps = Sweeps.of(survey, ROOM)
+    sweeps = Sweeps.from_survey(survey, ROOM)
     found = cast(survey)
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
@@ -235,7 +235,7 @@ def test_images_find_the_rays_of_frozen_sweeps():
 
 def clouds(survey, scene):
     """Sweeps of a survey and their points."""
-    sweeps = Sweeps.of(survey, scene)
+    sweeps = Sweeps.from_survey(survey, scene)
     found = cast(survey, scene=scene)
     places = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m
     return sweeps, Cloud(places, found)
@@ -249,7 +249,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     again = Sweeps.load(tmp_path / "sweeps.npz")
     kinds = [[one.kind for one in again.faults_in(k)] for k in range(3)]
     assert kinds == [["dead_channels"], ["dead_channels"], ["time_jump"]]
-    frozen = Sweeps.of(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
+    frozen = Sweeps.from_survey(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
     assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
     assert Sweep.of(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
@@ -262,7 +262,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
         about = json.load(tar.extractfile(name))
     assert about["faults"] == [{"kind": "time_jump", "from_s": 0.22, "by_s": -0.5}]
     assert about["time_ns"] == round(survey.begins_ns(2 * SWEEP))
-    assert b'"faults"' not in Sweeps.of(STANDING, ROOM).packed()
+    assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).packed()
 
 
 def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
@@ -313,7 +313,7 @@ def test_numbers_of_numpy_and_sets_are_as_good(tmp_path):
         Fault("dropped_packets", share=np.float32(0.5), packet=np.int64(3)),
         Fault("dirt", transmission=1, azimuth_deg=np.array([1, 2])),
     ]
-    Sweeps.of(replace(STANDING, faults=faults), ROOM).save(tmp_path / "sweeps.npz")
+    Sweeps.from_survey(replace(STANDING, faults=faults), ROOM).save(tmp_path / "sweeps.npz")
     assert [*Sweeps.load(tmp_path / "sweeps.npz").faults] == faults
     assert faults[0].channels == (0, 1)
 

@@ -313,7 +313,7 @@ def of_drive(**options):
     columns = {"scan": np.arange(20, dtype=np.int32), "object": np.zeros(20, np.int32)}
     columns |= {"time": np.arange(20) * 50_000_000, "intensity": np.ones(20, np.float32)}
     columns["channel"] = np.zeros(20, np.uint16)
-    return survey, Cloud(np.zeros((20, 3)), columns), Sweeps.of(survey, Scene.seed())
+    return survey, Cloud(np.zeros((20, 3)), columns), Sweeps.from_survey(survey, Scene.seed())
 
 
 def written(folder, survey, sweeps):
@@ -382,8 +382,8 @@ def test_a_cloud_by_itself_has_no_instruments(tmp_path):
     Format("mcap").write(tmp_path / "cloud.mcap", cloud, sweeps)  # nothing is written yet
     assert not {"/imu/data_raw"} & {topic for topic, *_ in read_bag(tmp_path / "cloud.mcap")}
     plain = replace(survey, navigation=None)
-    assert Instruments.of(plain) is None
-    assert b"instruments" not in Sweeps.of(plain, Scene.seed()).packed()
+    assert Instruments.from_survey(plain) is None
+    assert b"instruments" not in Sweeps.from_survey(plain, Scene.seed()).packed()
 
 
 def test_scenarios(tmp_path):

@@ -132,7 +132,7 @@ def test_sweeps_are_those_that_exporters_find():
     for sensor in (VLP16, GRID, LATE, replace(GRID, head=Spin(120, step_deg=77))):
         survey = Survey(sensor, [(0, 0, 1)], steps=sensor.steps_of_turn(40).stop)
         firsts = [sensor.steps_of_turn(number).start for number in range(42)]
-        assert Sweeps.of(survey, Scene.seed()).scans.tolist() == firsts
+        assert Sweeps.from_survey(survey, Scene.seed()).scans.tolist() == firsts
 
 
 def test_another_start_is_another_time_on_the_same_trajectory(scene):

@@ -253,7 +253,7 @@ def spun():
     survey = Survey(
         Sensor.grid(rays_per_revolution=360, layers=8), [Pose((0, 0, 1)), Pose((1, 0, 1))]
     )
-    return Sweeps.of(survey, scene)
+    return Sweeps.from_survey(survey, scene)
 
 
 def sweeping(path, sweeps):
@@ -397,7 +397,7 @@ def test_a_range_image_of_a_sensor_that_looks_down_is_a_row_across_its_way():
 def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, pictured):
     scene = Scene.from_meshes([box("Wall", (1, 8, 8))])
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
-    view = View(CloudFile(cloud), pictured, Sweeps.of(survey, scene))
+    view = View(CloudFile(cloud), pictured, Sweeps.from_survey(survey, scene))
     state, arrays = told(view, "state")
     assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin

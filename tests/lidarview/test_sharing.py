@@ -61,7 +61,7 @@ def write(folder, moves):
     PictureContent(scene, ways, hits, rays, duration_ns=survey.duration_ns).save(
         folder / PICTURE_FILE
     )
-    Sweeps.of(survey, scene).save(folder / SWEEPS_FILE)
+    Sweeps.from_survey(survey, scene).save(folder / SWEEPS_FILE)
     return folder
 
 

@@ -135,7 +135,7 @@ def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
 def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkeypatch):
     scene = Scene.seed()
     survey = Survey(poses=[(0, 0, 1)], columns=["intensity"])
-    Sweeps.of(survey, scene).save(tmp_path / "sweeps.npz")
+    Sweeps.from_survey(survey, scene).save(tmp_path / "sweeps.npz")
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
     save_cloud(Cloud(np.zeros((3, 3)), columns), tmp_path / "cloud.ply")
     (tmp_path / "report.json").write_text("{}")

@@ -13,7 +13,7 @@ import numpy as np
 from lidarsim.base.archives import open_archive, packed
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.words import plural
-from lidarsim.columns.table import CAUSES, TABLE, Column, by_value
+from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
 from lidarsim.scene.actors import Actor, samples_each, shapes_of
 from lidarsim.scene.animation import Animation
 from lidarsim.scene.colours import Colours
@@ -128,7 +128,7 @@ class PictureContent:
             reflectance=materials.reflectance[kinds.first[:-1]],
             coordinates=survey.coordinates,
             triangles=scene.triangles,
-            classes=by_value(survey.classes),
+            classes=value_names(survey.classes),
             materials=scene.material_names,
         )
         return content, drawn

@@ -26,7 +26,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage, target_of
-from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, Shown
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudDisplay
 from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
@@ -166,7 +166,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 
 @dataclass(eq=False, repr=False)
-class StoredCloud(Shown):
+class StoredCloud(CloudDisplay):
     """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`."""
 
     storage: Storage  # of the parts

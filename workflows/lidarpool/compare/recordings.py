@@ -27,7 +27,7 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.scene.files.las import las_units, open_las
 from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import read_ply_columns
-from lidarsim.sweeps.sweeps import SWEEPS_FILE, Placed, Sweeps
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, SweepPoses, Sweeps
 
 from ..base.fingerprint import fingerprint
 from ..columns.parts import StoredCloud
@@ -300,7 +300,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
             if len(rows) != file.metadata.points:
                 raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
         columns = {name: rows[name] for name in rows.dtype.names or ()}
-        pose = Placed(np.array([place]), np.array([[x, y, z, w]])).matrix(0)
+        pose = SweepPoses(np.array([place]), np.array([[x, y, z, w]])).matrix(0)
         return _places(columns), columns, pose
 
     return Recording(name, len(files), read, light)

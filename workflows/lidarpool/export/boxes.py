@@ -10,7 +10,7 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sensor.trajectory import matrices
-from lidarsim.sweeps.sweeps import Placed, Sweeps
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,11 @@ class Boxes:
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
 
-    def inward(self, pose: Placed, which: int | slice) -> Boxes:
+    def inward(self, pose: SweepPoses, which: int | slice) -> Boxes:
         """Return boxes of a sweep, or of some, (n, a), in axes of the sensor as each begins."""
-        turned = self.quaternions @ pose.products[which]
+        turned = self.quaternions @ pose.quaternion_matrices[which]
         turned *= np.where(turned[..., 3:] < 0, -1, 1)  # w is at least 0
-        centres = (self.centres - pose.positions[which][..., None, :]) @ pose.turns[which]
+        centres = (self.centres - pose.positions[which][..., None, :]) @ pose.rotations[which]
         return Boxes(centres, turned, self.sizes, self.points, self.there)
 
 

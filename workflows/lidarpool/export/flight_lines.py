@@ -111,7 +111,7 @@ class FlightLines:
         exact *= sweeps.precision_m
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
         steps = np.zeros((3, 1)) if poses.steps is None else poses.steps
-        ahead = _level(steps.T, sweeps.pose.turns[sweep][:, 0])
+        ahead = _level(steps.T, sweeps.pose.rotations[sweep][:, 0])
         rays = in_world - poses.positions
         to_right = rays[:, 0] * ahead[:, 1] - rays[:, 1] * ahead[:, 0]
         fields.scan_angle_deg[rows] = np.degrees(np.arctan2(to_right, -rays[:, 2]))
@@ -125,14 +125,14 @@ class FlightLines:
         begin_ns = sweeps.begins_ns[sweep] - station * sweeps.station_ns
         line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
         # The sensor looks backwards.
-        against = sweeps.pose.turns[sweep][:, 0] @ self._directions[sweep] < 0
+        against = sweeps.pose.rotations[sweep][:, 0] @ self._directions[sweep] < 0
         fields.direction[rows] = mirror.leftwards(line) == int(against)
         fields.line[rows] = (sensor * sweeps.stations + station) * _LINES + line
 
     @cached_property
     def _directions(self) -> Floats:
         """Level unit vectors (n, 3) of the direction of flight in each sweep."""
-        axes = self.sweeps.pose.turns[:, :, 0]
+        axes = self.sweeps.pose.rotations[:, :, 0]
         knots = self.sweeps.knots
         moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
         return _level(moved, axes)

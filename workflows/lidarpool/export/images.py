@@ -15,7 +15,7 @@ from lidarsim.base.arrays import AnyArray, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sensor import Sensor
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, MIXED_UP, Fired, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, MIXED_UP, FiredRays, Sweeps, plain_names
 
 from . import pieces, reading
 from .boxes import Boxes
@@ -89,7 +89,7 @@ class Image:
         }
 
 
-def fired_of(sweeps: Sweeps) -> Fired:
+def fired_of(sweeps: Sweeps) -> FiredRays:
     """Return what finds all rays; LidarError if that is unknown."""
     if sweeps.fired is None:
         raise LidarError(

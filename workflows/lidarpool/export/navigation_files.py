@@ -45,7 +45,7 @@ def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
 
     `origin` is that of the scene, (3,). OSError if one cannot be written.
     """
-    instruments = Instruments.of(survey)
+    instruments = Instruments.from_survey(survey)
     for name in () if instruments is None else instruments.files:
         with (folder / name).open("w", encoding="ascii", newline="\n") as file:
             for line in _imu_lines(survey) if name == IMU_FILE else _gnss_lines(survey, origin):

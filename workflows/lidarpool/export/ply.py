@@ -14,7 +14,7 @@ from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
+from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, check_names
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
@@ -144,7 +144,7 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
     for column in cloud.table:
         if column.name in normals:
             continue
-        values = np.ascontiguousarray(as_held(column, cloud[column.name]))
+        values = np.ascontiguousarray(as_file_type(column, cloud[column.name]))
         points.point[column.in_files] = o3d.core.Tensor(values[:, None])
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
     try:
@@ -162,7 +162,7 @@ def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
     for axis, values in zip(AXES, cloud.positions.T, strict=True):
         rows[axis] = values
     for column in cloud.table:
-        rows[column.in_files] = as_held(column, cloud[column.name])
+        rows[column.in_files] = as_file_type(column, cloud[column.name])
     return rows
 
 

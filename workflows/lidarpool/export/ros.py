@@ -31,7 +31,7 @@ from lidarsim.scene.colours import as_float
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.lidar_traits import LidarTraits
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Placed, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
 
 from . import reading
 from .boxes import Boxes
@@ -205,7 +205,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any)
     make = _Messages(types)
     frames = _frames(sweeps)
     actors = frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
-    poses = map(Placed, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
+    poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
     moving = [(CARRIER, sweeps.carrier), *zip(actors, poses, strict=True)]
     start_ns = _start_ns(sweeps)
     measured = make.measured(sweeps, start_ns)
@@ -264,14 +264,14 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any)
         waiting = next(measured, None)
 
 
-def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
+def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
     """Frames of the instruments on the carrier."""
     there = sweeps.instruments
     if there is None or there.folder is None:
         return []
     found = zip(_frames(sweeps)[-2:], (there.imu, there.gnss), strict=True)
     return [
-        (CARRIER, frame, Placed(np.array([one.position]), np.array([one.quaternion])), 0)
+        (CARRIER, frame, SweepPoses(np.array([one.position]), np.array([one.quaternion])), 0)
         for frame, one in found
         if one is not None
     ]
@@ -468,7 +468,7 @@ class _Messages:
         """Header of a message."""
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
-    def transforms(self, frames: list[tuple[str, str, Placed, int]], time_ns: int) -> Any:
+    def transforms(self, frames: list[tuple[str, str, SweepPoses, int]], time_ns: int) -> Any:
         """Frames in others: parent, name, poses, and which of them."""
         vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
         transform, stamped = self.kinds("geometry_msgs", "Transform", "TransformStamped")

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import plural, shortened
-from lidarsim.columns.table import TABLE, Z, by_value
+from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
 from lidarview.render.colouring import colours_of
 from lidarview.render.picture_page import FONT, Page, label_logarithms
@@ -285,7 +285,7 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        colouring = colours_of(classes, TABLE["class"], by_value({0: "none", **names}))
+        colouring = colours_of(classes, TABLE["class"], value_names({0: "none", **names}))
         page.legend(colouring.labels, "sensor")
         painted = colouring.paint(classes)
     else:

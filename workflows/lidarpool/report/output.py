@@ -153,7 +153,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         target = Storage.at(storage or folder)
         _, earlier = _earlier(target)
         further = _further_files(result.survey, formats)
-        sweeps = Sweeps.of(result.survey, result.scene)
+        sweeps = Sweeps.from_survey(result.survey, result.scene)
 
         def points(file: str) -> StoredCloud:
             """Return the points, which tell how far a file is while they are read."""
@@ -230,7 +230,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
 def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
     """Name the files that a result has besides those that all have."""
-    instruments = Instruments.of(survey)
+    instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
     return [*(one.row.file for one in formats), *measured]
 

@@ -130,7 +130,7 @@ class Job:
     @cached_property
     def sweeps(self) -> Sweeps:
         """Sweeps of the survey with poses and boxes of actors; seconds for thousands of poses."""
-        return Sweeps.of(self.survey, self.scene)
+        return Sweeps.from_survey(self.survey, self.scene)
 
 
 def build(

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,16 @@ if TYPE_CHECKING:
 
 BAG_FILES = (".mcap", ".db3")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-# {type of an entry of a point: its number in PointField}
+# {type of a field of a point: number of the type in PointField}
 POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+class BagMessage(NamedTuple):
+    """A message of a bag."""
+
+    topic: str
+    time_ns: int  # at which the message was recorded
+    content: Any  # the deserialised message
 
 
 def is_bag(path: Path) -> bool:
@@ -47,18 +55,18 @@ def open_bag(path: Path, name: str) -> Reader:
 
 @contextmanager
 def opened_bag(path: Path, name: str) -> Iterator[Reader]:
-    """Open a bag for the body, and turn errors of reading it into a LidarError."""
+    """Open a bag until the context exits; errors of reading the bag become a LidarError."""
     with closing(open_bag(path, name)) as bag, reading(name):
         yield bag
 
 
-def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time in nanoseconds, and content of the messages of some topics."""
-    connections = [one for one in bag.connections if one.topic in topics]
-    if connections:  # without any, rosbags would give the messages of all topics
+def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
+    """Yield the messages of `topics` in the order of the bag."""
+    connections = [entry for entry in bag.connections if entry.topic in topics]
+    if connections:  # without connections, rosbags would yield the messages of all topics
         for connection, time_ns, data in bag.messages(connections):
-            message = message_types().deserialize_cdr(data, connection.msgtype)
-            yield connection.topic, time_ns, message
+            content = message_types().deserialize_cdr(data, connection.msgtype)
+            yield BagMessage(connection.topic, time_ns, content)
 
 
 @cache

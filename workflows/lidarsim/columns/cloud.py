@@ -1,4 +1,4 @@
-"""The point cloud."""
+"""Point clouds in memory."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ SHOWN_POINTS = 5
 
 
 class CloudLike(Protocol):
-    """A cloud in memory or in parts, which is read in order, a piece at a time."""
+    """A cloud in memory or in parts that is read in order, piece by piece."""
 
     def __len__(self) -> int: ...
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres, in the positions' type."""
+        """Lowest and highest coordinates, (2, 3), metres, in the type of the positions."""
 
     @property
     def table(self) -> tuple[Column, ...]:
         """The columns beside the positions, in the order of files."""
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, from row `first` on, at most so many at a time."""
+        """Yield the points in order, from row `first` on, in clouds of at most `points`."""
 
     def row_of(self, scan: int) -> int:
-        """Row of the first point of a scan, if the points are in the order of scans."""
+        """Return the row of the first point of a scan, for points in the order of scans."""
 
 
-class Shown:
-    """How prompts and notebooks show a cloud."""
+class CloudDisplay:
+    """Representations of a cloud for prompts and notebooks."""
 
     def __repr__(self: CloudLike) -> str:
         names = ", ".join(("x", "y", "z", *(column.name for column in self.table)))
-        kept = shorten(names, 80, placeholder=" …")
-        return f"<{type(self).__name__} of {len(self):,} points: {kept}>"
+        shown_names = shorten(names, 80, placeholder=" …")
+        return f"<{type(self).__name__} of {len(self):,} points: {shown_names}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Table that notebooks show: columns, their types, the first points."""
+        """Return an HTML table of the columns, their types, and the first points."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
         kinds = [array.dtype for array in values.values()]
@@ -65,7 +65,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_fields
-class Cloud(Shown):
+class Cloud(CloudDisplay):
     """Points of a survey, ordered by scan and ray.
 
     Read a column as ``cloud["channel"]``, or as ``cloud.scan`` unless an attribute has its name.
@@ -77,11 +77,12 @@ class Cloud(Shown):
     positions
         float32 or float64 (n, 3), metres, world coordinates.
     columns
-        {name: (n,)}: the other columns, of `lidarsim.columns.table` or your own.
-    own
+        {name: (n,)}: the other columns, of `lidarsim.columns.table` or custom ones.
+    custom_columns
         Descriptions of the columns that are not in the table.
     sweeps
-        Returns the sweeps of the survey for `save_cloud`; clouds of a `Result` have it.
+        Function that returns the sweeps of the survey, for `save_cloud`; clouds of a `Result` have
+        such a function.
 
     Raises
     ------
@@ -91,10 +92,10 @@ class Cloud(Shown):
 
     positions: AnyFloats
     columns: Mapping[str, AnyArray]
-    own: tuple[Column, ...] = ()
+    custom_columns: tuple[Column, ...] = ()
     sweeps: Callable[[], Any] | None = None
 
-    __repr__ = Shown.__repr__  # which `checked_fields` would replace
+    __repr__ = CloudDisplay.__repr__  # `checked_fields` would replace an inherited method
 
     def __post_init__(self) -> None:
         positions = np.asarray(self.positions)
@@ -104,7 +105,7 @@ class Cloud(Shown):
             raise LidarError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
         if not np.isfinite(positions).all():
             raise LidarError("A point of the cloud is NaN or infinite; it cannot be stored.")
-        known = TABLE | {column.name: column for column in self.own}
+        known_columns = TABLE | {column.name: column for column in self.custom_columns}
         columns = {}
         for name, values in self.columns.items():
             array = np.asarray(values)
@@ -113,7 +114,7 @@ class Cloud(Shown):
                     f"Column {name!r} has the shape {array.shape}, but there are {len(positions)} "
                     "points: give one value for each point."
                 )
-            columns[name] = _fitting(known[name], array) if name in known else array
+            columns[name] = _fitting(known_columns[name], array) if name in known_columns else array
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "columns", columns)
 
@@ -143,7 +144,7 @@ class Cloud(Shown):
                 f"list of their rows, not {shown(key)}; a column is its name, as cloud['range']."
             )
         columns = {name: array[rows] for name, array in self.columns.items()}
-        return Cloud(positions, columns, self.own, self.sweeps)
+        return Cloud(positions, columns, self.custom_columns, self.sweeps)
 
     def __getattr__(self, name: str) -> AnyArray:
         columns: Mapping[str, AnyArray] = self.__dict__.get("columns", {})
@@ -157,9 +158,9 @@ class Cloud(Shown):
     @property
     def table(self) -> tuple[Column, ...]:
         """The columns beside the positions, in the order of files."""
-        known = TABLE | {column.name: column for column in self.own}
+        known_columns = TABLE | {column.name: column for column in self.custom_columns}
         return tuple(
-            known.get(name) or Column(name, array.dtype.str, "", "")
+            known_columns.get(name) or Column(name, array.dtype.str, "", "")
             for name, array in self.columns.items()
             if name != WAVEFORM
         )
@@ -171,26 +172,26 @@ class Cloud(Shown):
         return axes | {column.name: self[column.name] for column in self.table}
 
     @property
-    def recorded(self) -> bool:
-        """Whether its points have waveforms."""
+    def has_waveforms(self) -> bool:
+        """Whether the points have waveforms."""
         return WAVEFORM in self.columns
 
     @property
     def waveforms(self) -> Waveforms:
         """Recorded waveforms of the points.
 
-        LidarError if the survey recorded none: it needs `waveform_samples`.
+        LidarError if the survey, without `waveform_samples`, has recorded no waveforms.
         """
-        if not self.recorded:
+        if not self.has_waveforms:
             raise LidarError(
                 "The cloud has no waveforms: give the survey cloud.waveform_samples, and take the "
                 "cloud of its result; of files only LAS and LAZ hold them."
             )
-        return Waveforms.of(self.columns[WAVEFORM])
+        return Waveforms.from_records(self.columns[WAVEFORM])
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
+        """Lowest and highest coordinates, (2, 3), metres; zeros for an empty cloud."""
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
@@ -208,21 +209,21 @@ class Cloud(Shown):
         return import_module(library).DataFrame(self.by_name)
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
-        """Select the first points, or all if there are fewer."""
+        """Return the first points, or the whole of a smaller cloud."""
         return self[:points]
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, from row `first` on, at most so many at a time, as views."""
+        """Yield the points in order, from row `first` on, as views of at most `points` points."""
         for start in range(first, len(self), points):
             yield self[start : start + points]
 
     def row_of(self, scan: int) -> int:
-        """Row of the first point of a scan, if the points are in the order of scans."""
+        """Return the row of the first point of a scan, for points in the order of scans."""
         return int(np.searchsorted(self["scan"], scan))
 
     @classmethod
     def joined(cls, parts: list[Cloud]) -> Cloud:
-        """Concatenate clouds of the same columns; at least one."""
+        """Concatenate a list of clouds with the same columns; the list is not empty."""
         first = parts[0]
         if len(parts) == 1:
             return first
@@ -230,12 +231,12 @@ class Cloud(Shown):
             name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
         }
         positions = np.concatenate([part.positions for part in parts])
-        return cls(positions, columns, first.own, first.sweeps)
+        return cls(positions, columns, first.custom_columns, first.sweeps)
 
 
 def need_packages(*packages: str) -> None:
-    """Refuse with LidarError what needs packages that are not installed."""
-    # A module that a program made itself has no spec.
+    """Raise LidarError if packages are not installed."""
+    # A module that a program has created has no spec.
     missing = [
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
     ]
@@ -247,13 +248,13 @@ def need_packages(*packages: str) -> None:
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
     """Convert `values` to the column's type; LidarError if a cast would wrap around."""
-    given = np.asarray(values)
-    wanted = np.dtype(column.dtype)
-    cast = given.astype(wanted, copy=False)
-    if cast is not given and wanted.kind in "iu" and not np.array_equal(cast, given):
-        limits = np.iinfo(wanted)
+    array = np.asarray(values)
+    dtype = np.dtype(column.dtype)
+    converted = array.astype(dtype, copy=False)
+    if converted is not array and dtype.kind in "iu" and not np.array_equal(converted, array):
+        limits = np.iinfo(dtype)
         raise LidarError(
-            f"{column.name} holds {given.min()} to {given.max()}; it must be whole numbers of "
+            f"{column.name} holds {array.min()} to {array.max()}; it must be whole numbers of "
             f"{limits.min} to {limits.max}."
         )
-    return cast
+    return converted

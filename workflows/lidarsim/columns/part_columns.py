@@ -1,4 +1,4 @@
-"""Columns of the points of some consecutive scans, as a batch gives them and as a part holds them.
+"""Columns of the points of consecutive scans, as a batch returns and a part stores them.
 
 `x`, `y` and `z` are cells: whole multiples of the precision from the scene's local origin, so that
 positions are rounded only once.
@@ -23,13 +23,13 @@ from .waveforms import WAVEFORM
 class PartColumns:
     """Content of a part."""
 
-    first: int  # scan
+    first: int  # number of the first scan
     counts: Ints  # (scans,): rows of each scan
     columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
-    triangles: Ints32  # (k,): those that were hit
-    hits: Ints  # (k,): all their hits
-    # (scans,) and (scans, samples, 3): hits of each scan, and ends of some of its rays, metres,
-    # local coordinates, NaN where there are fewer; empty in a part that is not stored.
+    triangles: Ints32  # (k,): triangles that were hit
+    hits: Ints  # (k,): hits of each of these triangles
+    # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, metres, local
+    # coordinates, NaN in unused rows; empty in a part that is not stored.
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
     samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
 
@@ -38,19 +38,19 @@ class PartColumns:
 
     @property
     def stop(self) -> int:
-        """One past its last scan."""
+        """Number of the scan after the last scan."""
         return self.first + len(self.counts)
 
     @property
     def cells(self) -> Ints | None:
-        """Lowest and highest cell, (2, 3); None without rows."""
+        """Lowest and highest cells, (2, 3); None without rows."""
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]
         return np.array([[a.min() for a in axes], [a.max() for a in axes]], np.int64)
 
     def scan_column(self) -> Ints32:
-        """Scan of each row."""
+        """Return the scan of each row."""
         scans = np.arange(self.first, self.stop, dtype=np.int32)
         return np.repeat(scans, self.counts)
 
@@ -62,10 +62,20 @@ class PartColumns:
         rows: Integers | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
-        """Points of the part, or some of its rows, with these columns beside the positions.
+        """Return a cloud of the points of the part, or of selected rows.
 
-        Their cells are of `precision_m`, from the world position `origin`, (3,), metres; `sweeps`
-        as of `Cloud`.
+        Parameters
+        ----------
+        table
+            Columns beside the positions.
+        precision_m
+            Size of a cell, metres.
+        origin
+            (3,): world position of cell 0, metres.
+        rows
+            Rows of the points.
+        sweeps
+            Function that returns the sweeps of the survey, see `Cloud`.
         """
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         columns = {

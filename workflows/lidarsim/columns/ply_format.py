@@ -1,11 +1,11 @@
-"""The layout of our point clouds as binary PLY: the header, and a row for each point."""
+"""Layout of point clouds of lidarpool as binary PLY: the header, and a row for each point."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,80 +27,88 @@ _PLY_TYPES = {
 }  # fmt: skip
 
 
-# Types that Open3D writes; others become wider ones.
-_HELD = {"u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
-         "u4": "<f8", "i8": "<f8", "u8": "<f8"}  # fmt: skip
+# Types in files: types that Open3D writes, or wider types.
+_FILE_TYPES = {
+    "u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
+    "u4": "<f8", "i8": "<f8", "u8": "<f8",
+}  # fmt: skip
 _NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
-_EXACT = 2**53  # whole numbers up to here are exact in double precision
+_EXACT = 2**53  # integers up to this limit are exact in double precision
 
 
-def held_type(column: Column) -> np.dtype[Any]:
-    """Type of a column in a file."""
-    return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
+class PlyLayout(NamedTuple):
+    """Layout of the points in a PLY file."""
+
+    start: int  # offset of the first point, bytes
+    points: int  # number of points
+    row: np.dtype[np.void]  # type of a point
 
 
-def as_held(column: Column, values: AnyArray) -> AnyArray:
-    """Values of a column in its type in a file; LidarError if one would not be exact."""
-    wanted = held_type(column)
-    if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
+def file_type(column: Column) -> np.dtype[Any]:
+    """Return the type of a column in a file."""
+    return np.dtype(_FILE_TYPES.get(np.dtype(column.dtype).str[1:], "<f8"))
+
+
+def as_file_type(column: Column, values: AnyArray) -> AnyArray:
+    """Convert values of a column to the type in a file; LidarError if a value would be inexact."""
+    dtype = file_type(column)
+    if dtype == np.float64 and values.dtype.kind in "iu" and len(values):
         largest = max(abs(int(values.min())), abs(int(values.max())))
         if largest > _EXACT:
             raise LidarError(
                 f"Column {column.name!r} holds {largest}, and a PLY file holds whole numbers up to "
                 f"{_EXACT} exactly: leave the column out."
             )
-    return values.astype(wanted, copy=False)
+    return values.astype(dtype, copy=False)
 
 
-def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
-    """Row of a file whose positions are of type `real`, in the order of the table.
+def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
+    """Return the type of a row of a file, with columns in the order of the table.
 
-    Of the size of a row that Open3D writes, in an order of its own: it keeps columns in a hash
-    table.
+    A row of Open3D has the same size and a different order, that of a hash table.
     """
-    kind = "<f8" if real == np.float64 else "<f4"
-    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
+    kind = "<f8" if position_type == np.float64 else "<f4"
+    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, file_type(c)) for c in table])
 
 
 def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
-    """Header of a file of `count` points, in the words of Open3D; `comments` are whole lines."""
+    """Return the header of a file of `count` points in the format of Open3D, with comment lines."""
     lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
     lines = ["comment Created by Open3D", f"{comments}element vertex {count}", *lines]
     return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
 
 
-def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
-    """Find the start of the points of a PLY file, their number, and the type of a row.
+def layout(path: Path) -> PlyLayout:
+    """Return the layout of the points in a PLY file.
 
     Raises
     ------
     OSError
         If the file cannot be read.
     ValueError
-        If it is not a complete binary PLY file with our properties; the message is a clause.
+        If the file is not a complete binary PLY file of lidarpool; the message is a clause.
     """
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(_HEADER_LIMIT)
         if b"end_header\n" not in data:  # names of many classes, perhaps
             data += file.read(_COMMENTS_LIMIT)
-    head, found, _ = data.partition(b"end_header\n")
+    head, end_marker, _ = data.partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
-    if not found or not text.startswith(_MAGIC):
+    if not end_marker or not text.startswith(_MAGIC):
         raise ValueError("it has no header of a binary little-endian PLY file")
     count, dtype = _parse_header(text)
-    start = len(head) + len(found)
+    start = len(head) + len(end_marker)
     announced = start + count * dtype.itemsize
     if size != announced:
         raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
-    return start, count, dtype
+    return PlyLayout(start, count, dtype)
 
 
 def mapped_rows(path: Path) -> Records:
-    """Return the points of a PLY file, a row each, which stay on the disk until they are used.
+    """Return the points of a PLY file, as rows that stay on the disk until they are used.
 
-    LidarError if the file cannot be read, or is not a complete binary PLY file with our
-    properties.
+    LidarError if the file cannot be read, or is not a complete binary PLY file of lidarpool.
     """
     try:
         with explained(f"{path} cannot be read"):
@@ -112,7 +120,7 @@ def mapped_rows(path: Path) -> Records:
 
 
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
-    """Take number and type of the rows from a header; ValueError if they are not ours."""
+    """Return number and type of the rows of a header; ValueError for files not of lidarpool."""
     elements = [line.split() for line in text.splitlines() if line.startswith("element")]
     properties = [line.split() for line in text.splitlines() if line.startswith("property")]
     if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():

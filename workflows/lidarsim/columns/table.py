@@ -18,7 +18,7 @@ from ..base.validation import checked_fields
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
-Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
+Kind = Literal["number", "label"]  # a colour scale, or a colour for each value
 
 NO_SURFACE = "no surface"  # instead of an object's name
 CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
@@ -26,7 +26,7 @@ VELOCITY = "radial_velocity"
 COORDINATES = ("world", "sensor")  # coordinate systems of points
 NORMAL = ("normal_x", "normal_y", "normal_z")
 ORIGIN = ("origin_x", "origin_y", "origin_z")
-VECTORS = (NORMAL, ORIGIN)  # columns that are of use together only
+VECTORS = (NORMAL, ORIGIN)  # columns that are useful only together
 SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN)
 _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
@@ -34,28 +34,29 @@ _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 @dataclass(frozen=True)
 @checked_fields
 class Column:
-    """One quantity of every point of a cloud.
+    """A quantity of every point of a cloud.
 
     Parameters
     ----------
     name
         A Python identifier; also used in files, unless there is a `file_name`.
     dtype
-        NumPy's name of the type of one value.
+        NumPy's name of the type of a value.
     unit
         Unit of the values; "" for none.
     meaning
-        What it is, in a few words without a full stop.
+        Description in a few words without a full stop.
     source
         Name of an attribute of the returns of a batch (`lidarsim.simulator.points.BatchPoints`),
-        or a function that computes the column from them: an array (n,), one value for each
-        point. It runs on the worker that casts the rays. By default the attribute of its name.
+        or a function that computes the column from the returns: an array (n,), a value for each
+        point. The function runs on the worker that casts the rays. By default the attribute with
+        the name of the column.
     coordinates
         Coordinate system of the values: "world", "sensor", or "" for none.
     kind
-        How it is shown: "number" on a colour scale, "label" with a colour for each value.
+        Display of the values: "number" on a colour scale, "label" with a colour for each value.
     file_name
-        Its usual name in files.
+        Usual name of the column in files.
 
     Raises
     ------
@@ -77,10 +78,10 @@ class Column:
             raise LidarError(f"A column cannot have the name {self.name!r}: use an identifier.")
         try:
             kind = np.dtype(self.dtype).kind
-            known = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
+            supported = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
         except TypeError:
-            known = False
-        if not known:
+            supported = False
+        if not supported:
             raise LidarError(
                 f"Column {self.name!r} has the type {self.dtype!r}; give a type of whole or real "
                 "numbers, such as uint8 or float32."
@@ -92,10 +93,9 @@ class Column:
         return self.file_name or self.name
 
     def make(self, returns: Any) -> AnyArray:
-        """Values of this column for the returns of a batch: (n,), of the column's type.
+        """Return the values of this column for the returns of a batch: (n,), of the column's type.
 
-        LidarError if its source gives another number of values, or values that the type cannot
-        hold.
+        LidarError if the source has a wrong number of values, or values that do not fit the type.
         """
         source = self.source or self.name
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
@@ -104,17 +104,17 @@ class Column:
                 f"Column {self.name!r} was made with the shape {values.shape}; it needs one value "
                 f"for each of the {len(returns)} points."
             )
-        wanted = np.dtype(self.dtype)
-        if wanted.kind in "iu" and len(values) and values.dtype != wanted:
-            limits = np.iinfo(wanted)
+        dtype = np.dtype(self.dtype)
+        if dtype.kind in "iu" and len(values) and values.dtype != dtype:
+            limits = np.iinfo(dtype)
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise LidarError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
+                raise LidarError(f"Column {self.name!r} holds NaN or infinity as {dtype}.")
             if values.min() < limits.min or values.max() > limits.max:
                 raise LidarError(
-                    f"Column {self.name!r} holds {values.min()} to {values.max()}, and {wanted} "
+                    f"Column {self.name!r} holds {values.min()} to {values.max()}, and {dtype} "
                     f"holds {limits.min} to {limits.max}: give it a wider type."
                 )
-        return values.astype(wanted, copy=False)
+        return values.astype(dtype, copy=False)
 
 
 SCAN = Column("scan", "int32", "", "scan of the point: a time step at a pose", kind="label")
@@ -127,7 +127,7 @@ CHANNEL = Column(
 OBJECT = Column("object", "int32", "", "object that was hit; -1 for no surface", kind="label")
 
 AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
-ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
+ALWAYS = (*AXES, CHANNEL, OBJECT)  # columns of every part; `scan` follows from the row
 OPTIONAL = (
     Column("ray", "uint32", "", "number of the ray within its scan"),
     Column("time", "int64", "ns", "time of the ray since the survey's start"),
@@ -197,7 +197,7 @@ OPTIONAL = (
         "cause",
         "uint8",
         "",
-        "why the return is there: " + "; ".join(f"{n} {what}" for n, what in enumerate(CAUSES)),
+        "why the return is there: " + "; ".join(f"{n} {cause}" for n, cause in enumerate(CAUSES)),
         kind="label",
     ),
     Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
@@ -232,13 +232,13 @@ COLOURS = ("red", "green", "blue")
 TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
 
 
-def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
+def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
+    """Return the columns in addition to `ALWAYS`, without repetitions; names are of `TABLE`.
 
-    LidarError if there is no column of a name, two have the same name, a vector lacks an axis,
-    or a name cannot be written.
+    LidarError if a name is unknown, two columns have the same name, a vector lacks an axis, or a
+    name cannot be written.
     """
-    kept: dict[str, Column] = {}
+    by_name: dict[str, Column] = {}
     names = {column.in_files: column for column in TABLE.values()} | TABLE
     for entry in columns:
         column = entry
@@ -249,25 +249,25 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
                     + (did_you_mean(column, names) or f" There are {', '.join(names)}.")
                 )
             column = names[column]
-        if kept.get(column.name, column) != column or (
+        if by_name.get(column.name, column) != column or (
             column.name in TABLE and TABLE[column.name] != column
         ):
             raise LidarError(f"Two columns have the name {column.name!r}: rename one.")
-        kept[column.name] = column
+        by_name[column.name] = column
     for vector in VECTORS:
-        if 0 < len(kept.keys() & {*vector}) < len(vector):
+        if 0 < len(by_name.keys() & {*vector}) < len(vector):
             raise LidarError(
                 f"The columns {', '.join(vector)} are one vector, which formats turn to other "
                 "axes: give all three."
             )
-    rest = tuple(column for column in kept.values() if column not in (SCAN, *ALWAYS))
-    check_names((SCAN, *ALWAYS, *rest))
-    return rest
+    optional = tuple(column for column in by_name.values() if column not in (SCAN, *ALWAYS))
+    check_names((SCAN, *ALWAYS, *optional))
+    return optional
 
 
 def check_names(columns: Iterable[Column]) -> None:
-    """Check that columns have distinct names in files; LidarError if not."""
-    taken: set[str] = set()
+    """Raise LidarError unless columns have distinct and valid names in files."""
+    used_names: set[str] = set()
     for name in (column.in_files for column in columns):
         if not name.isascii() or not name.isprintable() or " " in name:
             raise LidarError(
@@ -278,21 +278,21 @@ def check_names(columns: Iterable[Column]) -> None:
                 f"A column cannot have the name {name!r} in files, where Open3D expects three "
                 "numbers for each point: use another name."
             )
-        if name in taken:
+        if name in used_names:
             raise LidarError(f"Two columns have the name {name!r} in files: rename one.")
-        taken.add(name)
+        used_names.add(name)
 
 
-def by_value(names: Mapping[int, str]) -> list[str]:
-    """Names of the values 0, 1, 2, … of a column; empty for those that are not in `names`."""
+def value_names(names: Mapping[int, str]) -> list[str]:
+    """Return the names of the values 0, 1, 2, … of a column; empty for values not in `names`."""
     return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
 
 
 def waveform_column(samples: int) -> Column:
-    """Column of recorded waveforms of so many samples, which only parts and clouds hold."""
+    """Return the column of recorded waveforms, which only parts and clouds in memory have."""
     return Column(WAVEFORM, column_type(samples), "", "waveform of the pulse", "waveform")
 
 
 def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
-    """All columns of a part, in their order in the file."""
+    """Return all columns of a part, in the order of the file."""
     return (*ALWAYS, *optional)

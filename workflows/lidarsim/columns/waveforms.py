@@ -1,4 +1,4 @@
-"""Recorded waveforms of points: a column of records, each with its samples."""
+"""Recorded waveforms of points: a column of records with samples."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Floats, Records
 
-WAVEFORM = "waveform"  # name of the column in parts; in files of clouds it has no place but in LAS
-ZERO = 2048  # that a digitised sample of 0 has, since noise goes below
+WAVEFORM = "waveform"  # name of the column in parts; of cloud files, only LAS holds waveforms
+ZERO = 2048  # digitised value of 0; noise is also negative
 SILENT = -126  # exponent of a waveform without light
 
 
 def record(samples: int) -> np.dtype[np.void]:
-    """Type of a waveform of so many samples.
+    """Return the type of the record of a waveform of a number of samples.
 
-    A sample is `(samples - ZERO) * 2.0**exponent`, in units of energy: the height of an echo as
-    narrow as the pulse is its energy. Sample 0 is `begin` sample steps after the pulse left. The
-    return is at `location_ps` after sample 0, and `toward` is the way to the sensor that light
-    goes there and back in a picosecond, metres, in the axes of the points.
+    A sample is `(samples - ZERO) * 2.0**exponent`, in units of energy: the height of a returned
+    pulse that is as narrow as the sent pulse is its energy. Sample 0 is `begin` sample steps after
+    firing. The return is at `location_ps` after sample 0. `toward` is the direction to the sensor,
+    times half the distance that light travels in a picosecond, metres, in the frame of the points.
     """
     return np.dtype(
         [
@@ -34,17 +34,17 @@ def record(samples: int) -> np.dtype[np.void]:
     )
 
 
-_REST = record(0).itemsize
+_RECORD_BYTES = record(0).itemsize
 
 
 def column_type(samples: int) -> str:
-    """NumPy's name of the type of the column."""
+    """Return NumPy's name of the type of the column."""
     return f"V{record(samples).itemsize}"
 
 
 def records(column: AnyArray) -> Records:
     """Return a column (n,) as records, see `record`."""
-    return column.view(record((column.dtype.itemsize - _REST) // 2))
+    return column.view(record((column.dtype.itemsize - _RECORD_BYTES) // 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +54,12 @@ class Waveforms:
     Parameters
     ----------
     samples
-        Heights (n, samples), in units of `intensity`: an echo as narrow as the pulse is as high as
-        its energy.
+        Heights (n, samples), in units of `intensity`: the height of a returned pulse that is as
+        narrow as the sent pulse is its energy.
     times_ns
-        When each was taken after the pulse left, (n, samples).
+        Times of the samples after firing, (n, samples), nanoseconds.
     location_ns
-        When the return came back, (n,): at half of the speed of light its range.
+        Times of the returns after firing, (n,), nanoseconds: ranges over half the speed of light.
     """
 
     samples: Floats
@@ -67,8 +67,8 @@ class Waveforms:
     location_ns: Floats
 
     @classmethod
-    def of(cls, column: AnyArray) -> Waveforms:
-        """Read a column of records."""
+    def from_records(cls, column: AnyArray) -> Waveforms:
+        """Return the waveforms of a column of records."""
         rows = records(column)
         heights = rows["samples"].astype(np.float64) - ZERO
         heights = np.ldexp(heights, rows["exponent"].astype(int)[:, None])

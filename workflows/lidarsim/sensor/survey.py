@@ -18,7 +18,15 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarError
 from ..base.validation import checked_fields, shown
-from ..columns.table import COORDINATES, OPTIONAL, TABLE, Column, chosen, stored, waveform_column
+from ..columns.table import (
+    COORDINATES,
+    OPTIONAL,
+    TABLE,
+    Column,
+    optional_columns,
+    stored,
+    waveform_column,
+)
 from .faults import Fault, FaultKind, check_faults
 from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
@@ -261,7 +269,7 @@ class Survey(CloudOptions, Weather):
             self._set(sensor=self.sensors[0].sensor)
         extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
         columns = (*self.columns, *(name for name, needed in extra.items() if needed))
-        self._set(columns=chosen(columns), classes=dict(sorted(self.classes.items())))
+        self._set(columns=optional_columns(columns), classes=dict(sorted(self.classes.items())))
         finest = min(one.sensor.optics.resolution_m or PRECISION_M for one in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:
@@ -426,7 +434,7 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
         """All columns of a part."""
-        columns = stored(chosen(self.columns))
+        columns = stored(optional_columns(self.columns))
         if self.waveform_samples:
             columns = (*columns, waveform_column(self.waveform_samples))
         return columns

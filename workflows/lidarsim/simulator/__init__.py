@@ -1,4 +1,4 @@
-"""The simulator: scene, sensors and physics produce returns, and returns are the sources of columns."""
+"""The simulator: from a scene and sensors to returns, and from returns to columns."""
 
 from .scanner import Scanner
 

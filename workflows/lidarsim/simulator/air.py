@@ -22,7 +22,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.random_numbers import Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .doppler import approach
+from .doppler import range_rates_of_origins
 from .returns import (
     RETURN_COLUMNS,
     SURFACE,
@@ -241,7 +241,9 @@ def add_air_hits(
     """
     if returns.velocity is not None:  # the air is at rest
         rays = batch.subray_poses.rays(batch.beams, air_hits.ray, batch.window[0])
-        air_hits = air_hits._replace(velocity=approach(batch.subray_poses, air_hits.ray, *rays))
+        air_hits = air_hits._replace(
+            velocity=range_rates_of_origins(batch.subray_poses, air_hits.ray, *rays)
+        )
     if setup.in_waveforms or setup.waveform_samples:
         batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
         return batch.hits

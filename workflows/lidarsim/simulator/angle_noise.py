@@ -30,7 +30,7 @@ class AngleNoiseStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of the directions of beams, in bytes."""
-        return turned_beams(setup, sizes)
+        return beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add random angles to the beams of a batch; return the returns unchanged."""
@@ -55,7 +55,7 @@ class RippleStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of the directions of beams; 0 if `AngleNoiseStep` counts the memory."""
-        return Memory() if setup.noise.angle_deg else turned_beams(setup, sizes)
+        return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add the errors of azimuth to the beams of a batch; return the returns unchanged."""
@@ -78,7 +78,7 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
     return across, up
 
 
-def turned_beams(setup: Setup, sizes: Sizes) -> Memory:
+def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
     """Return the memory of beams with a direction each, in bytes."""
     if setup.has_several_returns:  # then the beams are deflected batch by batch
         return Memory()

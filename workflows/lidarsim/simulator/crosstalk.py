@@ -30,7 +30,7 @@ from .surfaces import Surfaces
 if TYPE_CHECKING:
     from .stray_loops import ReceivedSpots
 
-OTHER = Purpose(23, "noise of the energy of another sensor's pulse")
+FOREIGN_PULSE = Purpose(23, "noise of the energy of another sensor's pulse")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
@@ -65,6 +65,14 @@ class _Spots(NamedTuple):
     distance: Floats  # from the sensor, metres
 
 
+class _Candidates(NamedTuple):
+    """Spots, and consecutive rays that may see each spot: arrays (k,)."""
+
+    spot: Indices
+    start: Indices  # row of the first ray in `_WaitingRays.order`
+    stop: Indices  # one past the row of the last ray
+
+
 class CrosstalkStep(PulseStep):
     """Adds the foreign pulses that a sensor receives.
 
@@ -78,7 +86,7 @@ class CrosstalkStep(PulseStep):
     reads = "ray", "distance"
     writes = RETURN_COLUMNS
     causes = (CROSSTALK,)
-    purposes = (OTHER,)
+    purposes = (FOREIGN_PULSE,)
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -117,7 +125,7 @@ class CrosstalkStep(PulseStep):
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.scan_and_number(ray)
-        detected = passes(self.setup.noise, OTHER, energy, scan, number, numbers(ray))
+        detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
         foreign_returns = returns_without_surface(
             returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )
@@ -167,8 +175,8 @@ class CrosstalkStep(PulseStep):
         """Return the spots in the fields of view of rays while the rays wait."""
         from . import stray_loops  # not before: numba takes half a second to import
 
-        spot, first, stop = self._candidates(waiting, spots)
-        max_count = int(np.maximum(stop - first, 0).sum())
+        candidates = self._candidates(waiting, spots)
+        max_count = int(np.maximum(candidates.stop - candidates.start, 0).sum())
         sightings = stray_loops.ReceivedSpots(
             row=np.empty(max_count, np.int64),
             spot=np.empty(max_count, np.int64),
@@ -176,7 +184,7 @@ class CrosstalkStep(PulseStep):
             range_m=np.empty(max_count),
         )
         count = stray_loops.receive(
-            stray_loops.SpotPairs(spot, first, stop),
+            stray_loops.SpotPairs(candidates.spot, candidates.start, candidates.stop),
             stray_loops.ReceivingRays(
                 waiting.order,
                 owned(waiting.fired),
@@ -191,11 +199,10 @@ class CrosstalkStep(PulseStep):
         )
         return sightings.first(count)
 
-    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> tuple[Indices, Indices, Indices]:
-        """Return spots, and for each spot the rays that may receive its light.
+    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
+        """Return spots, and for each spot the rays that may receive the light of the spot.
 
         The rays wait while the light of the spot arrives, and their cell looks towards the spot.
-        They are consecutive in `waiting.order`: returns start and stop.
         """
         times = waiting.fired[waiting.order]
         nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
@@ -213,7 +220,7 @@ class CrosstalkStep(PulseStep):
         spot = spot[in_view]
         cell = cell[in_view]
         first_row = np.maximum(first[spot], cell * CELL_RAYS)
-        return spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+        return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
 
     def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
         """Return the axes (c, 3) and opening angles (c,), radians, of cones of consecutive rays.

@@ -49,16 +49,22 @@ _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     """Return the names of the columns that a device can compute for a survey of a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
-    several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
-    shining = any(
-        m.reflectance == "texture" or m.roughness is not None or (several and m.spectrum)
+    several_wavelengths = (
+        len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    )
+    textured_or_rough = any(
+        m.reflectance == "texture"
+        or m.roughness is not None
+        or (several_wavelengths and m.spectrum)
         for m in survey.materials
     )
-    able = {column.name for column in _DEVICE_COLUMNS} - {*(_ENERGIES if hazy or shining else ())}
+    computable = {column.name for column in _DEVICE_COLUMNS} - {
+        *(_ENERGIES if hazy or textured_or_rough else ())
+    }
     if scene.has_mixed_objects:  # the device has no materials of faces
-        able -= {*_ENERGIES, "class"}
-    able -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
-    return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+        computable -= {*_ENERGIES, "class"}
+    computable -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
+    return computable - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
@@ -111,11 +117,13 @@ class DeviceColumns:
         self._surfaces = surfaces
         self.survey = survey
         stored = {column.name for column in survey.stored_columns}
-        able = _device_column_names(scene, survey)
+        computable = _device_column_names(scene, survey)
         self.all_hits = needs_hits(scene, survey)
         if self.all_hits and scene.actors:
-            able -= {*_ENERGIES}
-        self.device_columns = [column for column in _DEVICE_COLUMNS if column.name in stored & able]
+            computable -= {*_ENERGIES}
+        self.device_columns = [
+            column for column in _DEVICE_COLUMNS if column.name in stored & computable
+        ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
         # Whether NumPy needs hits on actors.
         self.some_hits = bool(scene.actors and self.energies)
@@ -147,14 +155,14 @@ class DeviceColumns:
         """
         survey = self.survey
         sensor = survey.carried[specs[0].sensor].sensor
-        every = survey.keep_every
+        keep_every = survey.keep_every
         scan = check_scan(
             pattern,
             **poses.caster_arguments,
             window=window,
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
-            keep_every=every,
+            keep_every=keep_every,
             groups=groups,
             tally=True,
         )
@@ -163,7 +171,7 @@ class DeviceColumns:
             actor_hits = replace(
                 actor_hits, triangle=actor_hits.triangle - np.int32(self.bodies[-1, 0])
             )
-        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // every) + len(groups))
+        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // keep_every) + len(groups))
         try:
             hits, tally = self._caster.caster.visit(scan, transfer.make, self._counters, actor_hits)
         finally:  # else the device would write to memory that goes back to the pool
@@ -187,7 +195,7 @@ class DeviceColumns:
             self._scene,
             survey,
             specs,
-            -(-hits // every),
+            -(-hits // keep_every),
             hits,
             tally,
             columns,
@@ -201,9 +209,13 @@ class DeviceColumns:
             materials = self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
-                self.bodies, surfaces.owners, normals, materials.reflectance,
-                materials.retro.astype(np.uint8), materials.semantic_class,
-            )  # fmt: skip
+                self.bodies,
+                surfaces.owners,
+                normals,
+                materials.reflectance,
+                materials.retro.astype(np.uint8),
+                materials.semantic_class,
+            )
             self._surface_tables = tuple(to_device(cupy, table) for table in tables)
         if self._rotations is None:
             self._rotations = to_device(cupy, self._surfaces.bodies()[1])
@@ -250,17 +262,28 @@ class _ColumnTransfer:
         }
         flags = sum(1 << _DEVICE_COLUMNS.index(column) for column in computed)
         arguments = (
-            hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(),
-            np.int64(len(hits)), np.int32(flags), *transfer.kernel_arguments, *arrays.values(),
-        )  # fmt: skip
+            hits.ray,
+            hits.distance,
+            hits.triangle,
+            hits.instance,
+            *hits.rays(),
+            np.int64(len(hits)),
+            np.int32(flags),
+            *transfer.kernel_arguments,
+            *arrays.values(),
+        )
         transfer.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
         return arrays
 
     def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
         """Return the rows of the hits on actors, and their rays, distances and triangles."""
         on_actors = hits.cupy.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
-        columns = (on_actors, hits.ray[on_actors], hits.distance[on_actors],
-                   hits.triangle[on_actors])  # fmt: skip
+        columns = (
+            on_actors,
+            hits.ray[on_actors],
+            hits.distance[on_actors],
+            hits.triangle[on_actors],
+        )
         rows, ray, distance, triangle = (array.get() for array in columns)
         triangle += np.int32(self._maker.bodies[-1, 0])
         return self._count + rows, ray, distance, triangle
@@ -308,13 +331,23 @@ class _ColumnTransfer:
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return (
             np.float64(maker.survey.precision_m),
-            cupy.asarray(self._groups), np.int32(len(specs)),
-            cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
-            np.int32(sensor.channels), np.int64(specs[0].start_ns),
-            bodies, owners, normals, rotations,
-            reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
-            np.float64(NEAREST_M), classes,
-        )  # fmt: skip
+            cupy.asarray(self._groups),
+            np.int32(len(specs)),
+            cupy.asarray(sensor.begins_ns(firings)),
+            cupy.asarray(sensor.beams.time_ns),
+            np.int32(sensor.channels),
+            np.int64(specs[0].start_ns),
+            bodies,
+            owners,
+            normals,
+            rotations,
+            reflectance,
+            retro,
+            np.float64(RETRO_GAIN),
+            np.float64(REFERENCE_M),
+            np.float64(NEAREST_M),
+            classes,
+        )
 
 
 @dataclass(frozen=True, eq=False)

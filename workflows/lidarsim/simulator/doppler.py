@@ -20,7 +20,9 @@ VELOCITY = Purpose(40, "noise of a return's radial velocity")
 BLOCK_HITS = 1 << 13  # hits that are computed at a time, to fit a cache
 
 
-def approach(poses: CastPoses, ray: Integers, origins: Floats, directions: Floats) -> Floats:
+def range_rates_of_origins(
+    poses: CastPoses, ray: Integers, origins: Floats, directions: Floats
+) -> Floats:
     """Return the growth of the ranges of static points by the motion of the carrier, m/s: (n,).
 
     Origins and unit directions of the rays are (n, 3), in the scene frame.
@@ -59,7 +61,7 @@ def radial_velocities(
         (n,): firing times, nanoseconds since the survey's start; for actors.
     """
     origins, directions = rays
-    rates = approach(poses, ray, origins, directions)
+    rates = range_rates_of_origins(poses, ray, origins, directions)
     if poses.actor_trajectories:
         velocity = velocities_of_ends(
             surfaces, poses.actor_trajectories, rays, distance, triangle, times

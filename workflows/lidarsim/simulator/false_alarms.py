@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..base.arrays import Floats, Indices, Integers
@@ -16,6 +18,14 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 FALSE_ALARM = CAUSES.index("false alarm")
 ALARM = Purpose(20, "time until the next false alarm")
 PEAK = Purpose(21, "energy of a false alarm")
+
+
+class FalseAlarms(NamedTuple):
+    """False alarms of rays: arrays (k,)."""
+
+    row: Indices  # of the rays
+    time_s: Floats  # since the receiver opened, seconds
+    energy: Floats
 
 
 class FalseAlarmStep(PulseStep):
@@ -48,39 +58,33 @@ class FalseAlarmStep(PulseStep):
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(rays)
-        row, since_s, energy = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
-        distance = sensor.min_range_m + since_s * (LIGHT_M_NS * 1e9 / 2)
-        return merged(
-            returns, returns_without_surface(returns, rays[row], distance, energy, FALSE_ALARM)
+        alarms = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
+        distance = sensor.min_range_m + alarms.time_s * (LIGHT_M_NS * 1e9 / 2)
+        alarm_returns = returns_without_surface(
+            returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM
         )
+        return merged(returns, alarm_returns)
 
 
-def false_alarms(
-    noise: Noise, gate_s: float, scan: Integers, ray: Integers
-) -> tuple[Indices, Floats, Floats]:
+def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> FalseAlarms:
     """Sample false alarms of rays (n,), whose receivers are open for `gate_s` seconds.
 
     False alarms come at the same rate at all times. Each is a maximum of the receiver's noise above
     the threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
     distribution (Rice 1944).
-
-    Returns
-    -------
-    Rows of the rays, the time since the receiver opened, in seconds, and energies: (k,) each.
     """
     rows = np.arange(len(ray))
     since_s = np.zeros(len(ray))
-    alarms: list[tuple[Indices, Floats, Floats]] = []
+    alarms: list[FalseAlarms] = []
     while len(rows) or not alarms:
         number = len(alarms)
         # The time until the next false alarm is exponentially distributed.
-        drawn = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
-        in_gate = np.flatnonzero(drawn > exp(-noise.false_alarm_hz * (gate_s - since_s)))
+        uniform_numbers = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
+        in_gate = np.flatnonzero(uniform_numbers > exp(-noise.false_alarm_hz * (gate_s - since_s)))
         rows = rows[in_gate]
-        since_s = since_s[in_gate] - log(drawn[in_gate]) / noise.false_alarm_hz
+        since_s = since_s[in_gate] - log(uniform_numbers[in_gate]) / noise.false_alarm_hz
         since_s = np.minimum(since_s, gate_s)
         share = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
         peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(share))
-        alarms.append((rows, since_s, noise.threshold * peak))
-    row, time_s, energy = map(np.concatenate, zip(*alarms, strict=True))
-    return row, time_s, energy
+        alarms.append(FalseAlarms(rows, since_s, noise.threshold * peak))
+    return FalseAlarms(*map(np.concatenate, zip(*alarms, strict=True)))

@@ -92,8 +92,8 @@ class LossStep(PulseStep):
                 lost_channels[row, required(fault.channels)] = True
             else:
                 packet = firings.numbers // fault.packet
-                drawn = uniform(seed, PACKET, spec.station, packet, fault_number)
-                lost_firings[row] = drawn < required(fault.share)
+                uniform_numbers = uniform(seed, PACKET, spec.station, packet, fault_number)
+                lost_firings[row] = uniform_numbers < required(fault.share)
         rows = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(

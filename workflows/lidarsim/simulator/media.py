@@ -81,7 +81,7 @@ class MediaStack:
         self.triangles[rows[free], depth[free]] = triangles[free]
 
     def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stack of each of `rows`; return True where it was there."""
+        """Remove a medium from the stacks of `rows`; return False for rows without the medium."""
         matches = self.kinds[rows] == kinds[:, None]
         in_stack = matches.any(axis=1)
         rows = rows[in_stack]
@@ -89,8 +89,8 @@ class MediaStack:
         column = np.arange(MAX_MEDIA)
         column = column + (column >= depth[:, None])
         for table in (self.kinds, self.triangles):
-            ended = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
-            table[rows] = np.take_along_axis(ended, column, axis=1)
+            padded = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
+            table[rows] = np.take_along_axis(padded, column, axis=1)
         return in_stack
 
 
@@ -179,9 +179,9 @@ class Media:
         self._angles = table.leaf_angles
         # The value of the kind -1, no surface, is 0: the last entry.
         self._area, self._index, self._attenuation = (
-            np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
-                                                  table.attenuation)
-        )  # fmt: skip
+            np.append(values, 0.0)
+            for values in (table.leaf_area, table.refractive_index, table.attenuation)
+        )
         self._angle = np.append(table.leaf_angle, 0)
         closed, self._inwards = surfaces.solids
         for number in np.flatnonzero(table.leafy).tolist():

@@ -20,7 +20,7 @@ from ..scene.colours import luminance
 from ..sensor.random_numbers import Purpose, raw
 from ..sensor.weather import FAINTEST
 from .actor_trajectories import ActorTrajectories
-from .doppler import approach, velocities_of_ends
+from .doppler import range_rates_of_origins, velocities_of_ends
 from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
 from .motion import CastPoses, Clock, along_rings
 from .returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
@@ -113,6 +113,14 @@ class Crossings(NamedTuple):
     velocities: Floats | None  # of the surfaces: a moving surface that bends light shifts the range
 
 
+class OnwardRows(NamedTuple):
+    """Rows of light that continues: arrays (k,)."""
+
+    rows: Indices
+    reflected: Bools  # whether a surface mirrors the light
+    share: Floats  # of the energy that returns
+
+
 class Deflection(NamedTuple):
     """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
 
@@ -189,8 +197,8 @@ class CastStep(PulseStep):
         first_light = cast.light
         parts: list[VisibleHits] = []
         for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
-            surface_hits = self._meet(cast, batch)
-            parts.append(self._see(cast.light, surface_hits))
+            surface_hits = self._surface_hits(cast, batch)
+            parts.append(self._visible_hits(cast.light, surface_hits))
             onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
             if onward is None:
                 break
@@ -256,7 +264,7 @@ class CastStep(PulseStep):
         light = LightPaths(ray, times, origins, directions, np.ones(count), np.zeros(count))
         media = self._media
         if setup.has_velocities:
-            light.range_rate = approach(poses, ray, origins, directions)
+            light.range_rate = range_rates_of_origins(poses, ray, origins, directions)
         if setup.has_mirrors:
             light.mirrored = np.zeros(count, np.uint8)
         deflected = setup.has_mirrors or (media is not None and media.refracts)
@@ -270,7 +278,7 @@ class CastStep(PulseStep):
 
     # -- hits --------------------------------------------------------------------------------
 
-    def _meet(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
+    def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
         """Return the hits of light on surfaces, or on leaves before the surfaces."""
         surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories
@@ -361,7 +369,7 @@ class CastStep(PulseStep):
             light.times,
         )
 
-    def _see(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
+    def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
         """Return the hits that the sensor may see, and the surfaces from which light continues."""
         materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         velocity = None
@@ -435,11 +443,10 @@ class CastStep(PulseStep):
 
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
-    ) -> tuple[Indices, Bools, Floats]:
-        """Compute the shares of the energy of light that surfaces transmit or mirror.
+    ) -> OnwardRows:
+        """Compute the energy of light that surfaces transmit or mirror; drop faint light.
 
-        Returns the rows of light that is not too faint, whether the light is reflected, and its
-        share: (k,) each. `rows` and `reflected` are overwritten.
+        The arrays `rows` and `reflected` are overwritten.
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -475,7 +482,7 @@ class CastStep(PulseStep):
             ),
             share,
         )
-        return rows[:count], reflected[:count], share[:count]
+        return OnwardRows(rows[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces; return the light that hits a surface within the range."""
@@ -585,11 +592,11 @@ def _range_rate_behind(
     velocities: Floats | None,
     outgoing: Floats,
 ) -> Floats | None:
-    """Return the growth of the optical path behind surfaces that move, m/s: (n,).
+    """Return the growth of the optical path behind moving surfaces and mirrors, m/s: (n,).
 
     `incoming_index` is the refractive index before the surfaces, `light.index` behind them.
     """
-    if light.range_rate is None or velocities is None:  # a mirror that moves shifts it, too
+    if light.range_rate is None or velocities is None:
         return light.range_rate
     incoming_speed = products(velocities.T, light.directions.T)
     outgoing_speed = products(velocities.T, outgoing.T)

@@ -181,9 +181,9 @@ class BatchPoints:
 
         Points of a frozen sensor stay fixed in the sensor frame, and move with the sensor.
         """
-        return self._after_freezing(self._scene_positions)
+        return self._moved_with_sensor(self._scene_positions)
 
-    def _after_freezing(self, points: Floats) -> Floats:
+    def _moved_with_sensor(self, points: Floats) -> Floats:
         """Move points (n, 3) with a frozen sensor from the repeated sweep to the current sweep."""
         if self.specs[0].repeats is None:
             return points
@@ -198,7 +198,7 @@ class BatchPoints:
         """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
-        return self._after_freezing(self.origins) + self.scene.origin
+        return self._moved_with_sensor(self.origins) + self.scene.origin
 
     @property
     def origin_x(self) -> Floats:
@@ -341,7 +341,7 @@ class BatchPoints:
         return np.abs(self._lit[0])
 
     @cached_property
-    def _facing(self) -> tuple[Floats, Floats]:
+    def _facing_normals(self) -> tuple[Floats, Floats]:
         """Unit normals (n, 3), scene frame, on the side that was hit, and cosines of incidence.
 
         NaN for returns without a surface, leaves within a crown, and ghosts, whose last ray starts
@@ -371,10 +371,10 @@ class BatchPoints:
     @cached_property
     def normals(self) -> Floats:
         """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3)."""
-        normals, _ = self._facing
+        normals, _ = self._facing_normals
         if self.survey.coordinates == "sensor":
             return self._world_to_sensor(normals)
-        return self._after_freezing(normals) - self._after_freezing(np.zeros((1, 3)))
+        return self._moved_with_sensor(normals) - self._moved_with_sensor(np.zeros((1, 3)))
 
     @property
     def normal_x(self) -> Floats:
@@ -394,7 +394,7 @@ class BatchPoints:
     @property
     def incidence_deg(self) -> Floats:
         """Angle between the ray and the normal of its surface, degrees; NaN as in `normals`."""
-        return np.degrees(arccos(np.minimum(self._facing[1], 1.0)))
+        return np.degrees(arccos(np.minimum(self._facing_normals[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:

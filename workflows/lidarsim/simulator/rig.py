@@ -64,7 +64,11 @@ class Rig:
         self._assemble(scene, survey, options, None)
 
     def _assemble(
-        self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
+        self,
+        scene: Scene,
+        survey: Survey,
+        options: dict[str, Any],
+        shared_caster: SceneCaster | None,
     ) -> None:
         self.scene = scene
         self.survey = survey
@@ -72,14 +76,14 @@ class Rig:
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._caster = SceneCaster(scene, self._surfaces, like, **options)
+        self._caster = SceneCaster(scene, self._surfaces, shared_caster, **options)
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)
-        self._repeated_rays: dict[
-            tuple[int, bool], _Rays
-        ] = {}  # {(sensor, whether it moves): rays}
-        self._patterns: dict[tuple[int, int, int], Pattern] = {}  # {(sensor, first, stop): rays}
+        # {(sensor, whether it moves): rays}
+        self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
+        # {(sensor, first firing, stop): rays}
+        self._patterns: dict[tuple[int, int, int], Pattern] = {}
         for number in range(len(survey.carried)):
             self._rays_of_sensor(number, survey.path.moves)
 

@@ -43,8 +43,8 @@ from .surfaces import warn_of_grey
 
 MAX_SCANS = 1 << 31  # the type of the column `scan`
 MAX_START_S = 9e9  # times are int64, nanoseconds
-Number = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
-Start = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
+SweepNumber = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
+StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
 
 class Scanner:
@@ -185,8 +185,8 @@ class Scanner:
         self,
         pose: Pose | Trajectory | Sequence[float],
         *,
-        number: Number | None = None,
-        start_s: Start = None,
+        number: SweepNumber | None = None,
+        start_s: StartSeconds = None,
     ) -> Cloud:
         """Scan a sweep: a revolution of the head, or a frame.
 
@@ -244,7 +244,11 @@ class Scanner:
 
     @checked
     def ranges(
-        self, poses: Pose | ArrayLike, *, number: Number | None = None, start_s: Start = None
+        self,
+        poses: Pose | ArrayLike,
+        *,
+        number: SweepNumber | None = None,
+        start_s: StartSeconds = None,
     ) -> Floats32:
         """Return images of the ranges that the sensor measures from several poses.
 

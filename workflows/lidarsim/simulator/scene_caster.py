@@ -40,7 +40,15 @@ from .motion import CastPoses, Clock
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
-SHORT = 1e-3  # share of a distance: a ray that ends by so little before a point reaches the point
+REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
+
+
+class _NearestHits(NamedTuple):
+    """Nearest hits of rays: arrays (k,), in the order of rays."""
+
+    ray: Ints
+    distance: Floats  # metres
+    triangle: Ints32
 
 
 class _ActorShapes(NamedTuple):
@@ -75,7 +83,11 @@ class SceneCaster:
     """
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, like: SceneCaster | None = None, **options: Any
+        self,
+        scene: Scene,
+        surfaces: Surfaces,
+        shared_caster: SceneCaster | None = None,
+        **options: Any,
     ) -> None:
         self._surfaces = surfaces
         self._shared = scene.instances
@@ -90,11 +102,11 @@ class SceneCaster:
         reach = np.float32(np.abs(scene.bounds).max())
         self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
         self._media = surfaces.media
-        if like is None or like._media != self._media:
+        if shared_caster is None or shared_caster._media != self._media:
             vertices = surfaces.spread_out(1.5 * self.clear_m)
             self.caster: RayCaster = _caster_of(scene, vertices, options)
         else:
-            self.caster = like.caster
+            self.caster = shared_caster.caster
         self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         # First triangle of each actor.
@@ -194,13 +206,11 @@ class SceneCaster:
         if len(distance):
             poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
             hits = self.scan(Pattern(towards / distance[:, None], origins), poses)
-            visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - SHORT)
+            visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - REACHED)
         return visible
 
-    def _with_actors(
-        self, static_hits: ScanReturns, scan: Scan, poses: CastPoses
-    ) -> tuple[Ints, Floats, Ints32]:
-        """Return rays, distances and triangles of the nearest hits on static bodies and actors."""
+    def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
+        """Return the nearest hits on static bodies and actors."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         static_distance = np.full(len(scan), np.inf)
@@ -218,7 +228,7 @@ class SceneCaster:
             ),
             joined,
         )
-        return joined.ray[:count], joined.distance[:count], joined.triangle[:count]
+        return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""

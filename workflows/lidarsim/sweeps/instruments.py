@@ -1,4 +1,4 @@
-"""Instruments that a carrier has beside its lidars: an IMU and a GNSS receiver."""
+"""Instruments of a carrier beside its lidars: an IMU and a GNSS receiver."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
 
 @dataclass(frozen=True)
 class Instrument:
-    """Mount and noise of an instrument, as bags state them beside its samples."""
+    """Mount and noise of an instrument, which bags state beside its samples."""
 
     position: list[float]  # on the carrier, metres
     quaternion: list[float]  # x, y, z, w
-    # Of white noise: of angular velocities and specific forces; of positions to the east, the north
-    # and up, where those that drift are added.
+    # Variances of white noise: of angular velocities and specific forces; or of positions to the
+    # east, the north and up, including drift.
     variances: list[float]
 
 
@@ -37,7 +37,7 @@ class Instruments:
     folder: Path | None = None  # None until the files are written
 
     @classmethod
-    def of(cls, survey: Survey) -> Instruments | None:
+    def from_survey(cls, survey: Survey) -> Instruments | None:
         """Return the instruments of a survey; None if the survey has none."""
         navigation = survey.navigation
         if navigation is None or (navigation.imu is None and navigation.gnss is None):
@@ -64,23 +64,26 @@ class Instruments:
             if instrument is not None
         ]
 
-    def words(self) -> dict[str, Any]:
-        """Return the instruments as JSON holds them, without the folder."""
+    def to_json(self) -> dict[str, Any]:
+        """Return a dictionary for JSON of the instruments, without the folder."""
         instruments = {"imu": self.imu, "gnss": self.gnss}
         return {name: instrument and asdict(instrument) for name, instrument in instruments.items()}
 
     @classmethod
-    def from_words(cls, words: dict[str, Any], folder: Path) -> Instruments:
-        """Return what `words` gave; with `folder` if it has the files of all instruments."""
-        imu = words["imu"] and Instrument(**words["imu"])
-        gnss = words["gnss"] and Instrument(**words["gnss"])
+    def from_json(cls, values: dict[str, Any], folder: Path) -> Instruments:
+        """Return the instruments of a dictionary from `to_json`.
+
+        `folder` is stored if it contains the files of all instruments.
+        """
+        imu = values["imu"] and Instrument(**values["imu"])
+        gnss = values["gnss"] and Instrument(**values["gnss"])
         instruments = cls(imu, gnss, folder)
         if all((folder / name).exists() for name in instruments.files):
             return instruments
         return cls(imu, gnss)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, without its header; none if the file is not written."""
+        """Yield the rows of a file, without its header; no rows if the file is not written."""
         if self.folder is None or name not in self.files:
             return
         with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:
@@ -90,6 +93,7 @@ class Instruments:
 
 
 def _instrument(mount: Pose, variances: list[float]) -> Instrument:
+    """Return an instrument at a mount, with w of the quaternion at or above 0."""
     quaternion = quaternions_of(mount.turn[None])[0]
     quaternion *= -1 if quaternion[3] < 0 else 1
     return Instrument([*mount.position], quaternion.tolist(), variances)

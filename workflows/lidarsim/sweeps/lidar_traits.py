@@ -1,4 +1,4 @@
-"""What files say of a sensor beside its points: modes, firings and lines of its mirror."""
+"""Traits of a sensor that files state beside its points: modes, firings, lines of its mirror."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ..sensor import Sensor
 from ..sensor.beams import Mirror, Spin
 from ..sensor.sensor import LineSensor
 
-_OUSTER = "ouster"  # scale of reflectivity that sensors of this maker have
+_OUSTER = "ouster"  # scale of reflectivity of sensors of this manufacturer
 
 
 @dataclass(frozen=True)
 class MirrorLines:
     """Lines that a mirror sweeps across the direction of flight.
 
-    `rate_hz` counts cycles; a swinging mirror sweeps two lines in a cycle, others one. `start_ns`
-    is the start of cycle 0, nanoseconds since the start of the station. `leftward` says whether the
-    first line of a cycle runs from right to left, seen along the sensor's x axis.
+    `rate_hz` counts cycles; a swinging mirror sweeps two lines in a cycle, a rotating mirror one
+    line. `start_ns` is the start of cycle 0, nanoseconds since the start of the station. `leftward`
+    is True if the first line of a cycle runs from right to left, seen along the sensor's x axis.
     """
 
     rate_hz: float
@@ -32,7 +32,7 @@ class MirrorLines:
     def numbers(self, times_ns: Floats) -> Ints:
         """Return the line of each time (n,), nanoseconds since the start of the station: (n,)."""
         per_second = self.rate_hz * (2 if self.swings else 1)
-        # A line begins with the firing that times are rounded to, 1 ns.
+        # Times are rounded to 1 ns: a line starts up to 1 ns before its first firing.
         return np.floor((times_ns - self.start_ns + 1) * (per_second / 1e9)).astype(np.int64)
 
     def leftwards(self, lines: Ints) -> Ints:
@@ -49,12 +49,12 @@ class LidarTraits:
     mode: str  # of its returns, see `Returns`
     zero_deg: float = 0.0  # azimuth at which its head starts: counter-clockwise from x
     firing_ns: float = 0.0  # time from the first beam of a firing to the last
-    # Length that the maker's ranges count beside the distance from the beam's origin, metres.
+    # Difference between the manufacturer's ranges and distances from the beam's origin, metres.
     range_offset_m: float = 0.0
     lines: MirrorLines | None = None  # of sensors that sweep across the direction of flight
 
     @classmethod
-    def of(cls, sensor: Sensor, mode: str) -> LidarTraits:
+    def from_sensor(cls, sensor: Sensor, mode: str) -> LidarTraits:
         """Return the traits of a sensor, whose class may be a user's."""
         head = sensor.head
         beams = sensor.beams
@@ -72,15 +72,15 @@ class LidarTraits:
             _lines_of(sensor),
         )
 
-    def words(self) -> dict[str, Any]:
-        """Return the traits as JSON holds them."""
+    def to_json(self) -> dict[str, Any]:
+        """Return a dictionary for JSON of the traits."""
         return asdict(self)
 
     @classmethod
-    def from_words(cls, words: dict[str, Any]) -> LidarTraits:
-        """Return the traits that `words` gave."""
-        lines = words.pop("lines")
-        return cls(**words, lines=lines and MirrorLines(**lines))
+    def from_json(cls, values: dict[str, Any]) -> LidarTraits:
+        """Return the traits of a dictionary from `to_json`, whose `lines` are removed."""
+        lines = values.pop("lines")
+        return cls(**values, lines=lines and MirrorLines(**lines))
 
 
 def _lines_of(sensor: Sensor) -> MirrorLines | None:

@@ -25,7 +25,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
-from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
+from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
 from lidarsim.scene.actors import Actor, samples_each, shapes_of
 from lidarsim.scene.colours import as_bytes
 from lidarsim.scene.scene import Scene
@@ -194,7 +194,7 @@ class View:
             names: dict[str, Sequence[str]] = {
                 "sensor": known.sensors,
                 "object": (*known.objects, *known.actors),
-                "class": by_value(known.classes),
+                "class": value_names(known.classes),
                 "material": known.materials,
             }
             if column in names:

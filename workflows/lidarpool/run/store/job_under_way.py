@@ -134,7 +134,7 @@ class JobUnderWay(PipelineJob):
             job.survey.precision_m,
             job.scene.origin if world else np.zeros(3),
             keeper=self._keeper,
-            sweeps=partial(Sweeps.of, job.survey, job.scene),
+            sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
         )
 
     def points_of_scan(self, scan: int) -> Cloud:
