@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow.dataset
-import pyarrow.parquet
 import pytest
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 

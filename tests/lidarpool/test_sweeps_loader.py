@@ -23,7 +23,6 @@ from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps,
 from tests.rows import quick
 
 import lidarpool
-import lidarpool.export.kitti
 from lidarpool import LidarError, Scene, Sweep
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes

@@ -29,7 +29,7 @@ from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.materials import extinction
 from lidarsim.sensor.weather import EXIT_M, dust, rain, snow, spray
-from lidarsim.simulator.air import highest
+from lidarsim.simulator.air import highest_probabilities
 from lidarsim.simulator.rig import Rig
 
 SEEN = Noise(detection_range_m=100)
@@ -323,7 +323,7 @@ def test_the_peak_of_fog_is_where_signal_and_noise_are_highest():
     signals = np.array([4.0, 3.5, 3.0, 1.0])
     rng = np.random.default_rng(1)
     noisy = signals + rng.normal(size=(400_000, 4))
-    table = highest(signals)
+    table = highest_probabilities(signals)
     for count in range(1, 5):
         share = np.bincount(noisy[:, :count].argmax(axis=1), minlength=4)[:count] / 400_000
         assert np.diff(table[count, :count], prepend=0) == pytest.approx(share, abs=0.004)

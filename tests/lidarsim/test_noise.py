@@ -109,7 +109,11 @@ def test_no_random_number_is_used_twice(monkeypatch):
                 and getattr(module, known.__name__, None) is known
             ):
                 monkeypatch.setattr(module, known.__name__, other)
-    for loops, names in ((air_loops, ["particles", "fog"]), (spray_loops, ["_column", "clumps"])):
+    sampling = {
+        air_loops: ["write_particle", "sample_particles", "sample_fog"],
+        spray_loops: ["write_particle", "_column", "_guide", "sample_clumps"],
+    }
+    for loops, names in sampling.items():
         # Others are compiled without these.
         plain = vars(random_loops) | vars(loops) | {"bits": hashed}
         functions = [random_loops.uniform, pulse_loops.scan_row, *(vars(loops)[n] for n in names)]

@@ -20,7 +20,7 @@ from lidarsim.simulator.doppler import VELOCITY
 from lidarsim.simulator.losses import DirtStep
 from lidarsim.simulator.paths import CastStep
 from lidarsim.simulator.recording import RecordingStep
-from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, unreal
+from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, returns_without_surface
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.step import PulseStep, Role
 from lidarsim.simulator.steps import STEPS, add_step, received_causes, remove_step
@@ -187,7 +187,7 @@ class Echo(Everywhere):
         rays = np.arange(batch.start, batch.stop)
         distance = np.full(len(rays), ADDED_M)
         energy = np.full(len(rays), 0.125)
-        return merged(returns, unreal(returns, rays, distance, energy, 2))
+        return merged(returns, returns_without_surface(returns, rays, distance, energy, 2))
 
 
 class Aside(Everywhere):

@@ -23,10 +23,10 @@ from lidarsim.simulator.random_loops import RandomKeys
 from lidarsim.simulator.range_noise import noisy_ranges
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.saturation import saturated
-from lidarsim.simulator.separation import Report, separated
+from lidarsim.simulator.separation import Reporting, separated
 from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps import setup_of
-from lidarsim.simulator.surfaces import Light, Surfaces
+from lidarsim.simulator.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.waveform import Digitizer, returns_in
 
 GAP = 0.75
@@ -40,8 +40,8 @@ KINDS = "nothing", "wall", "edge", "grazed", "panes", "clutter"
 
 def key_of(pulse):
     """Scan of a pulse, and its number in the scan."""
-    row = sum(pulse >= begin for begin in KEYS.begins.tolist()) - 1
-    return KEYS.scan + row, pulse - KEYS.begins.tolist()[row]
+    row = sum(pulse >= begin for begin in KEYS.scan_starts.tolist()) - 1
+    return KEYS.scan + row, pulse - KEYS.scan_starts.tolist()[row]
 
 
 def layers_of(rng, kind, ahead):
@@ -190,7 +190,7 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
     pulses = pulses_of(2, 7)
     noise = Noise(**losses, seed=5)
     hits, planes = columns_of(pulses, 7)
-    found = separated(hits, GAP, 7, planes, report=Report(mode, noise, KEYS, FIRST))
+    found = separated(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
     expected = {}
     for pulse, own in pulses.items():
         key = key_of(FIRST + pulse)
@@ -217,8 +217,8 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     distance = rng.uniform(0.01, 200, 2000)
     energy = 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
     assert noise.threshold == (0.1 * twin.energy_of(1, 50, 0) if noise.detection_range_m else 0)
-    seen = detected(noise, energy, *KEYS.of(ray), number)
-    ranges = noisy_ranges(noise, distance, energy, *KEYS.of(ray), number)
+    seen = detected(noise, energy, *KEYS.scan_and_number(ray), number)
+    ranges = noisy_ranges(noise, distance, energy, *KEYS.scan_and_number(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]
     assert seen.tolist() == [twin.detected(*row, noise) for _, *row in rows]
@@ -234,7 +234,7 @@ def test_energies_are_those_of_the_twin(extinction):
     materials = (Material("0", 0.3), RETRO)
     meshes = [quad(f"{k}", a, b, c, c + a - b) for k, (a, b, c) in enumerate(corners)]
     surfaces = Surfaces(Scene.from_meshes(meshes), materials)
-    light = Light(905.0, extinction)
+    light = SensorLight(905.0, extinction)
     wall = rng.integers(0, 2, 1000)
     distance = rng.uniform(0.5, 200, 1000)
     ahead = rng.normal(size=(1000, 3))
@@ -243,8 +243,8 @@ def test_energies_are_those_of_the_twin(extinction):
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
     lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
     assert lit.kinds.tolist() == wall.tolist()
-    assert np.allclose(lit.along, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
-    cosine = np.abs(lit.along)
+    assert np.allclose(lit.cosines, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
+    cosine = np.abs(lit.cosines)
     back = np.where(wall == 1, 0.8 * 220, 0.3 * cosine)
     rows = zip(back.tolist(), distance.tolist(), strict=True)
     expected = [twin.energy_of(*row, extinction) for row in rows]
@@ -318,14 +318,14 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     place = far[hits]
     light = np.ones(len(hits))
     crossings = spray_loops.Crossings(beam, crossed)
-    spray_loops.veil(crossings, each, 0.1, far, SampledHits(hits, place, light))
+    spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
     begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
-    keys = RandomKeys(begun, KEYS.scan, KEYS.begins, FIRST)
+    keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []
     table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
-    stop, many = spray_loops.clumps(0, crossings, each, table, keys, far, out)
+    stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]

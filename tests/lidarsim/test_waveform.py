@@ -41,7 +41,7 @@ def found(apart, decomposes, energies=(2.0, 1.4), sample_ns=1.0):
     """Ranges behind the first hit, in σ, energies and widths of two hits so many σ apart."""
     distance = 100 + np.array([0, apart]) * SIGMA_M
     hits = PulseReturns(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
-    made = returns_in(hits, Digitizer(SIGMA_NS, sample_ns, decomposes), each=2)
+    made = returns_in(hits, Digitizer(SIGMA_NS, sample_ns, decomposes), subrays=2)
     return (made.distance - 100) / SIGMA_M, 2 * made.energy, made.width
 
 

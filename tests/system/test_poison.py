@@ -9,7 +9,6 @@ import pytest
 from distributed import Client
 
 import lidarpool.run.pipeline.long_stages
-import lidarpool.run.pipeline.rigs
 import lidarpool.run.trials
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.pipeline.failures import memory_clause

@@ -1,11 +1,11 @@
-"""Poses of many actors at once: asked for one by one, they take longer than casting does."""
+"""Poses of all actors together: actor by actor, poses would take longer than casting."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,42 +14,35 @@ from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
 from ..sensor.trajectory import Stations, presence_ns
 
-
-class _TrackTable(NamedTuple):
-    """The straight tracks among trajectories, their segments one behind the other."""
-
-    member: Ints  # (w,): number among the tracks of each trajectory, -1 for others
-    first: Ints  # (t,): of each track its first segment
-    segments: Ints  # (t,): and how many it has
-    # (4, t): seconds, start by its clock, first and last time of its poses, and how far outside
-    # these a time may be; inf if any.
-    limits: Floats
-    times: Floats  # (s,): when segments begin
-    start: Floats  # (3, s), and the others as `Track.segments`
-    speed: Floats
-    turn: Floats  # (3, 9, s)
-    rates: Floats  # (s,)
+if TYPE_CHECKING:
+    from .surface_loops import TrackTable
 
 
-class _Pieces(NamedTuple):
-    """A straight track, or what stands, which is a track of one piece."""
+class _StraightTrack(NamedTuple):
+    """A straight track, or a station, which is a track of a single segment."""
 
-    times_s: Floats
-    start_s: float
-    slack_s: float
-    parts: tuple[Floats, ...]  # see `Track.segments`
+    times_s: Floats  # (s + 1,): start of each segment, and the end
+    start_s: float  # start of the track by its clock
+    slack_s: float  # how far outside its times a pose may be asked for; inf for any time
+    segments: tuple[Floats, ...]  # see `Track.segments`
 
 
-def _pieces_of(way: Trajectory) -> _Pieces | None:
-    if isinstance(way, Track) and not way.smooth:
-        return _Pieces(way.times_s, float(way.start_s or 0), way.slack_s, way.segments)
-    if not isinstance(way, Stations):
+def _straight_track(trajectory: Trajectory) -> _StraightTrack | None:
+    """Return the straight track of a trajectory or station; None for curved trajectories."""
+    if isinstance(trajectory, Track) and not trajectory.smooth:
+        return _StraightTrack(
+            trajectory.times_s,
+            float(trajectory.start_s or 0),
+            trajectory.slack_s,
+            trajectory.segments,
+        )
+    if not isinstance(trajectory, Stations):
         return None
-    (position,), turns = way.poses(0, np.zeros(1))
-    turn = np.zeros((3, 9, 1))
-    turn[0] = np.eye(3).reshape(9, 1) if turns is None else turns.reshape(9, 1)
-    parts = position[:, None], np.zeros((3, 1)), turn, np.zeros(1)
-    return _Pieces(np.zeros(2), 0.0, np.inf, parts)
+    (position,), rotations = trajectory.poses(0, np.zeros(1))
+    rotation = np.zeros((3, 9, 1))
+    rotation[0] = np.eye(3).reshape(9, 1) if rotations is None else rotations.reshape(9, 1)
+    segments = position[:, None], np.zeros((3, 1)), rotation, np.zeros(1)
+    return _StraightTrack(np.zeros(2), 0.0, np.inf, segments)
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
@@ -58,35 +51,40 @@ class ActorTrajectories(tuple[Trajectory, ...]):
     animated: Mapping[int, Actor] = MappingProxyType({})  # {number: actor that deforms}
 
     @classmethod
-    def of(cls, actors: Iterable[Actor]) -> ActorTrajectories:
-        """Return those of actors, and how these deform."""
-        found = list(actors)
-        made = cls(actor.trajectory for actor in found)
-        made.animated = {k: actor for k, actor in enumerate(found) if actor.mesh.animation}
-        return made
+    def from_actors(cls, actors: Iterable[Actor]) -> ActorTrajectories:
+        """Return the trajectories of actors, with the actors that deform."""
+        actor_list = list(actors)
+        trajectories = cls(actor.trajectory for actor in actor_list)
+        trajectories.animated = {
+            k: actor for k, actor in enumerate(actor_list) if actor.mesh.animation
+        }
+        return trajectories
 
     def deforming(self, number: Integers) -> Indices:
-        """Rows of `number` (n,) that are actors whose mesh has an animation."""
-        own = list(self.animated)
-        return np.flatnonzero(np.isin(number, own)) if own else np.zeros(0, np.intp)
+        """Return the rows of `number` (n,) that are actors whose mesh has an animation."""
+        animated = list(self.animated)
+        if not animated:
+            return np.zeros(0, np.intp)
+        return np.flatnonzero(np.isin(number, animated))
 
     def played(self, number: Integers, times_ns: Floats | Ints) -> Floats:
-        """Frames of actors `number` (n,) at times (n,), and how many a second pass: (2, n)."""
-        out = np.zeros((2, len(number)))
-        for one in np.unique(number).tolist():
-            rows = np.flatnonzero(number == one)
-            out[:, rows] = self.animated[one].played(times_ns[rows].astype(np.float64))
-        return out
+        """Return the frames of actors `number` (n,) at times (n,), and frames a second: (2, n)."""
+        frames = np.zeros((2, len(number)))
+        for actor in np.unique(number).tolist():
+            rows = np.flatnonzero(number == actor)
+            frames[:, rows] = self.animated[actor].played(times_ns[rows].astype(np.float64))
+        return frames
 
     @cached_property
     def presence_ns(self) -> Floats:
-        """Times when each is in the scene, nanoseconds: (w, 2), first and last."""
-        return np.array([presence_ns(way) for way in self], np.float64).reshape(-1, 2)
+        """First and last time of each actor in the scene, nanoseconds: (w, 2)."""
+        presence = [presence_ns(trajectory) for trajectory in self]
+        return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """Poses of trajectories `number` (n,) at times (n,): positions, and rotations by rows.
+        """Return the poses of trajectories `number` (n,) at times (n,), nanoseconds: (12, n).
 
-        They are (12, n), and have the bits of `Trajectory.poses`.
+        A pose is a position, and a rotation by rows, with the bits of `Trajectory.poses`.
 
         Raises
         ------
@@ -96,65 +94,78 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         from . import surface_loops  # not before: numba takes half a second to import
 
         tracks = self._tracks
-        out = np.empty((12, len(number)))
+        table = np.empty((12, len(number)))
         if not len(number):
-            return out
-        given = owned(number, np.int64), owned(times_ns)
-        outside = surface_loops.on_tracks(*given, *tracks, out)
+            return table
+        outside = surface_loops.poses_on_tracks(
+            owned(number, np.int64), owned(times_ns), tracks, table
+        )
         if outside >= 0:  # which raises the error
             self[number[outside]].poses(0, times_ns[number == number[outside]])
-        others = np.flatnonzero(tracks.member[number] < 0)
-        for one in np.unique(number[others]).tolist():
-            rows = others[number[others] == one]
-            places, turns = self[one].poses(0, times_ns[rows])
-            turns = np.eye(3) if turns is None else np.asarray(turns)
-            out[:3, rows] = np.broadcast_to(np.asarray(places), (len(rows), 3)).T
-            turns = np.broadcast_to(turns, (len(rows), 3, 3))
-            out[3:, rows] = turns.transpose(1, 2, 0).reshape(9, -1)
-        return out
+        not_straight = np.flatnonzero(tracks.member[number] < 0)
+        for trajectory in np.unique(number[not_straight]).tolist():
+            rows = not_straight[number[not_straight] == trajectory]
+            positions, rotations = self[trajectory].poses(0, times_ns[rows])
+            rotations = np.eye(3) if rotations is None else np.asarray(rotations)
+            table[:3, rows] = np.broadcast_to(np.asarray(positions), (len(rows), 3)).T
+            rotations = np.broadcast_to(rotations, (len(rows), 3, 3))
+            table[3:, rows] = rotations.transpose(1, 2, 0).reshape(9, -1)
+        return table
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Poses as of `table`: positions (n, 3), rotations (n, 3, 3)."""
+        """Return the positions (n, 3) and rotations (n, 3, 3) of trajectories `number` (n,).
+
+        Times (n,) are nanoseconds.
+
+        Raises
+        ------
+        LidarError
+            If a time is not within its trajectory.
+        """
         table = self.table(number, times_ns)
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Poses as of `table`, one for rows of one trajectory and time: (12, m), and which (n,).
+        """Return the poses (12, m) of runs of rows, and the run of each row (n,).
 
-        Numbers below 0 have none, which is -1.
+        In a run of rows, trajectory and time are equal.
+
+        Poses are positions, and rotations by rows. Rows with numbers below 0 have the run -1.
         """
         from . import surface_loops
 
         number = owned(number, np.int64)
         times = owned(times_ns)
         first, run = np.empty((2, len(number)), np.int64)
-        some = first[: surface_loops.runs(number, times, first, run)]
-        return self.table(number[some], times[some]), run
+        first = first[: surface_loops.find_runs(number, times, first, run)]
+        return self.table(number[first], times[first]), run
 
     @cached_property
-    def _tracks(self) -> _TrackTable:
-        pieces = [_pieces_of(way) for way in self]
-        straight = np.array([piece is not None for piece in pieces], np.bool_)
-        member = np.where(straight, np.cumsum(straight) - 1, -1)
-        tracks = [piece for piece in pieces if piece is not None]
-        parts = [piece.parts for piece in tracks]
-        segments = np.array([len(piece.times_s) - 1 for piece in tracks], np.int64)
+    def _tracks(self) -> TrackTable:
+        """Straight tracks among the trajectories, for loops."""
+        from .surface_loops import TrackTable
 
-        def joined(which: int, *shape: int) -> Floats:
-            none = np.zeros((*shape, 0))
-            return np.concatenate([none, *(part[which] for part in parts)], axis=-1)
+        straight_tracks = [_straight_track(trajectory) for trajectory in self]
+        straight = np.array([track is not None for track in straight_tracks], np.bool_)
+        tracks = [track for track in straight_tracks if track is not None]
+        counts = np.array([len(track.times_s) - 1 for track in tracks], np.int64)
+
+        def joined(part: int, *shape: int) -> Floats:
+            """Concatenate a part of the segments of all tracks."""
+            empty = np.zeros((*shape, 0))
+            return np.concatenate([empty, *(track.segments[part] for track in tracks)], axis=-1)
 
         limits = [
             (track.start_s, track.times_s[0], track.times_s[-1], track.slack_s) for track in tracks
         ]
-        return _TrackTable(
-            member,
-            np.cumsum(segments) - segments,
-            segments,
-            np.array(limits, np.float64).reshape(-1, 4).T.copy(),
-            np.concatenate([np.zeros(0), *(track.times_s[:-1] for track in tracks)]),
-            joined(0, 3),
-            joined(1, 3),
-            joined(2, 3, 9),
-            joined(3),
+        return TrackTable(
+            member=np.where(straight, np.cumsum(straight) - 1, -1),
+            first=np.cumsum(counts) - counts,
+            segments=counts,
+            limits=np.array(limits, np.float64).reshape(-1, 4).T.copy(),
+            times=np.concatenate([np.zeros(0), *(track.times_s[:-1] for track in tracks)]),
+            start=joined(0, 3),
+            speed=joined(1, 3),
+            rotation=joined(2, 3, 9),
+            rates=joined(3),
         )

@@ -1,7 +1,7 @@
 """Hits in the air: drops, flakes, fog and dust in front of surfaces.
 
-Which particles a beam meets follows from random numbers for each pulse alone. Only those that the
-sensor may detect are drawn: their number is Poisson's, their ranges and diameters are quantiles.
+Which particles a beam meets follows from random numbers for each pulse alone. Only particles that
+the sensor may detect are drawn: the number is Poisson's, ranges and diameters are quantiles.
 """
 
 from __future__ import annotations
@@ -23,7 +23,16 @@ from ..sensor.random_numbers import Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .doppler import range_rates_of_origins
-from .returns import OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .returns import (
+    RETURN_COLUMNS,
+    SURFACE,
+    Keys,
+    Planes,
+    PulseReturns,
+    joined,
+    numbers,
+    returns_without_surface,
+)
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
@@ -40,18 +49,18 @@ PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
 AIR = CAUSES.index("air")
 QUANTILES = 1 << 16
-TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
-CELLS_MOST = 255  # pulse lengths of fog
+CACHED_TABLES = 32  # as a scanner builds its casters again whenever an object is moved
+MAX_FOG_CELLS = 255  # pulse lengths of fog
 TAIL_SIGMAS = 6.0
 
 
 class DetectableParticles(NamedTuple):
-    """Particles of one kind that may be detected."""
+    """Distribution of the particles of a kind that may be detected."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # By range, (5, QUANTILES): distances before which an equal share is, smallest diameters that
-    # may be detected, mm, 1 - exp(-slope * (largest - smallest)), energies of a particle of 1 mm,
-    # and of a particle that fills the beam.
+    # By range, (5, QUANTILES): distances that divide the particles into equal shares, metres;
+    # smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest)); energies
+    # of a particle of 1 mm; and energies of a particle that fills the beam.
     by_range: Floats
     step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
 
@@ -59,16 +68,16 @@ class DetectableParticles(NamedTuple):
 class FogCells(NamedTuple):
     """Cells of half a pulse's length of fog that may be detected, from the sensor on."""
 
-    begin_m: float
-    cell_m: float
-    energy: Floats  # (cells,)
-    # Cumulative probabilities that a cell has the highest peak of the first n cells: row n is n
-    # plus the probabilities.
+    begin_m: float  # range of the first cell
+    cell_m: float  # length of a cell
+    energy: Floats  # (cells,): received of the fog in a cell
+    # ((cells + 1) * cells,): cumulative probabilities that a cell has the highest peak of the first
+    # n cells: row n is n plus the probabilities.
     peaks: Floats
 
 
 class WeatherStep(PulseStep):
-    """Finds where rain, snow, fog and dust return light to one sensor.
+    """Samples the returns of rain, snow, fog and dust.
 
     Raises
     ------
@@ -79,7 +88,7 @@ class WeatherStep(PulseStep):
     role = Role.CHANGES
     effects = "Rain", "Snow", "Fog", "Dust"
     reads = "ray", "distance", "triangle", "cause", "velocity"
-    writes = *OF_RETURNS, "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
     causes = (AIR,)
     purposes = (
         FOG_CELL, FOG_PLACE, PARTICLES, PARTICLE_RANGE,
@@ -95,207 +104,236 @@ class WeatherStep(PulseStep):
         self._wavelength_nm = sensor.optics.wavelength_nm
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
-        begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
-        self._kinds = [_detectable(air, kind, faintest, begins, ends) for kind in survey.particles]
+        min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
+        self._kinds = [
+            _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
+        ]
         names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.backscatter_at(self._wavelength_nm)
-        self._fog = _fog_cells(air, scatters, noise.threshold, begins, ends, setup.half_pulse_m)
+        self._fog = _fog_cells(
+            air, scatters, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
+        )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return whether the weather of the survey returns light."""
         return setup.survey.returns_light
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `PulseStep.added`."""
+        """Return the mean number of returns of particles and fog in a pulse."""
         scatters = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
         return setup.survey.mean_particles(setup.number) + bool(scatters)
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: of sub-rays, and of hits in the air."""
+        """Return the memory of sub-rays and of hits in the air, in bytes."""
         return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
-        drawn = self.sampled(returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam)
-        return returns if drawn is None else in_the_air(self.setup, returns, batch, drawn)
+        """Return the hits of a batch after hits in the air are sampled."""
+        air_hits = self.sampled(
+            returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
+        )
+        if air_hits is None:
+            return returns
+        return add_air_hits(self.setup, returns, batch, air_hits)
 
     def sampled(
-        self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, each: int
+        self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, subrays: int
     ) -> PulseReturns | None:
-        """Return hits in the air before those of surfaces, of beams with `each` sub-rays.
+        """Sample the hits in the air before surfaces, of `beams` from a first to before a last.
 
-        Hits are in the order of rays, numbered from the first beam's; None if there can be none.
+        `hits` are the beams' hits on surfaces; each beam has `subrays` sub-rays. The hits in the
+        air are in the order of rays, which are numbered from the first beam's first ray. Returns
+        None if neither particles nor fog can be detected.
         """
         first, stop = beams
-        count = (stop - first) * each
-        reach = reached(self.surfaces.at(self._wavelength_nm), self.surfaces, hits, count)
+        count = (stop - first) * subrays
+        reach = light_reach(
+            self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
+        )
         parts: list[SampledHits] = []
         for kind, seed in zip(self._kinds, self._seeds, strict=True):
             if kind is not None:
                 random = random_keys(seed, self.purposes[2:], keys, first)
-                parts += _particles(kind, random, each, reach)
+                parts += _particles(kind, random, subrays, reach)
         if self._fog is not None:
             random = random_keys(self._seed, self.purposes[:2], keys, first)
-            parts.append(_fog_hits(self._fog, random, each, self._clouded(hits, reach)))
+            parts.append(_fog_hits(self._fog, random, subrays, self._clouded(hits, reach)))
         if not parts:
             return None
         ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
-        drawn = unreal(hits, ray, distance, energy, AIR)
-        if len(self._bent(hits)):
-            drawn = drawn.take(~self._within(hits, ray, distance))
-        if parts[1:] or each > 1:
-            drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
-        return drawn
+        air_hits = returns_without_surface(hits, ray, distance, energy, AIR)
+        if len(self._refracting(hits)):
+            air_hits = air_hits.take(~self._within(hits, ray, distance))
+        if parts[1:] or subrays > 1:
+            air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
+        return air_hits
 
-    def _bent(self, hits: PulseReturns) -> Indices:
-        """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
-        refracts = self.surfaces.at(self._wavelength_nm).refracts
+    def _refracting(self, hits: PulseReturns) -> Indices:
+        """Return rows of hits that refract light; of each ray the first, third, … are entries."""
+        refracts = self.surfaces.at_wavelength(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
-        bent = refracts[self.surfaces.kinds(hits.triangle)]
-        return np.flatnonzero(bent if hits.cause is None else bent & (hits.cause == SURFACE))
+        refracting = refracts[self.surfaces.kinds(hits.triangle)]
+        return np.flatnonzero(
+            refracting if hits.cause is None else refracting & (hits.cause == SURFACE)
+        )
 
     def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Whether places on rays are within water or glass, where nothing falls: (n,)."""
-        rows = self._bent(hits)
-        bent = hits.ray[rows]
-        where = hits.distance[rows]
-        first, stop = (np.searchsorted(bent, ray, side=side) for side in ("left", "right"))
+        """Return whether points on rays are in water or glass, where no particles fall: (n,)."""
+        rows = self._refracting(hits)
+        surface_ray = hits.ray[rows]
+        surface_distance = hits.distance[rows]
+        first = np.searchsorted(surface_ray, ray, side="left")
+        stop = np.searchsorted(surface_ray, ray, side="right")
         count = np.zeros(len(ray), np.int64)
         for number in range(int((stop - first).max(initial=0))):
-            some = np.flatnonzero(first + number < stop)
-            count[some] += where[first[some] + number] < distance[some]
+            present = np.flatnonzero(first + number < stop)
+            count[present] += surface_distance[first[present] + number] < distance[present]
         return np.asarray(count % 2 == 1)
 
     def _clouded(self, hits: PulseReturns, reach: Floats) -> Floats:
-        """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
-        rows = self._bent(hits)
+        """Return the ranges at which fog ends, (rays,): surfaces, water, glass, but not panes."""
+        rows = self._refracting(hits)
         if not len(rows):
             return reach
         ray = hits.ray[rows]
-        where = hits.distance[rows]
-        out = np.full(len(rows), np.inf)
-        same = ray[1:] == ray[:-1]
-        out[:-1][same] = where[1:][same]
-        enters = (numbers(ray) % 2 == 0) & (out - where > self.setup.half_pulse_m)
+        surface_distance = hits.distance[rows]
+        exit_distance = np.full(len(rows), np.inf)
+        same_ray = ray[1:] == ray[:-1]
+        exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
+        enters = (numbers(ray) % 2 == 0) & (
+            exit_distance - surface_distance > self.setup.half_pulse_m
+        )
         reach = reach.copy()
-        np.minimum.at(reach, ray[enters], where[enters])
+        np.minimum.at(reach, ray[enters], surface_distance[enters])
         return reach
 
 
-def reached(materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int) -> Floats:
-    """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
+def light_reach(
+    materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
+) -> Floats:
+    """Return ranges that the light of sub-rays reaches, (count,), metres; inf without an end."""
     ray = hits.ray
-    ends = hits.distance
-    on = materials.passes
-    if on.any():
-        ends = np.where(on[surfaces.kinds(hits.triangle)], np.inf, ends)
+    end_distance = hits.distance
+    transmits = materials.passes
+    if transmits.any():
+        end_distance = np.where(transmits[surfaces.kinds(hits.triangle)], np.inf, end_distance)
     if hits.cause is not None:
         rows = np.flatnonzero(hits.cause == SURFACE)
         ray = ray[rows]
-        ends = ends[rows]
+        end_distance = end_distance[rows]
     reach = np.full(count, np.inf)
-    reach[ray] = ends  # of several, the last
+    reach[ray] = end_distance  # the last hit of a ray counts
     return reach
 
 
-def in_the_air(
-    setup: Setup, returns: PulseReturns, batch: PulseBatch, drawn: PulseReturns
+def add_air_hits(
+    setup: Setup, returns: PulseReturns, batch: PulseBatch, air_hits: PulseReturns
 ) -> PulseReturns:
-    """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
+    """Return the hits of a batch after hits in the air are added.
+
+    With waveforms, the hits in the air are inserted before the hits on surfaces; else `batch.air`
+    receives the hits in the air, for `SeparationStep`.
+    """
     if returns.velocity is not None:  # the air is at rest
-        rays = batch.subray_poses.rays(batch.beams, drawn.ray, batch.window[0])
-        drawn = drawn._replace(
-            velocity=range_rates_of_origins(batch.subray_poses, drawn.ray, *rays)
+        rays = batch.subray_poses.rays(batch.beams, air_hits.ray, batch.window[0])
+        air_hits = air_hits._replace(
+            velocity=range_rates_of_origins(batch.subray_poses, air_hits.ray, *rays)
         )
     if setup.in_waveforms or setup.waveform_samples:
-        batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
+        batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
         return batch.hits
     if batch.air is not None:
-        drawn = joined([batch.air, drawn])
-        drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
-    batch.air = drawn
+        air_hits = joined([batch.air, air_hits])
+        air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
+    batch.air = air_hits
     return returns
 
 
 def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
-    """Return what the random numbers of beams from number `first` on depend on, for loops."""
+    """Return the keys of the random numbers of beams from number `first` on, for loops."""
     from .random_loops import RandomKeys
 
-    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.begins, np.int64), first)
+    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
 
 
 def room_for_hits(size: int) -> SampledHits:
-    """Return arrays to which loops write hits."""
+    """Return arrays to which loops write up to `size` hits."""
     from .pulse_loops import SampledHits
 
     return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
 
 
 def _particles(
-    kind: DetectableParticles, random: RandomKeys, each: int, reach: Floats
+    kind: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind, on sub-rays that reach so far, metres."""
+    """Yield the hits of particles of a kind, on sub-rays with ranges `reach` (rays,), metres."""
     from . import air_loops  # not before: numba takes half a second to import
 
-    beams = len(reach) // each
+    beams = len(reach) // subrays
     tables = air_loops.ParticleTables(kind.counts, kind.by_range, kind.step_mm, exponential())
     beam = 0
     while beam < beams:
         hits = room_for_hits(2 * beams + len(kind.counts))
-        beam, count = air_loops.particles(beam, beams, each, tables, random, reach, hits)
+        beam, count = air_loops.sample_particles(beam, beams, subrays, tables, random, reach, hits)
         yield hits.first(count)
 
 
-def _fog_hits(fog: FogCells, random: RandomKeys, each: int, reach: Floats) -> SampledHits:
-    """Return the hits of the peaks of fog, on sub-rays that reach so far, metres."""
+def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
+    """Return the hits of the peaks of fog, on sub-rays with ranges `reach` (rays,), metres."""
     from . import air_loops
 
-    hits = room_for_hits(len(reach) // each)
+    hits = room_for_hits(len(reach) // subrays)
     tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
-    count = air_loops.fog(each, tables, random, reach, hits)
+    count = air_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)
 
 
-def inserted(
-    hits: PulseReturns, planes: Planes | None, drawn: PulseReturns
+def insert_air_hits(
+    hits: PulseReturns, planes: Planes | None, air_hits: PulseReturns
 ) -> tuple[PulseReturns, Planes | None]:
-    """Insert hits in the air before the others of their rays."""
-    order = np.argsort(np.concatenate([drawn.ray, hits.ray]), kind="stable")
+    """Return hits and planes with the hits in the air inserted before the surfaces of their rays.
+
+    The planes of hits in the air are 0; planes stay None.
+    """
+    order = np.argsort(np.concatenate([air_hits.ray, hits.ray]), kind="stable")
     if planes is not None:
-        none = np.zeros((len(drawn.ray), 3))
-        normals, directions = (np.concatenate([none, one])[order] for one in planes)
+        no_vectors = np.zeros((len(air_hits.ray), 3))
+        normals, directions = (np.concatenate([no_vectors, vectors])[order] for vectors in planes)
         planes = normals, directions
-    return joined([drawn, hits]).take(order), planes
+    return joined([air_hits, hits]).take(order), planes
 
 
-@lru_cache(TABLES_KEPT)
+@lru_cache(CACHED_TABLES)
 def _detectable(
-    air: Air, kind: Particles, energy: float, begins: float, ends: float
+    air: Air, kind: Particles, energy: float, min_range_m: float, max_range_m: float
 ) -> DetectableParticles | None:
-    """Return the particles that return at least an energy; None if there are none."""
-    tables = seen_by_range(air, kind, energy, begins, ends)
+    """Return the distribution of particles that return at least an energy; None if empty."""
+    tables = seen_by_range(air, kind, energy, min_range_m, max_range_m)
     if tables is None:
         return None
     mean, by_range = tables
     return DetectableParticles(_poisson(mean), by_range, 1 / kind.slope)
 
 
-@lru_cache(TABLES_KEPT)
+@lru_cache(CACHED_TABLES)
 def seen_by_range(
-    air: Air, kind: Particles, energy: float, begins: float, ends: float
+    air: Air, kind: Particles, energy: float, min_range_m: float, max_range_m: float
 ) -> tuple[float, Floats] | None:
-    """Return how many particles in a beam return enough energy, and their `by_range` table."""
-    distance = geomspace(begins, max(ends, begins * 1.001), NODES)
-    some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
-    if not len(some):
+    """Return the mean number of particles in a beam that return at least an energy, and a table.
+
+    The table is that of `DetectableParticles.by_range`. Returns None if no particle does.
+    """
+    distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
+    detectable = np.flatnonzero(air.rate(kind, energy, distance) > 0)
+    if not len(detectable):
         return None
-    last = min(some[-1] + 1, NODES - 1)
-    distance = geomspace(distance[max(some[0] - 1, 0)], distance[last], NODES)
+    last = min(detectable[-1] + 1, NODES - 1)
+    distance = geomspace(distance[max(detectable[0] - 1, 0)], distance[last], NODES)
     rate = air.rate(kind, energy, distance)
     parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(parts)])
@@ -303,14 +341,14 @@ def seen_by_range(
     distance = single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
-    most = kind.reflectance * air.white_energy(distance)
-    one = most / (1000 * air.width(distance)) ** 2
-    tables = distance, single(smallest), single(larger), single(one), single(most)
-    return float(sums[-1]), np.stack(tables)
+    full_beam_energy = kind.reflectance * air.white_energy(distance)
+    energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
+    rows = [smallest, larger, energy_of_1_mm, full_beam_energy]
+    return float(sums[-1]), np.stack([distance, *(single(row) for row in rows)])
 
 
 def _poisson(mean: float) -> Floats:
-    """Cumulative probabilities of 0, 1, … events; the last is 1."""
+    """Return the cumulative probabilities of 0, 1, … events of a mean number; the last is 1."""
     sums = []
     term = exp_of(-mean)
     count = 0
@@ -323,41 +361,47 @@ def _poisson(mean: float) -> Floats:
     return single(np.array([*sums, 1.0]))
 
 
-@lru_cache(TABLES_KEPT)
+@lru_cache(CACHED_TABLES)
 def _fog_cells(
-    air: Air, scatters: float, threshold: float, begins: float, ends: float, cell: float
+    air: Air,
+    scatters: float,
+    threshold: float,
+    min_range_m: float,
+    max_range_m: float,
+    cell_m: float,
 ) -> FogCells | None:
-    """Return the cells of fog that may be detected; None if there are none."""
-    count = int(min((ends - begins) / cell, CELLS_MOST)) if cell else 0
-    edges = begins + cell * np.arange(count + 1, dtype=np.float64)
+    """Return the cells of fog that may be detected; None without such cells."""
+    count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
+    edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
     energy = air.cloud(scatters, edges[:-1], edges[1:])
     energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
     if not len(energy):
         return None
-    peaks = highest(THRESHOLD_SIGMAS * energy / threshold)
+    peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
     rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return FogCells(begins, cell, single(energy), rows.reshape(-1))
+    return FogCells(min_range_m, cell_m, single(energy), rows.reshape(-1))
 
 
-def highest(signals: Floats) -> Floats:
-    """Cumulative probabilities of which of the first n signals is the highest: (k + 1, k).
+def highest_probabilities(signals: Floats) -> Floats:
+    """Return cumulative probabilities that a signal is the highest of the first n: (k + 1, k).
 
-    The signals (k,) fall, and have noise of standard deviation 1. The row of none is 1.
+    The signals (k,) fall, and have noise of standard deviation 1. Row n is for the first n signals;
+    row 0 is 1.
     """
     count = len(signals)
-    out = np.ones((count + 1, count))
-    # The highest is about the first, or somewhat higher.
-    at = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
+    probabilities = np.ones((count + 1, count))
+    # The highest signal is about as high as the first, or somewhat higher.
+    levels = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
     normal = NormalDist()
-    below = np.array([[normal.cdf(x - signal) for x in at] for signal in signals])
-    density = exp(-((at - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
-    product = np.ones(len(at))
+    below = np.array([[normal.cdf(x - signal) for x in levels] for signal in signals])
+    density = exp(-((levels - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
+    product = np.ones(len(levels))
     for number in range(1, count + 1):
         product = product * below[number - 1]
         share = (density[:number] * product).sum(axis=1)
-        out[number, :number] = np.cumsum(share / share.sum())
-        out[number, number - 1 :] = 1.0
-    return out
+        probabilities[number, :number] = np.cumsum(share / share.sum())
+        probabilities[number, number - 1 :] = 1.0
+    return probabilities
 
 
 def single(table: Floats) -> Floats:
@@ -367,6 +411,6 @@ def single(table: Floats) -> Floats:
 
 @cache
 def exponential() -> Floats:
-    """Quantiles of the exponential distribution, of equal shares."""
+    """Return quantiles of the exponential distribution at the middles of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     return single(-log1p(-shares))

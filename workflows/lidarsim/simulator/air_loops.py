@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled
+from raybeam.compiled import compiled, inlined
 
 from ..base.arrays import Floats
 from .pulse_loops import scan_row
@@ -16,40 +16,57 @@ from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
 
 class ParticleTables(NamedTuple):
-    """Particles of one kind that may be detected, see `air.seen_by_range`."""
+    """Tables of a kind of particles that may be detected, see `air.DetectableParticles`."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
-    by_range: Floats  # (5, shares): see `air.DetectableParticles.by_range`
+    by_range: Floats  # (5, shares): rows as in `air.DetectableParticles.by_range`
     step_mm: float  # diameter that exp(-1) of the particles exceed
     exponential: Floats  # quantiles of the exponential distribution
 
 
 class FogTables(NamedTuple):
-    """Fog that may be detected, see `air.FogCells`."""
+    """Cells of fog that may be detected, see `air.FogCells`."""
 
-    begin_m: float
-    end_m: float
-    cell_m: float
-    energies: Floats  # (cells,)
-    peaks: Floats  # ((cells + 1) * cells,)
+    begin_m: float  # range of the first cell
+    end_m: float  # range where fog ends
+    cell_m: float  # length of a cell
+    energies: Floats  # (cells,): received of the fog in a cell
+    peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities, see `air.FogCells.peaks`
+
+
+@inlined
+def write_particle(ray, column, quantile, subrays, tables, hits, row):
+    """Write the hit of a particle, on a sub-ray, to a row of `hits`, `SampledHits`.
+
+    `column` is the particle's in `tables.by_range`; the `quantile` says how large the particle is
+    among particles that may be detected there.
+    """
+    by_range = tables.by_range
+    exponential = tables.exponential
+    rank = quantile * by_range[2, column]
+    excess_mm = tables.step_mm * exponential[np.int64(rank * len(exponential))]
+    diameter = by_range[1, column] + excess_mm
+    light = by_range[3, column] * diameter * diameter
+    hits.ray[row] = ray
+    hits.distance[row] = by_range[0, column]
+    hits.energy[row] = subrays * min(light, by_range[4, column])
 
 
 @compiled()
-def particles(beam, stop, subrays, tables, keys, reach, hits):
-    """Sample the particles of a kind that beams `beam` to `stop` meet, while there is room.
+def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
+    """Sample the particles of a kind that beams `beam` to `stop` meet, while `hits` has room.
 
-    `reach` is how far the light of sub-rays gets. Writes `SampledHits`; returns the first beam that
-    is left, and the number of hits.
+    `tables` are `ParticleTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
+    that the light of each sub-ray reaches, metres. Writes `SampledHits`; returns the first beam
+    that is not sampled yet, and the number of hits.
     """
-    exponential = tables.exponential
-    by_range = tables.by_range
     starts = keys.starts
     count = 0
     row = 0
     while beam < stop and count + len(tables.counts) <= len(hits.ray):
-        row = scan_row(keys.begins, keys.first + beam, row)
+        row = scan_row(keys.scan_starts, keys.first + beam, row)
         scan = keys.scan + row
-        number = keys.first + beam - keys.begins[row]
+        number = keys.first + beam - keys.scan_starts[row]
         probability = uniform(starts[0], scan, number, 0)
         particle = 0
         while tables.counts[particle] <= probability:
@@ -57,14 +74,9 @@ def particles(beam, stop, subrays, tables, keys, reach, hits):
             ray = beam * subrays
             if subrays > 1:
                 ray += np.int64(bits(starts[2], scan, number, particle) % np.uint64(subrays))
-            if by_range[0, index] < reach[ray]:
-                rank = uniform(starts[3], scan, number, particle) * by_range[2, index]
-                longer = tables.step_mm * exponential[np.int64(rank * len(exponential))]
-                diameter = by_range[1, index] + longer
-                light = by_range[3, index] * diameter * diameter
-                hits.ray[count] = ray
-                hits.distance[count] = by_range[0, index]
-                hits.energy[count] = subrays * min(light, by_range[4, index])
+            if tables.by_range[0, index] < reach[ray]:
+                quantile = uniform(starts[3], scan, number, particle)
+                write_particle(ray, index, quantile, subrays, tables, hits, count)
                 count += 1
             particle += 1
         beam += 1
@@ -72,8 +84,12 @@ def particles(beam, stop, subrays, tables, keys, reach, hits):
 
 
 @compiled()
-def fog(subrays, tables, keys, reach, hits):
-    """Sample the peaks of fog in beams, as `particles` does; returns the number of hits."""
+def sample_fog(subrays, tables, keys, reach, hits):
+    """Sample the fog return of each beam into `hits`; return their number.
+
+    `tables` are `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
+    from the cell with the highest peak before its surface.
+    """
     cells = len(tables.energies)
     count = 0
     row = 0
@@ -81,22 +97,22 @@ def fog(subrays, tables, keys, reach, hits):
         free_cells = (min(reach[beam * subrays], tables.end_m) - tables.begin_m) / tables.cell_m
         if not free_cells >= 1:
             continue
-        foggy = cells if free_cells >= cells else np.int64(free_cells)
-        row = scan_row(keys.begins, keys.first + beam, row)
+        fog_cells = cells if free_cells >= cells else np.int64(free_cells)
+        row = scan_row(keys.scan_starts, keys.first + beam, row)
         scan = keys.scan + row
-        number = keys.first + beam - keys.begins[row]
-        probability = foggy + uniform(keys.starts[0], scan, number, 0)
-        cell = 0  # with the highest peak, by binary search
+        number = keys.first + beam - keys.scan_starts[row]
+        probability = fog_cells + uniform(keys.starts[0], scan, number, 0)
+        cell = 0  # becomes the cell with the highest peak, by binary search
         upper = cells
         while cell < upper:
             middle = (cell + upper) // 2
-            if tables.peaks[foggy * cells + middle] <= probability:
+            if tables.peaks[fog_cells * cells + middle] <= probability:
                 cell = middle + 1
             else:
                 upper = middle
-        share = uniform(keys.starts[1], scan, number, 0)
+        position_in_cell = uniform(keys.starts[1], scan, number, 0)
         hits.ray[count] = beam * subrays
-        hits.distance[count] = tables.begin_m + (cell + share) * tables.cell_m
+        hits.distance[count] = tables.begin_m + (cell + position_in_cell) * tables.cell_m
         hits.energy[count] = subrays * tables.energies[cell]
         count += 1
     return count

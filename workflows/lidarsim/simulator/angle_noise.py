@@ -35,7 +35,7 @@ class AngleNoiseStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add random angles to the beams of a batch; return the returns unchanged."""
         beams = np.arange(batch.start, batch.stop)
-        scan, ray = batch.keys.of(beams)
+        scan, ray = batch.keys.scan_and_number(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
         batch.deflect(np.column_stack([across, up]))
         return returns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,13 @@ from ..sensor.random_numbers import Purpose
 from ..sensor.survey import firing_start_ns
 from .detection import passes
 from .motion import CastPoses, Clock
-from .returns import OF_RETURNS, PulseReturns, merged, numbers, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, merged, numbers, returns_without_surface
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
+
+if TYPE_CHECKING:
+    from .stray_loops import ReceivedSpots
 
 FOREIGN_PULSE = Purpose(23, "noise of the energy of another sensor's pulse")
 CROSSTALK = CAUSES.index("crosstalk")
@@ -70,15 +73,6 @@ class _Candidates(NamedTuple):
     stop: Indices  # one past the row of the last ray
 
 
-class _Sightings(NamedTuple):
-    """Rays and spots in their field of view: arrays (k,)."""
-
-    row: Ints  # of the rays
-    spot: Ints
-    distance: Floats  # at which the spot appears to the receiver, metres
-    path_m: Floats  # from the ray's origin to the spot
-
-
 class CrosstalkStep(PulseStep):
     """Adds the foreign pulses that a sensor receives.
 
@@ -90,7 +84,7 @@ class CrosstalkStep(PulseStep):
     role = Role.RECEIVES
     effects = ("Crosstalk",)
     reads = "ray", "distance"
-    writes = OF_RETURNS
+    writes = RETURN_COLUMNS
     causes = (CROSSTALK,)
     purposes = (FOREIGN_PULSE,)
 
@@ -130,9 +124,9 @@ class CrosstalkStep(PulseStep):
         ray = rays[row[order]]
         distance = distance[order]
         energy = energy[order]
-        scan, number = batch.keys.of(ray)
+        scan, number = batch.keys.scan_and_number(ray)
         detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
-        foreign_returns = unreal(
+        foreign_returns = returns_without_surface(
             returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )
         return merged(returns, foreign_returns)
@@ -168,42 +162,42 @@ class CrosstalkStep(PulseStep):
         first_ns = waiting.fired[waiting.order[0]] - reach_ns
         last_ns = waiting.fired[waiting.order[-1]] + waiting.gate[1]
         spots = self._spots(number, spec, (first_ns, last_ns), poses)
-        row, spot, distance, path_m = self._sightings(waiting, spots)
+        row, spot, distance, range_m = self._sightings(waiting, spots)
         towards = spots.position[spot] - waiting.origins[row]
         times = waiting.fired[row] + spec.start_ns
         visible = self.caster.is_visible(
-            waiting.origins[row], towards, path_m, times, poses.actor_trajectories
+            waiting.origins[row], towards, range_m, times, poses.actor_trajectories
         )
-        energy = self._energy(spots, spot[visible], towards[visible], path_m[visible])
+        energy = self._energy(spots, spot[visible], towards[visible], range_m[visible])
         return ReceivedPulses(row[visible], distance[visible], energy)
 
-    def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> _Sightings:
+    def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
         """Return the spots in the fields of view of rays while the rays wait."""
         from . import stray_loops  # not before: numba takes half a second to import
 
         candidates = self._candidates(waiting, spots)
         max_count = int(np.maximum(candidates.stop - candidates.start, 0).sum())
-        row, spot = np.empty((2, max_count), np.int64)
-        distance, path_m = np.empty((2, max_count))
-        count = stray_loops.received(
-            candidates.spot,
-            candidates.start,
-            candidates.stop,
-            waiting.order,
-            owned(waiting.fired),
-            owned(waiting.origins),
-            owned(waiting.directions),
-            owned(spots.time),
-            owned(spots.position),
-            self._cosine,
-            self._sensor.min_range_m,
-            self._sensor.max_range_m,
-            row,
-            spot,
-            distance,
-            path_m,
+        sightings = stray_loops.ReceivedSpots(
+            row=np.empty(max_count, np.int64),
+            spot=np.empty(max_count, np.int64),
+            distance=np.empty(max_count),
+            range_m=np.empty(max_count),
         )
-        return _Sightings(row[:count], spot[:count], distance[:count], path_m[:count])
+        count = stray_loops.receive(
+            stray_loops.SpotPairs(candidates.spot, candidates.start, candidates.stop),
+            stray_loops.ReceivingRays(
+                waiting.order,
+                owned(waiting.fired),
+                owned(waiting.origins),
+                owned(waiting.directions),
+            ),
+            stray_loops.LitSpots(owned(spots.time), owned(spots.position)),
+            stray_loops.ReceptionLimits(
+                self._cosine, self._sensor.min_range_m, self._sensor.max_range_m
+            ),
+            sightings,
+        )
+        return sightings.first(count)
 
     def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
         """Return spots, and for each spot the rays that may receive the light of the spot.
@@ -296,7 +290,7 @@ class CrosstalkStep(PulseStep):
         # The air from the other sensor to the spot, and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
-        table = surfaces.at(self._sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
         # A retro-reflector sends light back only to the sensor that sent the light.
         share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))

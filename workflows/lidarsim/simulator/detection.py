@@ -32,7 +32,7 @@ class DetectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the detected returns."""
-        scan, ray = batch.keys.of(returns.ray)
+        scan, ray = batch.keys.scan_and_number(returns.ray)
         detected_mask = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
         return returns.take(detected_mask)
 

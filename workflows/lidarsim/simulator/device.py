@@ -177,7 +177,7 @@ class DeviceColumns:
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        scanned = Scanned(PulseReturns.one_each(ray, distance, triangle), hits, None)
+        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
         returns = BatchPoints(
             self._scene,
             survey,

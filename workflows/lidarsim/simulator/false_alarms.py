@@ -12,7 +12,7 @@ from ..columns.table import CAUSES
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.random_numbers import Purpose, uniform
-from .returns import OF_RETURNS, PulseReturns, merged, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 FALSE_ALARM = CAUSES.index("false alarm")
@@ -34,7 +34,7 @@ class FalseAlarmStep(PulseStep):
     role = Role.RECEIVES
     effects = ("False alarms",)
     reads = "ray", "distance"
-    writes = OF_RETURNS
+    writes = RETURN_COLUMNS
     causes = (FALSE_ALARM,)
     purposes = ALARM, PEAK
 
@@ -57,10 +57,12 @@ class FalseAlarmStep(PulseStep):
         """Return the returns of a batch and the false alarms of its rays."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
-        scan, ray = batch.keys.of(rays)
+        scan, ray = batch.keys.scan_and_number(rays)
         alarms = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
         distance = sensor.min_range_m + alarms.time_s * (LIGHT_M_NS * 1e9 / 2)
-        alarm_returns = unreal(returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM)
+        alarm_returns = returns_without_surface(
+            returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM
+        )
         return merged(returns, alarm_returns)
 
 

@@ -1,4 +1,4 @@
-"""A loop over returns that faults of a sensor take: see losses.py."""
+"""Loop over returns that faults of a sensor take: see losses.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,10 +9,10 @@ from raybeam.compiled import compiled
 
 @compiled()
 def remaining(ray, times, spans, firing, channel, rows):
-    """Write the rows of returns that no fault takes; returns their number.
+    """Write the rows of returns that no fault takes; return the number of rows.
 
-    Faults act in `spans` (f, 2) of times. They take the returns of some firings, (f, firings), and
-    channels, (f, channels).
+    Rays (n,) are in order, and have firing times (n,). Each fault acts in a span of times, `spans`
+    (f, 2), and takes the returns of masks of firings, (f, firings), and channels, (f, channels).
     """
     channels = channel.shape[1]
     count = 0

@@ -9,7 +9,7 @@ from ..base.elementary import sin_cos
 from ..base.vectors import hypot
 from ..sensor import Fault
 from ..sensor.random_numbers import Purpose, uniform
-from .returns import PulseReturns, made
+from .returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 
 PACKET = Purpose(61, "whether a packet is lost")
@@ -38,12 +38,12 @@ class DirtStep(PulseStep):
             in_spot = _in_spot(fault, x, y, z)
             if fault.from_s or fault.to_s is not None:
                 in_spot &= fault.during(batch.firings.times(beams))
-            transmission[in_spot] *= made(fault.transmission)
+            transmission[in_spot] *= required(fault.transmission)
         transmission = transmission.repeat(batch.subrays_per_beam)
-        hits = returns._replace(energy=made(returns.energy) * transmission.take(returns.ray))
+        hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
         batch.hits = hits
         if batch.air is not None:
-            energy = made(batch.air.energy) * transmission.take(batch.air.ray)
+            energy = required(batch.air.energy) * transmission.take(batch.air.ray)
             batch.air = batch.air._replace(energy=energy)
         return hits
 
@@ -89,11 +89,11 @@ class LossStep(PulseStep):
         lost_firings = np.zeros((len(faults), len(firings.numbers)), np.bool_)
         for row, (fault_number, fault) in enumerate(faults.items()):
             if fault.packet is None:
-                lost_channels[row, made(fault.channels)] = True
+                lost_channels[row, required(fault.channels)] = True
             else:
                 packet = firings.numbers // fault.packet
                 uniform_numbers = uniform(seed, PACKET, spec.station, packet, fault_number)
-                lost_firings[row] = uniform_numbers < made(fault.share)
+                lost_firings[row] = uniform_numbers < required(fault.share)
         rows = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(

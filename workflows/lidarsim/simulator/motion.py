@@ -39,7 +39,7 @@ class Clock:
         from . import surface_loops  # not before: numba takes half a second to import
 
         times_ns = np.empty(len(ray))
-        surface_loops.times(
+        surface_loops.firing_times(
             owned(ray, np.int64),
             self.start,
             self.subrays,

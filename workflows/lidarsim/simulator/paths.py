@@ -23,7 +23,7 @@ from .actor_trajectories import ActorTrajectories
 from .doppler import range_rates_of_origins, velocities_of_ends
 from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
 from .motion import CastPoses, Clock, along_rings
-from .returns import OF_RETURNS, SURFACE, PulseReturns, joined, selected
+from .returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
@@ -146,7 +146,7 @@ class CastStep(PulseStep):
         "Ghosts", "Wet ground", "Gaussian and oval beams", "Refraction", "Vegetation",
         "Rays without a return",
     )  # fmt: skip
-    writes = *OF_RETURNS, "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
     causes = (GHOST,)
     purposes = LEAF, CROWN
 
@@ -156,7 +156,7 @@ class CastStep(PulseStep):
         sensor = setup.sensor
         self._light = light_of(survey, sensor)
         self._seed = setup.noise.seed
-        table = surfaces.at(sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
@@ -222,7 +222,7 @@ class CastStep(PulseStep):
         """Return the function that draws random bits of sub-rays for a purpose."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
-            scan, number = batch.keys.of(batch.start + ray // batch.subrays_per_beam)
+            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
             return raw(self._seed, purpose, scan, number, ray % batch.subrays_per_beam)
 
         return draw
@@ -371,7 +371,7 @@ class CastStep(PulseStep):
 
     def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
         """Return the hits that the sensor may see, and the surfaces from which light continues."""
-        materials = self.surfaces.at(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
             along_ray = products(surface_hits.velocities.T, light.directions.T)
@@ -450,7 +450,7 @@ class CastStep(PulseStep):
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
-        materials = self.surfaces.at(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         bright = None
         if materials.textured and surface_hits.colour is not None:
             bright = luminance(surface_hits.colour[rows])
@@ -460,23 +460,26 @@ class CastStep(PulseStep):
         )
         share = np.empty(len(rows))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
-        count = surface_loops.onward(
+        count = surface_loops.divide_light(
             rows,
             reflected,
-            surface_hits.kinds,
-            surface_hits.cosines,
+            surface_loops.OnwardHits(
+                surface_hits.kinds,
+                surface_hits.cosines,
+                film,
+                light.share,
+                surface_hits.distance,
+            ),
             materials.shares(surface_hits.kinds[rows], bright),
-            self._light.wet,
-            film,
-            light.share,
-            surface_hits.distance,
-            materials.specular,
-            materials.passes,
-            ~materials.refracts,
-            materials.leafy,
-            self._brightest,
-            self._light.extinction,
-            self._faintest if drops_faint else -1.0,
+            surface_loops.OnwardOptics(
+                materials.specular, materials.passes, ~materials.refracts, materials.leafy
+            ),
+            surface_loops.OnwardLimits(
+                self._light.wet,
+                self._brightest,
+                self._light.extinction,
+                self._faintest if drops_faint else -1.0,
+            ),
             share,
         )
         return OnwardRows(rows[:count], reflected[:count], share[:count])
@@ -611,7 +614,7 @@ def _path_behind(
 
     origins = np.empty((3, len(clear_m)))
     directions = owned(outgoing.T)
-    surface_loops.set_off(
+    surface_loops.start_behind(
         owned(light.origins.T),
         owned(light.directions.T),
         owned(step_m),

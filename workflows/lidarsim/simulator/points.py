@@ -26,7 +26,7 @@ from .doppler import VELOCITY, radial_velocities
 from .motion import CastPoses, Firings
 from .paths import GHOST
 from .pulses import Scanned
-from .returns import made
+from .returns import required
 from .steps import received_causes
 from .surfaces import Surfaces, light_of
 
@@ -173,7 +173,7 @@ class BatchPoints:
     @property
     def range(self) -> Floats:
         """Distance from the start of the ray, metres, with noise."""
-        return made(self.pulse_returns.reported)
+        return required(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
@@ -413,7 +413,7 @@ class BatchPoints:
                 self._poses.actor_trajectories,
                 None if colours is None else colours[block],
             )
-            cosines[block] = lit.along
+            cosines[block] = lit.cosines
             energy[block] = lit.energy
         return cosines, energy
 
@@ -521,7 +521,7 @@ class BatchPoints:
     @property
     def waveform(self) -> Records:
         """Recorded waveform, see `lidarsim.columns.waveforms.record`."""
-        table = made(self.pulse_returns.waveform).copy()
+        table = required(self.pulse_returns.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
@@ -532,12 +532,12 @@ class BatchPoints:
     @property
     def return_number(self) -> Bytes:
         """Number among the reported returns of its pulse."""
-        return made(self.pulse_returns.number)
+        return required(self.pulse_returns.number)
 
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return made(self.pulse_returns.returns)
+        return required(self.pulse_returns.returns)
 
     @property
     def cause(self) -> Bytes:

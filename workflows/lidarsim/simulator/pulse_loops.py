@@ -1,4 +1,4 @@
-"""Parts that loops over pulses share; a loop is compiled when it is first called."""
+"""Parts that loops over pulses share; each loop is compiled when it is first called."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from raybeam.compiled import compiled, inlined, stage
 
-from ..base.arrays import Floats, Ints
+from ..base.arrays import Bools, Floats, Ints
 
-SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
+SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between neighbouring hits
 
 
 class SampledHits(NamedTuple):
@@ -26,15 +26,24 @@ class SampledHits(NamedTuple):
 
 
 class Neighbours(NamedTuple):
-    """Where surfaces may continue from sub-ray to sub-ray; without pairs they do not."""
+    """Neighbouring sub-rays of a beam, and planes of hits; without pairs no surface continues."""
 
+    subrays: int  # of a beam
     pairs: Ints  # (k, 2): neighbouring sub-rays of a beam
     normals: Floats  # (3, n): of the surfaces of hits
     directions: Floats  # (3, n): of the rays of hits
 
 
+class SurfaceMarks(NamedTuple):
+    """Marks of hits in the order of `PulseHits`: (n,) each."""
+
+    solid: Bools  # whether the hit is on a surface that may continue
+    starts_return: Bools  # whether a return starts at the hit
+    apart: Bools  # whether the surface of the hit before does not continue; may be `starts_return`
+
+
 class PulseHits(NamedTuple):
-    """Hits of beams in the order of their distances, (n,) each, and scratch memory."""
+    """Hits of beams in the order of beams and distances, (n,) each, and scratch memory."""
 
     subray: Ints  # number among the sub-rays of all beams
     distance: Floats  # metres
@@ -50,19 +59,20 @@ def beam_of(ray, subrays):
 
 
 @inlined
-def scan_row(begins, beam, row):
-    """Return the row of the scan of a beam, from the row of a beam before."""
-    while row + 1 < len(begins) and begins[row + 1] <= beam:
+def scan_row(scan_starts, beam, row):
+    """Return the row of the scan of a beam, searched from the row of an earlier beam."""
+    while row + 1 < len(scan_starts) and scan_starts[row + 1] <= beam:
         row += 1
     return row
 
 
 @compiled()
-def counted(ray, begins, keep_every, counts, rows, number, returns):
-    """Count the returns of scans, which begin at some rays, and write those that are kept.
+def thin_out(ray, scan_starts, keep_every, counts, rows, number, returns):
+    """Count the returns of each scan, and write every `keep_every`-th return of a scan.
 
-    Writes the rows of kept returns, their numbers in their pulses from 1, and how many returns a
-    pulse has, at most 255; returns how many are kept.
+    Scans begin at rays `scan_starts`; their `counts` are added to. Of kept returns, writes the
+    `rows`, the `number` in the pulse, from 1, and the number of `returns` of the pulse, both at
+    most 255. Returns the number of kept returns.
     """
     count = 0
     scan = 0
@@ -71,7 +81,7 @@ def counted(ray, begins, keep_every, counts, rows, number, returns):
     for k in range(len(ray)):
         if k == stop:
             begin = k
-            scan = scan_row(begins, ray[k], scan)
+            scan = scan_row(scan_starts, ray[k], scan)
             while stop < len(ray) and ray[stop] == ray[begin]:
                 stop += 1
         if keep_every == 1 or counts[scan] % keep_every == 0:
@@ -84,31 +94,37 @@ def counted(ray, begins, keep_every, counts, rows, number, returns):
 
 
 @inlined
-def _half_way(this, that, inverse_m, neighbours):
-    """Return the range half-way to another hit, on the plane of the first."""
+def _half_way(hit, neighbour, inverse_m, neighbours):
+    """Return the range of the plane of a hit half-way to a neighbouring hit, metres."""
     normals = neighbours.normals
     directions = neighbours.directions
-    x = normals[0, this]
-    y = normals[1, this]
-    z = normals[2, this]
-    that_cosine = x * directions[0, that] + y * directions[1, that] + z * directions[2, that]
-    this_cosine = x * directions[0, this] + y * directions[1, this] + z * directions[2, this]
-    ratio = 1 + that_cosine / this_cosine
+    x = normals[0, hit]
+    y = normals[1, hit]
+    z = normals[2, hit]
+    neighbour_cosine = (
+        x * directions[0, neighbour] + y * directions[1, neighbour] + z * directions[2, neighbour]
+    )
+    hit_cosine = x * directions[0, hit] + y * directions[1, hit] + z * directions[2, hit]
+    ratio = 1 + neighbour_cosine / hit_cosine
     if ratio < 1e-9:  # and not if it is unknown
         ratio = 1e-9
     return 2 / (inverse_m * ratio)
 
 
 @stage
-def continue_surfaces(begin, stop, new, apart, solid, hits, gap_m, subrays, neighbours):
-    """Unmark in `apart` where a surface of a beam continues, by returns that begin at `new`.
+def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901, PLR0914 - a compiled loop
+    """Clear `marks.apart` at the hits of a beam where the surface of the hit before continues.
 
-    The hits of the beam are rows `begin` to `stop`, in the order of distances, of which `solid` are
-    considered. Two neighbouring sub-rays hit one surface if the planes through the two hits meet
-    half-way between them, within the gap or half of the distance between the hits. The inverse
-    range of a plane is linear in the ray's direction, so two hits on one plane always meet,
-    whatever the angle; half of the distance allows for rough ground.
+    The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,
+    `SurfaceMarks`; only `solid` hits are considered. Two neighbouring sub-rays hit one surface if
+    the planes through the two hits meet half-way between the hits, within `gap_m` or half of the
+    distance between the hits. The inverse range of a plane is linear in the ray's direction, so two
+    hits on one plane always meet, whatever the angle; half of the distance allows for rough ground.
     """
+    subrays = neighbours.subrays
+    solid = marks.solid
+    starts_return = marks.starts_return
+    apart = marks.apart
     distance = hits.distance
     row = hits.row
     subray_hits = hits.subray_hits
@@ -117,7 +133,7 @@ def continue_surfaces(begin, stop, new, apart, solid, hits, gap_m, subrays, neig
     panes = 0
     for k in range(count * subrays):
         subray_hits[k] = -1
-    for k in range(begin, stop):  # the hit of each sub-ray, after so many panes of glass
+    for k in range(begin, stop):  # subray_hits: by panes of glass before the hit, then by sub-rays
         changes[k - begin] = 0
         if solid[k]:
             pane = 0
@@ -127,22 +143,24 @@ def continue_surfaces(begin, stop, new, apart, solid, hits, gap_m, subrays, neig
             panes = max(panes, pane + 1)
     changes[count] = 0
     first = begin
-    for k in range(begin, stop):  # the first hit of the return of each hit
-        if new[k]:
+    for k in range(begin, stop):  # row[k, 1]: the first hit of the return of hit k
+        if starts_return[k]:
             first = k
         row[k, 1] = first
     for pane in range(panes):
         for pair in range(len(neighbours.pairs)):
-            this = subray_hits[pane * subrays + neighbours.pairs[pair, 0]]
-            that = subray_hits[pane * subrays + neighbours.pairs[pair, 1]]
-            if this < 0 or that < 0 or row[this, 1] == row[that, 1]:
+            hit = subray_hits[pane * subrays + neighbours.pairs[pair, 0]]
+            neighbour = subray_hits[pane * subrays + neighbours.pairs[pair, 1]]
+            if hit < 0 or neighbour < 0 or row[hit, 1] == row[neighbour, 1]:
                 continue
-            this_m = _half_way(row[this, 0], row[that, 0], 1 / distance[this], neighbours)
-            that_m = _half_way(row[that, 0], row[this, 0], 1 / distance[that], neighbours)
-            between_m = abs(distance[this] - distance[that])
-            if abs(this_m - that_m) <= max(gap_m, SLOPE * between_m):
-                changes[min(this, that) + 1 - begin] += 1
-                changes[max(this, that) + 1 - begin] -= 1
+            hit_m = _half_way(row[hit, 0], row[neighbour, 0], 1 / distance[hit], neighbours)
+            neighbour_m = _half_way(
+                row[neighbour, 0], row[hit, 0], 1 / distance[neighbour], neighbours
+            )
+            between_m = abs(distance[hit] - distance[neighbour])
+            if abs(hit_m - neighbour_m) <= max(gap_m, SLOPE * between_m):
+                changes[min(hit, neighbour) + 1 - begin] += 1
+                changes[max(hit, neighbour) + 1 - begin] -= 1
     inside = 0
     for k in range(begin, stop):
         inside += changes[k - begin]

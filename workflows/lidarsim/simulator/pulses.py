@@ -1,6 +1,6 @@
-"""Returns of the pulses of one sensor: casts its scans, and applies the steps to what is hit.
+"""Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
-Random numbers depend only on scan, ray and return, so the batches do not matter.
+Random numbers depend only on scan, ray and return, so batches do not change the result.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
 from .motion import CastPoses, Firings
-from .returns import NO_SURFACE, Keys, PulseReturns, joined, made
+from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
 from .scene_caster import SceneCaster
 from .step import Emitter, PulseBatch, PulseStep, Role
 from .steps import setup_of, steps_of
@@ -26,15 +26,15 @@ CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
 
 
 class Scanned(NamedTuple):
-    """What scans give: kept returns, and counts of all."""
+    """Kept returns of scans, and counts of all returns."""
 
     returns: PulseReturns
-    hits: Ints  # (scans,): returns of each, kept or not
-    tally: Ints | None  # (counters,): hits by `Surfaces.counter`, kept or not, if asked for
+    hits: Ints  # (scans,): returns of each scan, kept or not
+    tally: Ints | None  # (counters,): hits by `Surfaces.counter`, kept or not, on request
 
 
 class PulseCaster:
-    """Casts the scans of one sensor."""
+    """Caster of the scans of a sensor."""
 
     def __init__(
         self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
@@ -56,9 +56,24 @@ class PulseCaster:
         *,
         tally: bool = True,
     ) -> Scanned:
-        """Cast scans from number `scan` on: hits in the sensor's range, counted and thinned out.
+        """Return the returns of scans from number `scan` on, counted and thinned out.
 
-        The others are arguments of `RayCaster.scan`, where each group is a scan.
+        Parameters
+        ----------
+        scan
+            Number of the first scan.
+        pattern
+            Rays of the beams.
+        poses
+            Poses of the beams.
+        window
+            First row of the beams in `pattern`, and one past the last.
+        groups
+            (scans,): first beam of each scan.
+        firings
+            Firings of the beams.
+        tally
+            Whether hits are counted by `Surfaces.counter`.
         """
         first = window[0]
         rays = window[1] - window[0]
@@ -67,23 +82,23 @@ class PulseCaster:
             keys = Keys(scan, groups)
             return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
 
-        whole = batch(0, rays)
+        all_beams = batch(0, rays)
         if self._setup.has_several_returns:
             unit = poses.rays_per_pose or self._setup.sensor.channels
             size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
-            begins = range(0, rays, size)
-            chunks = [self._pulses(batch(k, min(k + size, rays))) for k in begins]
-            found = self._kept(joined(chunks), groups, tally)
+            chunk_starts = range(0, rays, size)
+            chunks = [self._pulses(batch(k, min(k + size, rays))) for k in chunk_starts]
+            scanned = self._thin_out(joined(chunks), groups, tally)
         else:
-            found = self._once(whole, groups, tally)
-        returns = found.returns
+            scanned = self._cast_once(all_beams, groups, tally)
+        returns = scanned.returns
         for step in self.steps:
             if Role.ON_REPORTED in step.role:
-                returns = step.apply(returns, whole)
-        return self._in_range(found._replace(returns=returns), groups)
+                returns = step.apply(returns, all_beams)
+        return self._within_range(scanned._replace(returns=returns), groups)
 
-    def _in_range(self, scanned: Scanned, groups: Ints) -> Scanned:
-        """Remove the returns whose ranges, with noise, are beyond those that the sensor reports.
+    def _within_range(self, scanned: Scanned, groups: Ints) -> Scanned:
+        """Remove the returns whose ranges, with noise, are outside of the sensor's range.
 
         The counts and the numbers of the other returns are as if the removed ones were undetected.
         """
@@ -105,30 +120,34 @@ class PulseCaster:
             tally = tally - np.bincount(counter, minlength=len(tally))
         first = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
         last = np.searchsorted(returns.ray, returns.ray, "right")
-        before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
-        number = made(returns.number) - (before[:-1] - before[first])
-        count = made(returns.returns) - (before[last] - before[first])
+        removed_before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
+        number = required(returns.number) - (removed_before[:-1] - removed_before[first])
+        count = required(returns.returns) - (removed_before[last] - removed_before[first])
         renumbered = returns._replace(
             number=number.astype(np.uint8), returns=count.astype(np.uint8)
         )
         return Scanned(renumbered.take(in_range), hits, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
-        """Take the pulses of a batch through all steps."""
-        returns = PulseReturns.none()
+        """Return the returns of a batch after all steps that act before returns are thinned out."""
+        returns = PulseReturns.empty()
         for step in self.steps:
             if Role.ON_REPORTED not in step.role:
                 returns = step.apply(returns, batch)
         return returns
 
-    def _once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
-        """Cast rays with one return each; compute energies only for kept ones, and if needed."""
+    def _cast_once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
+        """Cast rays that have a single return each, counted and thinned out by the caster.
+
+        Energies are computed only for kept returns, and only if steps turn beams; else they follow
+        from the reported directions.
+        """
         setup = self._setup
         poses = batch.poses
         for step in self.steps:
             if Role.AIMS in step.role:
-                step.apply(PulseReturns.none(), batch)
-        found = self._caster.scan(
+                step.apply(PulseReturns.empty(), batch)
+        hits = self._caster.scan(
             batch.beams,
             poses,
             window=batch.window,
@@ -138,13 +157,13 @@ class PulseCaster:
             groups=groups,
             tally=tally,
         )
-        returns = PulseReturns.one_each(found.ray, found.distance, found.triangle)
-        if batch.offsets is not None:  # else it is made of the reported directions, if it is needed
-            returns = self._lit(returns, batch)
-        return Scanned(returns, found.hits, found.tally)
+        returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
+        if batch.offsets is not None:
+            returns = self._with_light(returns, batch)
+        return Scanned(returns, hits.hits, hits.tally)
 
-    def _lit(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Make what depends on the directions in which rays were cast."""
+    def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Add energy, colour and velocity to returns, by the directions in which rays were cast."""
         surfaces = self._surfaces
         setup = self._setup
         poses = batch.poses
@@ -154,40 +173,48 @@ class PulseCaster:
         triangle = returns.triangle
         colour = velocity = None
         if setup.has_velocities:
-            given = returns.ray, rays, distance, triangle, times
-            velocity = radial_velocities(surfaces, poses, *given)
+            velocity = radial_velocities(
+                surfaces, poses, returns.ray, rays, distance, triangle, times
+            )
         if surfaces.materials.textured:
-            ends = directions * distance[:, None]
-            ends += origins
-            colour = surfaces.colours(triangle, ends, times, poses.actor_trajectories)
-            del ends  # which takes as much memory as the normals
+            points = directions * distance[:, None]
+            points += origins
+            colour = surfaces.colours(triangle, points, times, poses.actor_trajectories)
+            del points  # which takes as much memory as the normals
         light = light_of(setup.survey, setup.sensor)
         lit = surfaces.lit(
             triangle, directions, distance, light, times, poses.actor_trajectories, colour
         )
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
-    def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
-        """Count the returns of each scan and thin them out."""
+    def _thin_out(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
+        """Count the returns of each scan, and keep every n-th return of a scan."""
         from . import pulse_loops  # not before: numba takes half a second to import
 
-        every = self._setup.survey.keep_every
-        most = len(returns.ray)
+        keep_every = self._setup.survey.keep_every
+        size = len(returns.ray)
         hits = np.zeros(len(groups), np.int64)
-        rows = np.empty(most, np.int64)
-        number, each = np.empty((2, most), np.uint8)
-        given = owned(returns.ray, np.int64), owned(groups, np.int64), every
-        count = pulse_loops.counted(*given, hits, rows, number, each)
-        thinned = returns if count == most else returns.take(rows[:count])
+        rows = np.empty(size, np.int64)
+        number, returns_of_pulse = np.empty((2, size), np.uint8)
+        count = pulse_loops.thin_out(
+            owned(returns.ray, np.int64),
+            owned(groups, np.int64),
+            keep_every,
+            hits,
+            rows,
+            number,
+            returns_of_pulse,
+        )
+        thinned = returns if count == size else returns.take(rows[:count])
         thinned = thinned._replace(
             ray=thinned.ray.astype(np.uint32),
             number=number[:count],
-            returns=each[:count],
+            returns=returns_of_pulse[:count],
             reported=thinned.distance,
         )
         if not tally:
             return Scanned(thinned, hits, None)
         surfaces = self._surfaces
-        some = returns.triangle[returns.triangle != NO_SURFACE]
-        counted = np.bincount(surfaces.counter(some), minlength=surfaces.counters)
-        return Scanned(thinned, hits, counted)
+        triangle = returns.triangle[returns.triangle != NO_SURFACE]
+        tally_counts = np.bincount(surfaces.counter(triangle), minlength=surfaces.counters)
+        return Scanned(thinned, hits, tally_counts)

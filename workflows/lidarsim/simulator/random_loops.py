@@ -1,4 +1,4 @@
-"""Random numbers for compiled loops: those of `lidarsim.sensor.random_numbers`, one at a time."""
+"""Random numbers for compiled loops: as `lidarsim.sensor.random_numbers`, number by number."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -12,7 +12,7 @@ from raybeam.compiled import inlined
 
 from ..base.arrays import AnyArray, Ints
 
-SHIFT_TO_INDEX = np.uint64(48)  # of random bits, so that one of 65,536 equal shares is left
+SHIFT_TO_INDEX = np.uint64(48)  # leaves the upper 16 of 64 bits, an index below 65,536
 
 _30 = np.uint64(30)
 _27 = np.uint64(27)
@@ -21,22 +21,22 @@ _11 = np.uint64(11)
 _FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_NUMBERS = np.uint64(256)  # of one ray
+_NUMBERS = np.uint64(256)  # random numbers that a ray may have for a purpose
 _NEXT = np.uint64(1)
 
 
 class RandomKeys(NamedTuple):
-    """What the random numbers of consecutive beams depend on, beside the number of each."""
+    """Keys of the random numbers of consecutive beams."""
 
-    starts: AnyArray  # uint64 (purposes,), see `random_numbers.starts`; empty if none are drawn
+    starts: AnyArray  # uint64 (purposes,), see `random_numbers.starts`; empty without numbers
     scan: int  # number of the first scan
-    begins: Ints  # (scans,): numbers of the beams at which scans begin
+    scan_starts: Ints  # (scans,): number of the first beam of each scan
     first: int  # number of the first beam
 
 
 @inlined
 def _mixed(x):
-    """Return the last step of SplitMix64, as `random_numbers._mixed` does, of one number."""
+    """Return a 64-bit number after the last step of SplitMix64, as `random_numbers._mixed`."""
     x = (x ^ (x >> _30)) * _FIRST_FACTOR
     x = (x ^ (x >> _27)) * _SECOND_FACTOR
     return x ^ (x >> _31)
@@ -44,9 +44,9 @@ def _mixed(x):
 
 @inlined
 def bits(start, scan, ray, number):
-    """Return 64 random bits: of a purpose, by the start of its hashes."""
-    begin = _mixed(start + np.uint64(scan) * _GAMMA)
-    return _mixed(begin + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
+    """Return the 64 random bits of a purpose, by the start of its hashes, a ray and a number."""
+    scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
+    return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
 
 
 @inlined

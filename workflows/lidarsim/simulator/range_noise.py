@@ -8,7 +8,7 @@ from ..base.arrays import Floats, Integers, Ints
 from ..base.elementary import exp, log
 from ..sensor.noise import Noise
 from ..sensor.random_numbers import Purpose, normal
-from .returns import PulseReturns, made
+from .returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 
 RANGE = Purpose(1, "noise of a return's range")
@@ -33,13 +33,13 @@ class RangeNoiseStep(PulseStep):
         """Return the returns with their reported ranges."""
         # The leading edge of a clipped pulse is that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
-        scan, ray = batch.keys.of(returns.ray)
+        scan, ray = batch.keys.scan_and_number(returns.ray)
         noise = self.setup.noise
         distance = returns.distance
         if noise.channel_bias_m or noise.warm_up_m:
             channel = returns.ray % self.setup.sensor.channels
             distance = distance + lasting_errors(noise, channel, batch.firings.times(returns.ray))
-        reported = noisy_ranges(noise, distance, height, scan, ray, made(returns.number))
+        reported = noisy_ranges(noise, distance, height, scan, ray, required(returns.number))
         return returns._replace(reported=reported)
 
 

@@ -13,7 +13,7 @@ from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import CUT
 from ..sensor.random_numbers import Purpose, normal, raw
-from .returns import Keys, PulseReturns, made, numbers
+from .returns import Keys, PulseReturns, numbers, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
@@ -63,7 +63,7 @@ class RecordingStep(PulseStep):
         the window while their signals stop within. Overlapping windows of a pulse hold the same
         samples.
         """
-        digitizer = Digitizer.of(self.setup)
+        digitizer = Digitizer.for_sensor(self.setup)
         count = self.setup.waveform_samples
         records = np.zeros(len(returns.ray), record(count))
         records["sample_ps"] = round(1000 * digitizer.sample_ns)
@@ -85,8 +85,8 @@ class RecordingStep(PulseStep):
         """Add the receiver's noise to samples (windows, count) in place; return clipped samples."""
         noise = self.setup.noise
         if noise.threshold:
-            keys = Keys(batch.keys.scan, batch.keys.begins - batch.start)
-            scan, ray = keys.of(windows.beam)
+            keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
+            scan, ray = keys.scan_and_number(windows.beam)
             stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
             number = windows.begin[:, None] + np.arange(samples.shape[1])
             errors = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
@@ -99,7 +99,7 @@ def _window_starts(distance: Floats, pulse_row: Ints, digitizer: Digitizer, coun
 
     `pulse_row` numbers the returns of a pulse; windows have `count` samples.
     """
-    time = distance * digitizer.per_m
+    time = distance * digitizer.samples_per_m
     first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
     last = np.ceil(time).astype(np.int64) + digitizer.reach
     begin = first.copy()
@@ -118,7 +118,7 @@ def _windows(
     begin = _window_starts(returns.distance, pulse_row, digitizer, count)
     starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
     beam = returns.ray[starts_window] - batch.start
-    ray = made(batch.hits).ray
+    ray = required(batch.hits).ray
     first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
     stop_hit = np.searchsorted(ray, (beam + 1) * batch.subrays_per_beam)
     windows = Windows(beam, begin[starts_window], first_hit, stop_hit)
@@ -127,16 +127,16 @@ def _windows(
 
 def _sampled(batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int) -> Floats:
     """Return the samples of the signals of hits in windows, without noise: (windows, count)."""
-    hits = made(batch.hits)
+    hits = required(batch.hits)
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)
     first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
     rows = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
-    time = hits.distance[rows] * digitizer.per_m
+    time = hits.distance[rows] * digitizer.samples_per_m
     first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
     sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
-    height *= made(hits.energy)[rows, None] / batch.subrays_per_beam
+    height *= required(hits.energy)[rows, None] / batch.subrays_per_beam
     sample = sample_times - windows.begin[window, None]
     inside = (sample >= 0) & (sample < count)
     sample += count * window[:, None]

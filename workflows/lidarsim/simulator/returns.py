@@ -1,4 +1,4 @@
-"""What comes back of pulses, and the keys of random numbers."""
+"""Returns of pulses, and the keys of random numbers."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from ..scene.colours import GREY, packed
 
 T = TypeVar("T")
 
-NO_SURFACE = -1  # triangle and object of what is no surface
+NO_SURFACE = -1  # triangle and object of returns that are not from a surface
 SURFACE = CAUSES.index("surface")
 
 
 def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
-    """Yield some rows of each column; None for one that is not there."""
+    """Yield the selected rows of each column; None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
             yield column.T.take(rows, axis=-1).T
@@ -38,82 +38,81 @@ def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
             yield None if column is None else column[rows]
 
 
-# Columns of whatever comes back.
-OF_RETURNS = "ray", "distance", "triangle", "energy", "colour", "cause"
+# Columns of every hit and return.
+RETURN_COLUMNS = "ray", "distance", "triangle", "energy", "colour", "cause"
 
 
 class PulseReturns(NamedTuple):
-    """What comes back of pulses, in the order of rays and distances: arrays (n,).
+    """Hits or returns of pulses, in the order of rays and distances: arrays (n,).
 
-    Columns that no step of a survey makes are None. Before hits become returns, a ray is a sub-ray.
-    What is no surface has the triangle `NO_SURFACE`.
+    Columns that no step of a survey writes are None. Before hits become returns, a ray is a
+    sub-ray. Returns that are not from a surface have the triangle `NO_SURFACE`.
     """
 
     ray: Integers
     distance: Floats  # metres, without noise
     triangle: Ints32
-    # Received, see `Surfaces.energy`; None if it is that of the rays as reported.
+    # Received, see `Surfaces.energy`; None if it follows from the rays as they are reported.
     energy: Floats | None = None
-    # Packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
+    # Packed, see `Surfaces.colours`; None if it is taken at the rays' ends, or not needed.
     colour: UInts32 | None = None
-    cause: Bytes | None = None  # why they are there; None if all are surfaces
-    # Radial, m/s, if a column has it; NaN if unknown.
-    velocity: Floats | None = None
-    # Full width at half maximum in the waveform, ns, and height; None if returns are made without.
+    cause: Bytes | None = None  # indices into `CAUSES`; None if all hits are on surfaces
+    velocity: Floats | None = None  # radial, m/s, if a column stores it; NaN if unknown
+    # Full width at half maximum in the waveform, ns, and its height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
     waveform: Records | None = None  # recorded, but for the location
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
-    returns: Bytes | None = None  # how many these are
-    reported: Floats | None = None  # distance with noise
+    returns: Bytes | None = None  # number of reported returns of its pulse
+    reported: Floats | None = None  # distance with noise, metres
 
     @classmethod
-    def none(cls) -> PulseReturns:
-        """Make none."""
+    def empty(cls) -> PulseReturns:
+        """Return a table without rows."""
         return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32))
 
     @classmethod
-    def one_each(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
-        """Make the only return of each ray, without noise."""
-        one = np.ones(len(ray), np.uint8)
-        return cls(ray, distance, triangle, number=one, returns=one, reported=distance)
+    def single_returns(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
+        """Return a table where each ray (n,) has a single return, without noise."""
+        single = np.ones(len(ray), np.uint8)
+        return cls(ray, distance, triangle, number=single, returns=single, reported=distance)
 
     def take(self, rows: Bools | Indices) -> PulseReturns:
-        """Select some of them."""
-        if rows.dtype == np.bool_:  # of each column it would be counted again
+        """Return the selected rows of all columns."""
+        if rows.dtype == np.bool_:  # a mask would be counted again for each column
             rows = np.flatnonzero(rows)
         return PulseReturns(*selected(self, rows))
 
     @property
     def height(self) -> Floats:
-        """Heights of echoes; without waveforms their energies."""
-        return made(self.energy if self.amplitude is None else self.amplitude)
+        """Heights of returns in the waveform (n,); without waveforms their energies."""
+        return required(self.energy if self.amplitude is None else self.amplitude)
 
 
-# Normals of the surfaces of hits, as they are seen in mirrors, and directions of their rays:
+# Normals of the surfaces of hits, as they are seen in mirrors, and directions of the hits' rays:
 # (n, 3) each.
 Planes = tuple[Floats, Floats]
 
 
-def made(column: T | None) -> T:
-    """Return a column that an earlier step has made."""
+def required(column: T | None) -> T:
+    """Return a column that an earlier step has written, so never None."""
     assert column is not None
     return column
 
 
-# Values of a column where some have it, and others do not.
+# Values of columns in the rows of tables that lack the column, where other tables have it.
 _LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
 
 
 def joined(parts: list[PulseReturns]) -> PulseReturns:
-    """Concatenate hits. Other columns than `_LACKING` are in all parts, or in none."""
+    """Concatenate tables of hits. Columns outside `_LACKING` are in all tables, or in none."""
     if len(parts) == 1:
         return parts[0]
     return PulseReturns._make(_column(name, parts) for name in PulseReturns._fields)
 
 
 def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
-    """Concatenate a column; None if all parts lack it."""
+    """Concatenate a column of several tables; None if all tables lack the column."""
     columns = [getattr(part, name) for part in parts]
     if all(column is None for column in columns):
         return None
@@ -125,10 +124,10 @@ def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
     )
 
 
-def unreal(
+def returns_without_surface(
     returns: PulseReturns, ray: Ints, distance: Floats, energy: Floats, cause: int
 ) -> PulseReturns:
-    """Make returns that are from no surface, with the columns that others have."""
+    """Return rows (n,) that are not from a surface, with the columns of a table of returns."""
     count = len(ray)
     return PulseReturns(
         ray,
@@ -141,11 +140,11 @@ def unreal(
     )
 
 
-def merged(returns: PulseReturns, more: PulseReturns) -> PulseReturns:
-    """Add returns to others; the result is in the order of rays and distances."""
-    if not len(more.ray):
+def merged(returns: PulseReturns, additions: PulseReturns) -> PulseReturns:
+    """Merge two tables of returns, in the order of rays and distances."""
+    if not len(additions.ray):
         return returns
-    hits = joined([returns, more])
+    hits = joined([returns, additions])
     return hits.take(np.lexsort((hits.distance, hits.ray)))
 
 
@@ -154,20 +153,23 @@ class Keys:
     """Keys of the random numbers of rays."""
 
     scan: int  # number of the first scan
-    begins: Ints  # rays at which scans begin
+    scan_starts: Ints  # (scans,): first ray of each scan
 
-    def of(self, ray: Integers) -> tuple[Ints, Ints]:
-        """Return the scans of rays, and their numbers within them."""
-        number = np.searchsorted(self.begins, ray, side="right") - 1
-        return self.scan + number, ray - self.begins[number]
+    def scan_and_number(self, ray: Integers) -> tuple[Ints, Ints]:
+        """Return the scans of rays (n,), and the numbers of the rays in their scans: (n,) each."""
+        index = np.searchsorted(self.scan_starts, ray, side="right") - 1
+        return self.scan + index, ray - self.scan_starts[index]
 
 
 def numbers(ray: Integers) -> Ints:
-    """Count the entries of each ray, which are consecutive, from 0: (n,)."""
+    """Return the number of each entry within its ray, from 0: (n,).
+
+    The entries of a ray are consecutive.
+    """
     return np.arange(len(ray)) - np.repeat(*runs(ray))
 
 
 def runs(ray: Integers) -> tuple[Ints, Ints]:
-    """Find starts and lengths of runs of equal numbers."""
-    begins = np.flatnonzero(np.diff(ray, prepend=-1))
-    return begins, np.diff(begins, append=len(ray))
+    """Return the starts and lengths of runs of equal rays."""
+    starts = np.flatnonzero(np.diff(ray, prepend=-1))
+    return starts, np.diff(starts, append=len(ray))

@@ -73,7 +73,7 @@ class Rig:
         self.scene = scene
         self.survey = survey
         self.options = options
-        self._actor_trajectories = ActorTrajectories.of(scene.actors)
+        self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._caster = SceneCaster(scene, self._surfaces, shared_caster, **options)
@@ -116,7 +116,7 @@ class Rig:
         """Return a rig with new trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._actor_trajectories = ActorTrajectories.of(actors)
+        rig._actor_trajectories = ActorTrajectories.from_actors(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:

@@ -1,10 +1,10 @@
-"""Estimates of a survey from some of its rays."""
+"""Estimates of a survey from a sample of its rays."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,60 +19,63 @@ from ..sensor.beams import Beams
 from ..sensor.weather import Weather
 from .rig import Rig
 
-SAMPLE_RAYS = 500_000  # rays that are cast at most
-SAMPLE_PARTS = 500  # parts of a survey that rays are cast of, at most
+SAMPLE_RAYS = 500_000  # largest number of rays that are cast
+SAMPLE_PARTS = 500  # largest number of parts of a survey that are sampled
 SAMPLE_SCANS = 40  # consecutive scans of a part
-RANGE_RAYS = 20_000  # rays that `sample_ranges` casts, at most
+RANGE_RAYS = 20_000  # largest number of rays that `sample_ranges` casts
 GOLDEN = 0.6180339887498949  # the golden ratio less 1
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
-    """Estimate hits and points of a survey by casting some of its rays, all if they are few.
+    """Estimate hits and points of a survey by casting a sample of its rays.
 
-    The rays are spread evenly over all scans; of many thousand scans, over some of each part. The
-    result also has the number of rays that were cast.
+    The rays are spread evenly over all scans; of many thousand scans, over scans of each part. Few
+    rays are all cast. The result has the number of rays that were cast, of hits and of points.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count))
     subrays = max(returns.subrays for returns in survey.returns_each)
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
     sampled = survey
     if (every := -(-rays // SAMPLE_RAYS)) > 1:
-        # Faults and errors of certain channels do not fit one beam.
-        other: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
+        # Faults and errors of certain channels do not fit a single beam.
+        without_channels: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
         carried = [
-            replace(one, noise=one.noise and replace(one.noise, **other))
-            for one in _with_few_rays(survey, every)
+            replace(mounted, noise=mounted.noise and replace(mounted.noise, **without_channels))
+            for mounted in _with_few_rays(survey, every)
         ]
-        noise = replace(survey.noise, **other)
+        noise = replace(survey.noise, **without_channels)
         sampled = replace(survey, sensors=carried, noise=noise, faults=())
-    cast = whole = hits = points = 0
+    cast_rays = 0
+    sampled_rays = 0  # of which the cast rays are the sample
+    hits = 0
+    points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
         every = getattr(sampled.carried[batch.specs[0].sensor].sensor, "every", 1)
         rays = sum(spec.ray_count for spec in batch.specs)
-        cast = cast + rays
-        whole = whole + rays * every
+        cast_rays = cast_rays + rays
+        sampled_rays = sampled_rays + rays * every
         hits += int(batch.hits.sum()) * every
         points += int(np.ceil(batch.hits * every / survey.keep_every).sum())
-    share = survey.ray_count / whole
-    return {"rays": cast, "hits": round(hits * share), "points": round(points * share)}
+    share = survey.ray_count / sampled_rays
+    return {"rays": cast_rays, "hits": round(hits * share), "points": round(points * share)}
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
-    """Return the distances at which some rays of a survey meet their nearest surfaces, metres.
+    """Return the distances from sampled rays of a survey to the nearest surfaces, metres: (n,).
 
-    Sensors see near and far without limits, noise, faults and weather. Rays that meet nothing are
-    left out: (n,). `scans` chooses scans of the survey, by default all.
+    Sensors have no limits of range, noise, faults and weather. Rays that meet no surface are left
+    out. `scans` are the scans of the survey that are sampled, by default all.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count) if scans is None else scans)
     rays = survey.ray_count * int((stops - firsts).sum()) // survey.scan_count
     carried = [
         replace(
-            one,
-            sensor=replace(one.sensor, min_range_m=0.0, max_range_m=np.inf),
+            mounted,
+            sensor=replace(mounted.sensor, min_range_m=0.0, max_range_m=np.inf),
             noise=Noise(),
             returns=Returns(),
         )
-        for one in _with_few_rays(survey, max(1, -(-rays // RANGE_RAYS)))
+        for mounted in _with_few_rays(survey, max(1, -(-rays // RANGE_RAYS)))
     ]
     plain = replace(
         survey,
@@ -93,8 +96,8 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
-    """Return the first scans of the parts that rays are cast of, and the scans behind them."""
-    # Of at most two stations: a cast of each.
+    """Return the start and stop scans of the sampled parts of a survey."""
+    # A part spans at most two stations, which are cast separately.
     scans_per_part = max(1, min(*survey.steps_each, SAMPLE_SCANS))
     parts = even_indices(-(-len(scans) // scans_per_part), SAMPLE_PARTS)
     firsts = scans.start + scans_per_part * parts
@@ -102,58 +105,78 @@ def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return the sensors of a survey with one of `every` rays, and their time steps."""
+    """Return the sensors of a survey with a share 1 / `every` of their rays."""
     return [
-        replace(one, sensor=_FewRays.of(one.sensor, every), steps=steps)
-        for one, steps in zip(survey.carried, survey.steps_each, strict=True)
+        replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
+        for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
     ]
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast parts of a survey."""
+    """Cast parts of a survey, and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 
 
+class _SampledRays(NamedTuple):
+    """Rays of a sensor: (k,) each."""
+
+    firings: Ints  # (f,): the firings of the rays, each once
+    row: Ints  # of the ray's firing in `firings`
+    channel: Ints
+
+
 @dataclass(frozen=True, eq=False)
 class _FewRays(Sensor):
-    """A sensor of one beam, whose firings are some rays of another: one of each `every`."""
+    """A sensor of a single beam, whose firings are a sample of the rays of a sensor."""
 
-    whole: Sensor = field(default_factory=Sensor)
-    every: int = 1
+    sampled: Sensor = field(default_factory=Sensor)
+    every: int = 1  # rays of the sensor for each sampled ray
     period = None
 
     @classmethod
-    def of(cls, sensor: Sensor, every: int) -> _FewRays:
-        """Take one of so many rays, but some of each scan, though it may have a firing less."""
+    def from_sensor(cls, sensor: Sensor, every: int) -> _FewRays:
+        """Sample a share 1 / `every` of the rays of a sensor, or more, so that no scan is empty."""
         first, stop = sensor.firings(0)
+        # The numbers of firings of scans may differ by one.
         every = max(1, min(every, (stop - first) * sensor.channels // 2))
-        near = sensor.min_range_m
-        far = sensor.max_range_m
-        beams = Beams(np.zeros(1))
-        return cls(beams, sensor.head, near, far, "", sensor.optics, 0.0, sensor, every)
+        return cls(
+            Beams(np.zeros(1)),
+            sensor.head,
+            sensor.min_range_m,
+            sensor.max_range_m,
+            "",
+            sensor.optics,
+            0.0,
+            sensor,
+            every,
+        )
 
     def firings(self, step: int) -> tuple[int, int]:
-        first, stop = self.whole.firings(step)
-        channels = self.whole.channels
+        """Return the start and stop of the sampled rays of a time step."""
+        first, stop = self.sampled.firings(step)
+        channels = self.sampled.channels
         return first * channels // self.every, stop * channels // self.every
 
-    def _rays(self, firings: Ints) -> tuple[Ints, ...]:
-        """Return firings of the other, and which of these and which channel each ray is of."""
+    def _rays(self, firings: Ints) -> _SampledRays:
+        """Return the rays of the sensor that firings sample."""
         # Steps of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
-        fired, channel = np.divmod(ray, self.whole.channels)
-        return *np.unique(fired, return_inverse=True), channel
+        fired, channel = np.divmod(ray, self.sampled.channels)
+        return _SampledRays(*np.unique(fired, return_inverse=True), channel)
 
     def directions(self, firings: Ints) -> Floats:
-        some, row, channel = self._rays(firings)
-        return self.whole.directions(some)[row, channel, None]
+        """Return the directions of sampled rays, (k, 1, 3)."""
+        rays = self._rays(firings)
+        return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 
     def origins(self, firings: Ints) -> Floats | None:
-        some, row, channel = self._rays(firings)
-        starts = self.whole.origins(some)
-        return None if starts is None else starts[row, channel, None]
+        """Return the origins of sampled rays, (k, 1, 3); None if rays start at the sensor."""
+        rays = self._rays(firings)
+        origins = self.sampled.origins(rays.firings)
+        return None if origins is None else origins[rays.row, rays.channel, None]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        some, row, _ = self._rays(firings)
-        return self.whole.begins_ns(some)[row] + self.whole.lead_ns
+        """Return the firing times of sampled rays, (k,), nanoseconds."""
+        rays = self._rays(firings)
+        return self.sampled.begins_ns(rays.firings)[rays.row] + self.sampled.lead_ns

@@ -1,4 +1,4 @@
-"""Saturation: pulses that fill the receiver are clipped and wide, and hide what is close."""
+"""Saturation: pulses that fill the receiver are clipped and wide, and hide close returns."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from ..base.arrays import owned
 from ..base.elementary import log
 from ..base.elementary_scalars import log_of
 from ..sensor.optics import FWHM, LIGHT_M_NS
-from .returns import PulseReturns, made
+from .returns import PulseReturns, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 _TO_M = LIGHT_M_NS / 4  # half of a width, in range
 
 
 class SaturationStep(PulseStep):
-    """Clips and widens the pulses that fill the receiver, and joins them with what they hide."""
+    """Clips and widens the pulses that fill the receiver, and joins pulses with hidden returns."""
 
     role = Role.RECEIVES
     effects = ("Saturation",)
@@ -24,16 +24,16 @@ class SaturationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return whether the noise of the sensor has saturation."""
         return setup.noise.saturation is not None
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: widths, amplitudes, and what is made of them."""
+        """Return the memory of widths, amplitudes and joined returns, in bytes."""
         return Memory(retained=16 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the returns of a batch after saturation."""
         setup = self.setup
         optics = self.setup.sensor.optics
         pulse_ns = setup.reporting.length_ns(optics)
@@ -43,7 +43,7 @@ class SaturationStep(PulseStep):
 
 
 def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
-    """Clip returns at the height `full`, and join those that overlap clipped ones.
+    """Clip returns at the height `full`, and join returns that overlap clipped returns.
 
     A Gaussian pulse of height A, clipped at S, is above S / 2 for √(1 + log2(A / S)) of its full
     width at half maximum, `pulse_ns` unless a return has a width. With widths, as in waveforms, the
@@ -53,25 +53,25 @@ def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseRetur
 
     height = returns.height
     in_waveforms = returns.width is not None
-    width = made(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
-    unclipped = np.where(width > 0, width, pulse_ns)  # what has no echo has the width 0
+    width = required(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
+    unclipped = np.where(width > 0, width, pulse_ns)  # returns without a waveform have the width 0
     widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
     early_m = _TO_M * (widened - unclipped) if in_waveforms else 0.0
-    echoes = saturation_loops.Echoes(
+    pulses = saturation_loops.Pulses(
         ray=owned(returns.ray, np.int64),
         full=height > full,
         height=owned(height),
         front=returns.distance - _TO_M * widened,
         back=returns.distance + _TO_M * widened,
         distance=np.maximum(returns.distance - early_m, 0),
-        energy=made(returns.energy).copy(),
+        energy=required(returns.energy).copy(),
     )
-    left = np.empty(len(height), np.bool_)
-    saturation_loops.join_full(echoes, left)
-    joined_ns = (echoes.back - echoes.front) / (2 * _TO_M)
+    remains = np.empty(len(height), np.bool_)
+    saturation_loops.join_full(pulses, remains)
+    joined_ns = (pulses.back - pulses.front) / (2 * _TO_M)
     return returns._replace(
-        distance=echoes.distance,
-        energy=echoes.energy,
-        width=np.where(echoes.full, joined_ns, width),
+        distance=pulses.distance,
+        energy=pulses.energy,
+        width=np.where(pulses.full, joined_ns, width),
         amplitude=np.minimum(height, full),
-    ).take(left)
+    ).take(remains)

@@ -1,4 +1,4 @@
-"""A loop over returns that pulses which fill the receiver hide: see saturation.py."""
+"""Loop that joins pulses which fill the receiver with hidden pulses: see saturation.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -11,45 +11,45 @@ from raybeam.compiled import compiled
 from ..base.arrays import Bools, Floats, Ints
 
 
-class Echoes(NamedTuple):
+class Pulses(NamedTuple):
     """Returns of pulses in the order of rays and distances: (n,) each."""
 
     ray: Ints
-    full: Bools  # whether the echo fills the receiver
+    full: Bools  # whether the return fills the receiver
     height: Floats
-    front: Floats  # where the echo begins and ends, metres
-    back: Floats
+    front: Floats  # leading edge of the return, metres
+    back: Floats  # trailing edge of the return, metres
     distance: Floats  # metres
     energy: Floats
 
 
 @compiled()
-def join_full(echoes, left):
-    """Join the echoes of a pulse that overlap if one of them is full; marks those that are `left`.
+def join_full(pulses, remains):
+    """Join overlapping returns of a pulse where a return is full; mark the returns that remain.
 
-    Of joined echoes the highest is left, with the energy of all, and with the edges and the least
-    distance of the full ones, which are written.
+    Of joined returns the highest remains, with the energy of all joined returns, and with the edges
+    and the smallest distance of the full returns, which are written to `pulses`.
     """
-    height = echoes.height
-    front = echoes.front
-    back = echoes.back
-    full = echoes.full
+    height = pulses.height
+    front = pulses.front
+    back = pulses.back
+    full = pulses.full
     begin = 0
-    for k in range(len(echoes.ray)):
-        if echoes.ray[k] != echoes.ray[begin]:
+    for k in range(len(pulses.ray)):
+        if pulses.ray[k] != pulses.ray[begin]:
             begin = k
-        left[k] = True
+        remains[k] = True
         last = k
         for j in range(k - 1, begin - 1, -1):
-            if not (left[j] and (full[j] or full[last]) and back[j] >= front[last]):
+            if not (remains[j] and (full[j] or full[last]) and back[j] >= front[last]):
                 continue
             hidden = j
             if height[j] >= height[last]:
                 hidden = last
                 last = j
-            left[hidden] = False
-            echoes.energy[last] += echoes.energy[hidden]
+            remains[hidden] = False
+            pulses.energy[last] += pulses.energy[hidden]
             if full[hidden]:
                 front[last] = min(front[last], front[hidden])
                 back[last] = max(back[last], back[hidden])
-                echoes.distance[last] = min(echoes.distance[last], echoes.distance[hidden])
+                pulses.distance[last] = min(pulses.distance[last], pulses.distance[hidden])

@@ -216,21 +216,19 @@ class SceneCaster:
         static_distance = np.full(len(scan), np.inf)
         static_distance[static_hits.ray] = static_hits.distance
         nearest, shapes = self._nearest(scan, poses, static_distance)
-        ray = np.empty(len(scan), np.int64)
-        distance = np.empty(len(scan))
-        triangle = np.empty(len(scan), np.int32)
+        joined = surface_loops.JoinedHits(
+            np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
+        )
         count = surface_loops.merge(
             static_hits.ray,
             static_hits.triangle,
-            *nearest,
-            shapes.part_triangles,
-            shapes.shape,
-            self._actor_triangles,
-            ray,
-            distance,
-            triangle,
+            nearest,
+            surface_loops.ActorTriangles(
+                shapes.part_triangles, shapes.shape, self._actor_triangles
+            ),
+            joined,
         )
-        return _NearestHits(ray[:count], distance[:count], triangle[:count])
+        return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors."""

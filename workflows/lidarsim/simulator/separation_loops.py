@@ -11,10 +11,10 @@ import numpy as np
 from raybeam.compiled import compiled, inlined, stage
 
 from ..base.arrays import Bools, Floats, Ints
-from .pulse_loops import PulseHits, beam_of, continue_surfaces, scan_row
+from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes, as of `separation.MODES`
+ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes, in the order of `separation.MODES`
 
 
 class SubrayHits(NamedTuple):
@@ -28,18 +28,19 @@ class SubrayHits(NamedTuple):
 
 
 class Receiver(NamedTuple):
-    """What a receiver tells apart, detects and reports."""
+    """Resolution, detection and reporting of a receiver."""
 
     subrays: int  # of a beam
-    gap_m: float  # half of the pulse's length: what is closer is one return
+    gap_m: float  # half of the pulse's length: closer hits are one return
     mode: int  # which returns are reported
+    with_velocity: bool  # whether returns have velocities
     dropout: float  # share of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # the threshold in standard deviations of the noise
     quantiles: Floats  # of the normal distribution; empty without detection
 
 
-class MadeReturns(NamedTuple):
+class ReturnArrays(NamedTuple):
     """Arrays to which returns are written: (k,) each."""
 
     beam: Ints
@@ -48,9 +49,9 @@ class MadeReturns(NamedTuple):
     energy: Floats
     velocity: Floats  # radial, m/s
 
-    def first(self, count: int) -> MadeReturns:
+    def first(self, count: int) -> ReturnArrays:
         """Return copies of the first returns, which a loop has written."""
-        return MadeReturns(
+        return ReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
             self.distance[:count].copy(),
@@ -59,62 +60,228 @@ class MadeReturns(NamedTuple):
         )
 
 
-class _PulseScratch(NamedTuple):
-    """Memory for the hits of a beam, and of the returns that are made of them."""
+class _BeamRows(NamedTuple):
+    """Rows of the hits of a beam, on surfaces and in the air."""
 
+    start: int
+    stop: int
+    air_start: int
+    air_stop: int
+
+
+class _BeamScratch(NamedTuple):
+    """Scratch memory for the hits and returns of a beam."""
+
+    hits: PulseHits  # row[k, 0] is the row on surfaces, or -1, -2, … in the air
+    marks: SurfaceMarks
     energy: Floats
     velocity: Floats
-    solid: Bools
-    new: Bools  # whether a return begins at a hit
     shown: Bools  # whether the mode reports a return
 
 
 @stage
-def _most_hits(ray, subrays):
-    """Return the number of hits of a beam, at most."""
-    most = 0
+def _max_hits(ray, subrays):
+    """Return the largest number of hits of a beam."""
+    max_count = 0
     begin = 0
     end = -1
     for k in range(len(ray)):
         if ray[k] >= end:
             begin = k
             end = (beam_of(ray[k], subrays) + 1) * subrays
-        most = max(most, k + 1 - begin)
-    return most
+        max_count = max(max_count, k + 1 - begin)
+    return max_count
 
 
 @stage
 def _room_for_hits(size, subrays):
-    """Return memory for `size` hits of a beam."""
-    return PulseHits(
+    """Return scratch memory for up to `size` hits of a beam."""
+    pulse_hits = PulseHits(
         np.empty(size, np.int64),
         np.empty(size),
         np.empty((size, 2), np.int64),
         np.empty(size * subrays, np.int64),
         np.empty(size + 1, np.int64),
     )
-
-
-@stage
-def _scratch(size):
-    """Return memory for what else is known of `size` hits of a beam."""
-    return _PulseScratch(
+    starts_return = np.empty(size, np.bool_)
+    return _BeamScratch(
+        pulse_hits,
+        SurfaceMarks(np.empty(size, np.bool_), starts_return, starts_return),
         np.empty(size),
         np.empty(size),
-        np.empty(size, np.bool_),
-        np.empty(size, np.bool_),
         np.empty(size, np.bool_),
     )
 
 
 @inlined
-def _keep(made, k, count):
-    """Move a return to the end of those that are kept; returns their number then."""
-    made.beam[count] = made.beam[k]
-    made.row[count] = made.row[k]
-    made.distance[count] = made.distance[k]
-    made.energy[count] = made.energy[k]
-    made.velocity[count] = made.velocity[k]
+def _end_of_beam(ray, row, end_ray):
+    """Return the first row from `row` on whose sub-ray is not below `end_ray`."""
+    while row < len(ray) and ray[row] < end_ray:
+        row += 1
+    return row
+
+
+@inlined
+def _single_return(hits, rows, beam, receiver, count, output):
+    """Write the return of a beam if its hits on surfaces are within the receiver's gap.
+
+    Returns whether the hits are within the gap, and the number of returns that are written.
+    """
+    nearest_m = np.inf
+    farthest_m = -np.inf
+    best = rows.start
+    has_energy = False
+    sum_energy = 0.0
+    sum_distance = 0.0
+    sum_velocity = 0.0
+    for k in range(rows.start, rows.stop):
+        if hits.energy[k] > 0:
+            nearest_m = min(nearest_m, hits.distance[k])
+            farthest_m = max(farthest_m, hits.distance[k])
+            sum_energy += hits.energy[k]
+            sum_distance += hits.energy[k] * hits.distance[k]
+            if receiver.with_velocity:
+                sum_velocity += hits.energy[k] * hits.velocity[k]
+            if not has_energy or hits.energy[k] > hits.energy[best]:
+                best = k
+            has_energy = True
+    if not farthest_m - nearest_m <= receiver.gap_m:
+        return False, count
+    if has_energy:
+        output.beam[count] = beam
+        output.row[count] = best
+        output.distance[count] = sum_distance / sum_energy
+        output.energy[count] = sum_energy / receiver.subrays
+        if receiver.with_velocity:
+            output.velocity[count] = sum_velocity / sum_energy
+        count += 1
+    return True, count
+
+
+@inlined
+def _collect_hits(hits, air, rows, scratch):
+    """Write the hits of a beam that have energy to `scratch`, in the order of sub-rays.
+
+    Hits in the air come first in a sub-ray. Returns the number of hits, and the distance between
+    the nearest and the farthest hit, metres.
+    """
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    energy = scratch.energy
+    surface_row = rows.start
+    air_row = rows.air_start
+    count = 0
+    nearest_m = np.inf
+    farthest_m = -np.inf
+    while surface_row < rows.stop or air_row < rows.air_stop:
+        in_air = air_row < rows.air_stop
+        if in_air and (surface_row == rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
+            row[count, 0] = -1 - air_row
+            distance[count] = air.distance[air_row]
+            energy[count] = air.energy[air_row]
+            air_row += 1
+        else:
+            row[count, 0] = surface_row
+            distance[count] = hits.distance[surface_row]
+            energy[count] = hits.energy[surface_row]
+            surface_row += 1
+        if energy[count] > 0:
+            nearest_m = min(nearest_m, distance[count])
+            farthest_m = max(farthest_m, distance[count])
+            count += 1
+    return count, farthest_m - nearest_m
+
+
+@inlined
+def _sort_by_distance(pulse_hits, count):
+    """Sort the first hits of `pulse_hits` by distance; equally far hits keep their order."""
+    row = pulse_hits.row
+    distance = pulse_hits.distance
+    for k in range(1, count):
+        row_k = row[k, 0]
+        distance_k = distance[k]
+        index = k
+        while index > 0 and distance[index - 1] > distance_k:
+            row[index, 0] = row[index - 1, 0]
+            distance[index] = distance[index - 1]
+            index -= 1
+        row[index, 0] = row_k
+        distance[index] = distance_k
+
+
+@inlined
+def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
+    """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
+
+    `count` is the number of hits, and `apart` says whether hits are farther apart than the
+    receiver's gap. A surface that continues from sub-ray to sub-ray is in a single return.
+    """
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    solid = scratch.marks.solid
+    starts_return = scratch.marks.starts_return
+    several = False
+    surface_number = -1
+    number = 0
+    for k in range(count):
+        row_k = row[k, 0]
+        solid[k] = row_k >= 0 and hits.solid[row_k]
+        scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
+        scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
+        if receiver.with_velocity:
+            velocity_k = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
+            scratch.velocity[k] = velocity_k
+        starts_return[k] = k == 0 or (apart and distance[k] - distance[k - 1] > receiver.gap_m)
+        number += int(starts_return[k])
+        if solid[k]:  # surfaces can only continue if they are in several returns
+            several |= surface_number >= 0 and surface_number != number
+            surface_number = number
+    if several and len(neighbours.pairs):
+        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbours)
+
+
+@inlined
+def _write_returns(hit_count, beam, receiver, scratch, count, output):
+    """Write the returns of the first hits in `scratch`; return the number of written returns."""
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    starts_return = scratch.marks.starts_return
+    energy = scratch.energy
+    velocity = scratch.velocity
+    k = 0
+    while k < hit_count:
+        best = k
+        sum_energy = 0.0
+        sum_distance = 0.0
+        sum_velocity = 0.0
+        while True:
+            sum_energy += energy[k]
+            sum_distance += energy[k] * distance[k]
+            if receiver.with_velocity:
+                sum_velocity += energy[k] * velocity[k]
+            if energy[k] > energy[best]:
+                best = k
+            k += 1
+            if k == hit_count or starts_return[k]:
+                break
+        output.beam[count] = beam
+        output.row[count] = row[best, 0]
+        output.distance[count] = sum_distance / sum_energy
+        output.energy[count] = sum_energy / receiver.subrays
+        if receiver.with_velocity:
+            output.velocity[count] = sum_velocity / sum_energy
+        count += 1
+    return count
+
+
+@inlined
+def _keep(output, k, count):
+    """Move return `k` to the end of the `count` kept returns; return the new number of these."""
+    output.beam[count] = output.beam[k]
+    output.row[count] = output.row[k]
+    output.distance[count] = output.distance[k]
+    output.energy[count] = output.energy[k]
+    output.velocity[count] = output.velocity[k]
     return count + 1
 
 
@@ -122,19 +289,29 @@ def _keep(made, k, count):
 def _detected(energy, scan, beam, number, receiver, starts):
     """Return whether a return is detected, as `detection.detected` does."""
     quantiles = receiver.quantiles
-    seen = receiver.dropout == 0 or uniform(starts[0], scan, beam, number) >= receiver.dropout
-    if seen and receiver.threshold > 0:
+    detected = receiver.dropout == 0 or uniform(starts[0], scan, beam, number) >= receiver.dropout
+    if detected and receiver.threshold > 0:
         signal = receiver.threshold_sigmas * (energy / receiver.threshold - 1)
-        seen = signal + quantiles[0] > 0  # whatever is drawn
-        if not seen and signal + quantiles[-1] > 0:
-            drawn = np.int64(bits(starts[1], scan, beam, number) >> SHIFT_TO_INDEX)
-            seen = signal + quantiles[drawn] > 0
-    return seen
+        detected = signal + quantiles[0] > 0  # whatever is drawn
+        if not detected and signal + quantiles[-1] > 0:
+            index = np.int64(bits(starts[1], scan, beam, number) >> SHIFT_TO_INDEX)
+            detected = signal + quantiles[index] > 0
+    return detected
+
+
+@inlined
+def _keep_detected(begin, stop, scan, number_in_scan, receiver, starts, output):
+    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row."""
+    count = begin
+    for k in range(begin, stop):
+        if _detected(output.energy[k], scan, number_in_scan, k - begin, receiver, starts):
+            count = _keep(output, k, count)
+    return count
 
 
 @stage
 def _mark(energy, begin, stop, mode, shown):
-    """Mark what a mode reports of the returns of a pulse; of equally strong ones the nearest."""
+    """Mark which returns of a pulse a mode reports; the nearest of equally strong returns."""
     best = begin
     second = -1
     for k in range(begin + 1, stop):
@@ -151,9 +328,22 @@ def _mark(energy, begin, stop, mode, shown):
     shown[best] |= mode in (STRONGEST, DUAL)
 
 
+@inlined
+def _keep_reported(begin, stop, mode, scratch, output):
+    """Keep the returns of a beam that a mode reports; return the next free row."""
+    for k in range(begin, stop):
+        scratch.energy[k - begin] = output.energy[k]
+    _mark(scratch.energy, 0, stop - begin, mode, scratch.shown)
+    count = begin
+    for k in range(begin, stop):
+        if scratch.shown[k - begin]:
+            count = _keep(output, k, count)
+    return count
+
+
 @compiled()
-def reported(ray, energy, mode, shown):
-    """Mark what a mode reports of returns."""
+def mark_reported(ray, energy, mode, shown):
+    """Mark in `shown` (n,) which returns, in the order of rays, a mode reports."""
     begin = 0
     while begin < len(ray):
         stop = begin + 1
@@ -164,153 +354,48 @@ def reported(ray, energy, mode, shown):
 
 
 @compiled()
-def returns(hits, air, neighbours, receiver, keys, made):
-    """Make the returns of beams, see `separation.separated`; returns their number.
+def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - a compiled loop
+    """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
 
-    `hits` of surfaces and hits in the `air` are `SubrayHits`; `made` are `MadeReturns`.
+    `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
+    `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost.
+    Returns the number of returns.
     """
     subrays = receiver.subrays
-    gap_m = receiver.gap_m
-    moves = len(hits.velocity) + len(air.velocity) > 0
-    size = _most_hits(hits.ray, subrays) + _most_hits(air.ray, subrays)
-    pulse = _room_for_hits(size, subrays)
-    energy, velocity, solid, new, shown = _scratch(size)
-    row = pulse.row
-    distance = pulse.distance
-    i = 0
-    j = 0
+    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
+    scratch = _room_for_hits(size, subrays)
+    row = 0
+    air_row = 0
     count = 0
     scan_index = 0
-    while i < len(hits.ray) or j < len(air.ray):
-        beam = beam_of(hits.ray[i] if i < len(hits.ray) else air.ray[j], subrays)
-        if j < len(air.ray):
-            beam = min(beam, beam_of(air.ray[j], subrays))
-        end = (beam + 1) * subrays
-        last = i
-        last_air = j
-        while last < len(hits.ray) and hits.ray[last] < end:
-            last += 1
-        while last_air < len(air.ray) and air.ray[last_air] < end:
-            last_air += 1
+    while row < len(hits.ray) or air_row < len(air.ray):
+        beam = beam_of(hits.ray[row] if row < len(hits.ray) else air.ray[air_row], subrays)
+        if air_row < len(air.ray):
+            beam = min(beam, beam_of(air.ray[air_row], subrays))
+        end_ray = (beam + 1) * subrays
+        stop = _end_of_beam(hits.ray, row, end_ray)
+        air_stop = _end_of_beam(air.ray, air_row, end_ray)
+        rows = _BeamRows(row, stop, air_row, air_stop)
+        row = stop
+        air_row = air_stop
         begin = count
-        n = 0
-        nearest_m = np.inf
-        farthest_m = -np.inf
-        best = i
-        sum_energy = 0.0
-        sum_distance = 0.0
-        sum_velocity = 0.0
-        for k in range(i, last):
-            if hits.energy[k] > 0:
-                nearest_m = min(nearest_m, hits.distance[k])
-                farthest_m = max(farthest_m, hits.distance[k])
-                sum_energy += hits.energy[k]
-                sum_distance += hits.energy[k] * hits.distance[k]
-                if moves:
-                    sum_velocity += hits.energy[k] * hits.velocity[k]
-                if n == 0 or hits.energy[k] > hits.energy[best]:
-                    best = k
-                n += 1
-        if j == last_air and farthest_m - nearest_m <= gap_m:  # mostly one surface, and no air
-            i = last
-            if n == 0:
-                continue
-            made.beam[count] = beam
-            made.row[count] = best
-            made.distance[count] = sum_distance / sum_energy
-            made.energy[count] = sum_energy / subrays
-            if moves:
-                made.velocity[count] = sum_velocity / sum_energy
-            count += 1
-        else:
-            n = 0
-            nearest_m = np.inf
-            farthest_m = -np.inf
-            while i < last or j < last_air:  # what is in the air first
-                if j < last_air and (i == last or air.ray[j] <= hits.ray[i]):
-                    row[n, 0] = -1 - j
-                    distance[n] = air.distance[j]
-                    energy[n] = air.energy[j]
-                    j += 1
-                else:
-                    row[n, 0] = i
-                    distance[n] = hits.distance[i]
-                    energy[n] = hits.energy[i]
-                    i += 1
-                if energy[n] > 0:
-                    nearest_m = min(nearest_m, distance[n])
-                    farthest_m = max(farthest_m, distance[n])
-                    n += 1
-            if n == 0:
-                continue
-            apart = farthest_m - nearest_m > gap_m
-            for k in range(1, n if apart else 0):  # few beams hit an edge or graze a surface
-                row_k = row[k, 0]
-                distance_k = distance[k]
-                index = k
-                while index > 0 and distance[index - 1] > distance_k:
-                    row[index, 0] = row[index - 1, 0]
-                    distance[index] = distance[index - 1]
-                    index -= 1
-                row[index, 0] = row_k
-                distance[index] = distance_k
-            several = False
-            surface_number = -1
-            number = 0
-            for k in range(n):
-                row_k = row[k, 0]
-                solid[k] = row_k >= 0 and hits.solid[row_k]
-                pulse.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
-                energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
-                if moves:
-                    velocity[k] = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
-                new[k] = k == 0 or (apart and distance[k] - distance[k - 1] > gap_m)
-                number += int(new[k])
-                if solid[k]:  # surfaces can only continue if they are in several returns
-                    several |= surface_number >= 0 and surface_number != number
-                    surface_number = number
-            if several and len(neighbours.pairs):
-                continue_surfaces(0, n, new, new, solid, pulse, gap_m, subrays, neighbours)
-            k = 0
-            while k < n:  # a return
-                best = k
-                sum_energy = 0.0
-                sum_distance = 0.0
-                sum_velocity = 0.0
-                while True:
-                    sum_energy += energy[k]
-                    sum_distance += energy[k] * distance[k]
-                    if moves:
-                        sum_velocity += energy[k] * velocity[k]
-                    if energy[k] > energy[best]:
-                        best = k
-                    k += 1
-                    if k == n or new[k]:
-                        break
-                made.beam[count] = beam
-                made.row[count] = row[best, 0]
-                made.distance[count] = sum_distance / sum_energy
-                made.energy[count] = sum_energy / subrays
-                if moves:
-                    made.velocity[count] = sum_velocity / sum_energy
-                count += 1
-        stop = count
-        if len(keys.starts):  # those that are detected
-            scan_index = scan_row(keys.begins, keys.first + beam, scan_index)
+        single = False
+        if rows.air_start == rows.air_stop:  # mostly, there is one surface, and no hit in the air
+            single, count = _single_return(hits, rows, beam, receiver, count, output)
+        if not single:
+            hit_count, extent_m = _collect_hits(hits, air, rows, scratch)
+            apart = extent_m > receiver.gap_m
+            if apart:  # few beams hit an edge or graze a surface
+                _sort_by_distance(scratch.hits, hit_count)
+            _mark_returns(hits, air, hit_count, apart, receiver, neighbours, scratch)
+            count = _write_returns(hit_count, beam, receiver, scratch, count, output)
+        if len(keys.starts) and count > begin:
+            scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
+            number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
             scan = keys.scan + scan_index
-            number_in_scan = keys.first + beam - keys.begins[scan_index]
-            count = begin
-            for k in range(begin, stop):
-                number = k - begin
-                if _detected(made.energy[k], scan, number_in_scan, number, receiver, keys.starts):
-                    count = _keep(made, k, count)
-            stop = count
-        if receiver.mode != ALL and stop - begin > 1:
-            for k in range(begin, stop):
-                energy[k - begin] = made.energy[k]
-            _mark(energy, 0, stop - begin, receiver.mode, shown)
-            count = begin
-            for k in range(begin, stop):
-                if shown[k - begin]:
-                    count = _keep(made, k, count)
+            count = _keep_detected(
+                begin, count, scan, number_in_scan, receiver, keys.starts, output
+            )
+        if receiver.mode != ALL and count - begin > 1:
+            count = _keep_reported(begin, count, receiver.mode, scratch, output)
     return count

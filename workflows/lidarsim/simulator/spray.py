@@ -1,7 +1,7 @@
 """Spray: clumps of drops that vehicles leave behind them on wet ground.
 
 Each vehicle leaves a box of spray in every tenth of a second, as wide and high as itself, and as
-long as its way. It stays where it is, and what is in it falls to the ground.
+long as the vehicle drives meanwhile. A box stays where it is, and its drops fall to the ground.
 """
 
 from __future__ import annotations
@@ -13,41 +13,38 @@ import numpy as np
 
 from raybeam.moving import near_boxes
 
-from ..base.arrays import Floats, owned
+from ..base.arrays import Floats, Ints, owned
 from ..base.vectors import into_axes, length
 from ..columns.table import CAUSES
 from ..scene.actors import check_spray
 from ..sensor.random_numbers import Purpose
 from ..sensor.weather import FAINTEST, LARGE, reach, spray
 from .actor_trajectories import ActorTrajectories
-from .air import exponential, in_the_air, random_keys, reached, room_for_hits, seen_by_range
+from .air import add_air_hits, exponential, light_reach, random_keys, room_for_hits, seen_by_range
 from .motion import along_rings
-from .returns import OF_RETURNS, PulseReturns, joined, made, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, joined, required, returns_without_surface
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces
 
 if TYPE_CHECKING:
-    from .spray_loops import Crossings
+    from .spray_loops import Crossings, SprayBoxes
 
 SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
 SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
 SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
 SPRAY = CAUSES.index("spray")
-# time between boxes of a vehicle, and how many are there at a time
-BOX_NS = 1e8
-BOXES = 10
-# For how long, and when exp(-1) of it is left, as drops of a few tenths of a millimetre fall.
-LASTS_NS = BOXES * BOX_NS
-DECAY_NS = 4e8
-# speeds: of the stated density, and below which there is none
-FULL_M_S = 25.0
-LEAST_M_S = 3.0
+BOX_NS = 1e8  # time between boxes of a vehicle
+BOXES = 10  # boxes of a vehicle at a time
+LASTS_NS = BOXES * BOX_NS  # time after which a box is gone
+DECAY_NS = 4e8  # time in which exp(-1) of the spray is left: drops of a few 0.1 mm fall
+FULL_SPEED_M_S = 25.0  # speed at which spray has the stated density
+MIN_SPEED_M_S = 3.0  # speed below which there is no spray
 STEP_NS = 5e5  # for velocities
 
 
 class SprayStep(PulseStep):
-    """Finds where spray behind vehicles returns light, and takes light from what is behind it.
+    """Samples the returns of spray behind vehicles, and attenuates the light behind spray.
 
     Raises
     ------
@@ -58,7 +55,7 @@ class SprayStep(PulseStep):
     role = Role.CHANGES
     effects = ("Spray",)
     reads = "ray", "distance", "triangle", "energy", "cause", "velocity"
-    writes = *OF_RETURNS, "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
     causes = (SPRAY,)
     purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
 
@@ -74,110 +71,135 @@ class SprayStep(PulseStep):
         self._extinction = kind.extinction / LARGE
         self._step = 1 / kind.slope
         self._clumps = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
-        self._materials = surfaces.at(sensor.optics.wavelength_nm)
-        # Of each actor the lowest corner of its mesh, and halves of its sides: (a, 2, 3).
+        self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
+        # (actors, 2, 3): lowest corner of the box around a mesh, and halves of the box's sides.
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
-        self._sizes = np.array([(one.min(axis=0), np.ptp(one, axis=0) / 2) for one in meshes])
+        self._sizes = np.array([(mesh.min(axis=0), np.ptp(mesh, axis=0) / 2) for mesh in meshes])
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return whether spray is on, and an actor raises spray."""
         actors = setup.scene.actors
         return setup.survey.spray_g_m3 > 0 and any(actor.spray for actor in actors)
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `PulseStep.added`: of most pulses that meet spray."""
+        """Return the mean number of clumps in a pulse that meets spray."""
         return 1.0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: rays in the middles of beams, how far light gets, and clumps."""
+        """Return the memory of rays in the middles of beams, light and clumps, in bytes."""
         return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
+        """Return the hits of a batch after spray, which attenuates light and adds hits."""
         if self._clumps is None:
             return returns
         from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
 
-        each = batch.subrays_per_beam
-        count = (batch.stop - batch.start) * each
-        reach_m = reached(self._materials, self.surfaces, returns, count)
-        crossings = self._crossings(batch, reach_m.reshape(-1, each).max(axis=1))
+        subrays = batch.subrays_per_beam
+        count = (batch.stop - batch.start) * subrays
+        reach_m = light_reach(self._materials, self.surfaces, returns, count)
+        crossings = self._crossings(batch, reach_m.reshape(-1, subrays).max(axis=1))
         if not len(crossings.beam):
             return returns
-        energy = made(returns.energy).copy()
+        energy = required(returns.energy).copy()
         ray = returns.ray.astype(np.int64)
-        veiled = pulse_loops.SampledHits(ray, owned(returns.distance), energy)
-        spray_loops.veil(crossings, each, self._extinction, reach_m, veiled)
+        surface_hits = pulse_loops.SampledHits(ray, owned(returns.distance), energy)
+        spray_loops.attenuate(crossings, subrays, self._extinction, reach_m, surface_hits)
         batch.hits = returns = returns._replace(energy=energy)
+        clumps = self._sample_clumps(returns, batch, crossings, reach_m)
+        return add_air_hits(self.setup, returns, batch, clumps)
+
+    def _sample_clumps(
+        self, returns: PulseReturns, batch: PulseBatch, crossings: Crossings, reach_m: Floats
+    ) -> PulseReturns:
+        """Return the hits of clumps in the boxes that beams cross, in the order of sub-rays."""
+        from . import spray_loops
+
+        assert self._clumps is not None
         mean, by_range = self._clumps
         tables = spray_loops.ClumpTables(mean, by_range, self._step, exponential())
-        random = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
+        keys = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
         parts: list[PulseReturns] = []
         row = 0
         while row < len(crossings.beam):
             hits = room_for_hits(1024 + len(crossings.beam))
-            row, count = spray_loops.clumps(row, crossings, each, tables, random, reach_m, hits)
-            parts.append(unreal(returns, *hits.first(count), cause=SPRAY))
+            row, count = spray_loops.sample_clumps(
+                row, crossings, batch.subrays_per_beam, tables, keys, reach_m, hits
+            )
+            parts.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
         clumps = joined(parts)
-        clumps = clumps.take(np.argsort(clumps.ray, kind="stable"))
-        return in_the_air(self.setup, returns, batch, clumps)
+        return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
-    def _crossings(self, batch: PulseBatch, far: Floats) -> Crossings:
-        """Return where beams, which get so far (n,), cross boxes.
+    def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:
+        """Return where beams, which end at `reach_m` (n,), cross boxes.
 
-        Those of a beam follow each other, in the order of vehicles and times.
+        The crossings of a beam are consecutive, in the order of vehicles and times.
         """
         from . import spray_loops
 
         assert self._clumps is not None
-        place = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
-        times = batch.subray_poses.times(place * batch.subrays_per_beam)
-        boxes, there, density = self._boxes(
-            batch.subray_poses.actor_trajectories, times.min(), times.max()
+        ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
+        times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
+        spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
+        rays = np.concatenate(
+            [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
         )
-        rays = np.concatenate([one.T.take(place, axis=1) for one in batch.central_rays])
-        far = np.minimum(far[place], self._clumps[1][0, -1])
-        cell, which, size = near_boxes(rays, times, boxes, there, float(far.max()))
+        reach_m = np.minimum(reach_m[ring_order], self._clumps[1][0, -1])
+        cell, box, cell_rays = near_boxes(
+            rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
+        )
         order = np.argsort(cell, kind="stable")
-        pairs = spray_loops.CellPairs(cell[order], which[order], size)
-        spray_boxes = spray_loops.SprayBoxes(boxes, there, density, LASTS_NS, DECAY_NS)
+        pairs = spray_loops.CellPairs(cell[order], box[order], cell_rays)
         room = 0
-        count = 1 + size * len(cell) // 4
+        count = 1 + cell_rays * len(cell) // 4
         while room < count:  # mostly, some rays of a cell meet a box
             room = count
             crossings = spray_loops.Crossings(np.empty(room, np.int64), np.empty((3, room)))
-            count = spray_loops.cross(rays, times, far, pairs, spray_boxes, crossings)
+            count = spray_loops.find_crossings(rays, times, reach_m, pairs, spray_boxes, crossings)
         return spray_loops.Crossings(
-            place[crossings.beam[:count]], owned(crossings.spans[:, :count])
+            ring_order[crossings.beam[:count]], owned(crossings.spans[:, :count])
         )
 
-    def _boxes(
-        self, ways: ActorTrajectories, begin: float, end: float
-    ) -> tuple[Floats, Floats, Floats]:
-        """Boxes of spray, and when they are there, as of `near_boxes`; their densities (b,)."""
-        numbers = np.arange(math.floor(begin / BOX_NS) - BOXES, math.floor(end / BOX_NS) + 1)
-        some = np.array([number for number in self._raising if ways[number].moves], np.int64)
-        actor = np.repeat(some, len(numbers))
-        born = np.tile(BOX_NS * numbers, len(some))
-        since, last = ways.presence_ns[actor].T
-        at = np.maximum(born, np.maximum(since, 0.0) + STEP_NS)  # it came as it goes then
-        rows = np.flatnonzero((born <= end) & (at <= last))
-        actor = actor[rows]
-        born = born[rows]
-        at = at[rows]
-        places, turns = ways.poses(actor, at)
-        speed = (places - ways.poses(actor, at - STEP_NS)[0]) / (STEP_NS / 1e9)
-        metres = length(speed)
-        sides = turns.transpose(0, 2, 1)
-        low, half = self._sizes[actor].transpose(1, 0, 2).copy()
-        half[:, 0] = metres * (BOX_NS / 2e9)
-        middle = places + speed * ((born - at) / 1e9)[:, None] + into_axes(low + half, sides)
-        boxes = np.concatenate([middle, (sides * half[:, :, None]).reshape(-1, 9)], axis=1)
-        there = np.stack([np.maximum(born, since), born + LASTS_NS], axis=1)
-        fast = np.flatnonzero(metres >= LEAST_M_S)
-        density = self.setup.survey.wet * np.square(metres[fast] / FULL_M_S)
-        return boxes[fast], there[fast], density
+    def _boxes(self, trajectories: ActorTrajectories, begin_ns: float, end_ns: float) -> SprayBoxes:
+        """Return the boxes of spray that are in the scene between two times."""
+        from . import spray_loops
+
+        numbers = np.arange(math.floor(begin_ns / BOX_NS) - BOXES, math.floor(end_ns / BOX_NS) + 1)
+        moving = np.array([k for k in self._raising if trajectories[k].moves], np.int64)
+        actor = np.repeat(moving, len(numbers))
+        created_ns = np.tile(BOX_NS * numbers, len(moving))
+        first_ns, last_ns = trajectories.presence_ns[actor].T
+        # Before a vehicle is in the scene, it drives as when it appears.
+        known_ns = np.maximum(created_ns, np.maximum(first_ns, 0.0) + STEP_NS)
+        rows = np.flatnonzero((created_ns <= end_ns) & (known_ns <= last_ns))
+        created_ns = created_ns[rows]
+        first_ns = first_ns[rows]
+        boxes, speed_m_s = self._boxes_of(trajectories, actor[rows], created_ns, known_ns[rows])
+        presence_ns = np.stack([np.maximum(created_ns, first_ns), created_ns + LASTS_NS], axis=1)
+        fast = np.flatnonzero(speed_m_s >= MIN_SPEED_M_S)
+        density = self.setup.survey.wet * np.square(speed_m_s[fast] / FULL_SPEED_M_S)
+        return spray_loops.SprayBoxes(boxes[fast], presence_ns[fast], density, LASTS_NS, DECAY_NS)
+
+    def _boxes_of(
+        self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, known_ns: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the boxes that actors leave at times (b,), and the speeds of the actors, m/s.
+
+        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame. Poses
+        are taken at `known_ns`.
+        """
+        positions, rotations = trajectories.poses(actor, known_ns)
+        earlier, _ = trajectories.poses(actor, known_ns - STEP_NS)
+        velocity = (positions - earlier) / (STEP_NS / 1e9)
+        speed_m_s = length(velocity)
+        sides = rotations.transpose(0, 2, 1)
+        lowest, half_sides = self._sizes[actor].transpose(1, 0, 2).copy()
+        half_sides[:, 0] = speed_m_s * (BOX_NS / 2e9)
+        driven = velocity * ((created_ns - known_ns) / 1e9)[:, None]
+        middle = positions + driven + into_axes(lowest + half_sides, sides)
+        boxes = np.concatenate([middle, (sides * half_sides[:, :, None]).reshape(-1, 9)], axis=1)
+        return boxes, speed_m_s

@@ -8,22 +8,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, inlined, stage
 
 from ..base.arrays import Floats, Ints
 from ..base.elementary_loops import exp
+from .air_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-CLUMPS_MOST = 255  # clumps of spray that a beam meets: a ray has so many random numbers
+MAX_CLUMPS = 255  # clumps of spray that a beam meets: a ray has so many random numbers
 _GUIDE_PARTS = 1024  # parts of a table in which a column is looked up
 
 
 class CellPairs(NamedTuple):
-    """Cells of consecutive rays and boxes that may meet, in the order of cells: (p,) each."""
+    """Cells of consecutive rays and boxes that may meet, in the order of cells."""
 
-    cell: Ints
-    box: Ints
+    cell: Ints  # (p,)
+    box: Ints  # (p,)
     cell_rays: int  # rays of a cell
 
 
@@ -31,21 +32,21 @@ class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
     boxes: Floats  # (b, 12): middles, and halves of their sides as vectors
-    presence_ns: Floats  # (b, 2): when each is there
-    density: Floats  # (b,): at first
+    presence_ns: Floats  # (b, 2): first and last time of each box
+    density: Floats  # (b,): when the box is left behind
     lasts_ns: float  # time after which a box is gone
     decay_ns: float  # time in which exp(-1) of the density is left
 
 
 class Crossings(NamedTuple):
-    """Beams in boxes; those of a beam follow each other."""
+    """Crossings of beams and boxes; the crossings of a beam are consecutive."""
 
     beam: Ints  # (k,)
-    spans: Floats  # (3, k): where each enters and leaves a box, metres, and the density there
+    spans: Floats  # (3, k): where the beam enters and leaves the box, metres, and the box's density
 
 
 class ClumpTables(NamedTuple):
-    """Clumps of spray that may be detected, see `air.seen_by_range`."""
+    """Tables of clumps of spray that may be detected, see `air.DetectableParticles`."""
 
     mean: float  # clumps that a beam would meet at a density of 1
     by_range: Floats  # (5, shares): columns of equal shares of `mean`
@@ -53,22 +54,70 @@ class ClumpTables(NamedTuple):
     exponential: Floats  # quantiles of the exponential distribution
 
 
-@compiled()
-def cross(rays, times, reach, pairs, spray_boxes, crossings):
-    """Write where rays (6, n), which end at `reach` (n,), cross boxes, see `near_boxes`.
+@stage
+def _ball_radii(boxes):
+    """Return the radii of balls around boxes (b, 12): (b,), metres."""
+    radii = np.zeros(len(boxes))
+    for b in range(len(boxes)):
+        for side in range(3, 12):
+            radii[b] += boxes[b, side] * boxes[b, side]
+        radii[b] = 1.001 * np.sqrt(radii[b])
+    return radii
 
-    Returns the number of crossings, of which as many are written as there is room for.
+
+@inlined
+def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
+    """Return where a ray enters and leaves a box, metres, in this order if the ray meets the box.
+
+    `to_middle` is the vector from the ray's start to the middle of the box.
+    """
+    p, q, r = to_middle
+    u, v, w = direction
+    enters = 0.0
+    leaves = reach_m
+    for side in range(3, 12, 3):
+        x = boxes[b, side]
+        y = boxes[b, side + 1]
+        z = boxes[b, side + 2]
+        half = (x * x + y * y) + z * z
+        pace = (x * u + y * v) + z * w
+        middle = (x * p + y * q) + z * r
+        if pace != 0:
+            near_side = (middle - half) / pace
+            far_side = (middle + half) / pace
+            enters = max(enters, min(near_side, far_side))
+            leaves = min(leaves, max(near_side, far_side))
+        elif abs(middle) > half:
+            leaves = -1.0
+    return enters, leaves
+
+
+@inlined
+def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
+    """Write a crossing of beam `k` and a box, if `crossings` has room."""
+    if count < len(crossings.beam):
+        age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
+        enters, leaves = span
+        crossings.beam[count] = k
+        crossings.spans[0, count] = enters
+        crossings.spans[1, count] = leaves
+        density = spray_boxes.density[b] * exp(age_ns / spray_boxes.decay_ns)
+        crossings.spans[2, count] = density
+
+
+@compiled()
+def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: C901, PLR0914 - a compiled loop
+    """Write where rays (6, n), which end at `reach` (n,), metres, cross boxes; return the number.
+
+    Rows of rays are origins and directions; `pairs` are `CellPairs`. As many crossings are written
+    as `crossings` has room for.
     """
     boxes = spray_boxes.boxes
     presence_ns = spray_boxes.presence_ns
     cell = pairs.cell
     count = 0
     begin = 0
-    radii = np.zeros(len(boxes))
-    for b in range(len(boxes)):
-        for side in range(3, 12):
-            radii[b] += boxes[b, side] * boxes[b, side]
-        radii[b] = 1.001 * np.sqrt(radii[b])
+    radii = _ball_radii(boxes)
     while begin < len(cell):
         end = begin
         while end < len(cell) and cell[end] == cell[begin]:
@@ -78,43 +127,21 @@ def cross(rays, times, reach, pairs, spray_boxes, crossings):
             u = rays[3, k]
             v = rays[4, k]
             w = rays[5, k]
-            time = times[k]
             for pair in range(begin, end):
                 b = pairs.box[pair]
                 p = boxes[b, 0] - rays[0, k]
                 q = boxes[b, 1] - rays[1, k]
                 r = boxes[b, 2] - rays[2, k]
-                along = (p * u + q * v) + r * w
+                ahead = (p * u + q * v) + r * w
                 radius = radii[b]
-                aside = (p * p + q * q) + r * r - along * along
-                if aside > radius * radius or along > reach[k] + radius:
+                aside_square = (p * p + q * q) + r * r - ahead * ahead
+                if aside_square > radius * radius or ahead > reach[k] + radius:
                     continue  # the ray misses the ball around the box
-                if not presence_ns[b, 0] <= time <= presence_ns[b, 1]:
+                if not presence_ns[b, 0] <= times[k] <= presence_ns[b, 1]:
                     continue
-                enters = 0.0
-                leaves = reach[k]
-                for side in range(3, 12, 3):
-                    x = boxes[b, side]
-                    y = boxes[b, side + 1]
-                    z = boxes[b, side + 2]
-                    half = (x * x + y * y) + z * z
-                    along = (x * u + y * v) + z * w
-                    aside = (x * p + y * q) + z * r
-                    if along != 0:
-                        near_side = (aside - half) / along
-                        far_side = (aside + half) / along
-                        enters = max(enters, min(near_side, far_side))
-                        leaves = min(leaves, max(near_side, far_side))
-                    elif abs(aside) > half:
-                        leaves = -1.0
-                if enters < leaves:
-                    if count < len(crossings.beam):
-                        age_ns = presence_ns[b, 1] - spray_boxes.lasts_ns - time
-                        crossings.beam[count] = k
-                        crossings.spans[0, count] = enters
-                        crossings.spans[1, count] = leaves
-                        density = spray_boxes.density[b] * exp(age_ns / spray_boxes.decay_ns)
-                        crossings.spans[2, count] = density
+                span = _span_in_box(boxes, b, (p, q, r), (u, v, w), reach[k])
+                if span[0] < span[1]:
+                    _write_crossing(k, b, times[k], span, spray_boxes, crossings, count)
                     count += 1
         begin = end
     return count
@@ -129,84 +156,90 @@ def _column(ranges, guide, width_m, distance):
     return column
 
 
-@compiled()
-def clumps(k, crossings, subrays, tables, keys, reach, hits):
-    """Sample the clumps of spray that beams meet, from crossing `k` on, while there is room.
+@stage
+def _guide(ranges, width_m):
+    """Return columns at which the search of a distance starts, by parts of a width, metres."""
+    guide = np.zeros(_GUIDE_PARTS + 4, np.int64)
+    for part in range(1, len(guide)):
+        guide[part] = _column(ranges, guide[part - 1 :], np.inf, width_m * (part - 1))
+    return guide
 
-    Depths between clumps are exponential. `reach` is how far the light of sub-rays gets. Writes
-    `SampledHits`; returns the first crossing that is left, and the number of hits.
+
+@compiled()
+def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
+
+    `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
+    that the light of each sub-ray reaches, metres. Depths between clumps are exponential. Writes
+    `SampledHits`; returns the first crossing that is not sampled yet, and the number of hits.
     """
     beam = crossings.beam
     spans = crossings.spans
-    by_range = tables.by_range
     exponential = tables.exponential
     starts = keys.starts
-    ranges = by_range[0]
-    guide = np.zeros(_GUIDE_PARTS + 4, np.int64)
+    ranges = tables.by_range[0]
     width_m = ranges[-1] / _GUIDE_PARTS
     share = tables.mean / len(ranges)
-    for part in range(1, len(guide)):
-        guide[part] = _column(ranges, guide[part - 1 :], np.inf, width_m * (part - 1))
+    guide = _guide(ranges, width_m)
     count = 0
     row = 0
-    while k < len(beam) and count + CLUMPS_MOST <= len(hits.ray):
-        this = beam[k]
-        number_in_run = keys.first + this
-        row = scan_row(keys.begins, number_in_run, row if keys.begins[row] <= number_in_run else 0)
+    while k < len(beam) and count + MAX_CLUMPS <= len(hits.ray):
+        this_beam = beam[k]
+        key = keys.first + this_beam
+        row = scan_row(keys.scan_starts, key, row if keys.scan_starts[row] <= key else 0)
         scan = keys.scan + row
-        number = number_in_run - keys.begins[row]
+        number = key - keys.scan_starts[row]
         clump = 0
-        left = exponential[np.int64(bits(starts[0], scan, number, 0) >> SHIFT_TO_INDEX)]
+        depth = exponential[np.int64(bits(starts[0], scan, number, 0) >> SHIFT_TO_INDEX)]
         begin = k
-        most = 0.0
-        while k < len(beam) and beam[k] == this:  # most beams meet too little, by a rough bound
+        max_depth = 0.0  # in columns
+        while k < len(beam) and beam[k] == this_beam:
             first_part = min(spans[0, k] / width_m, _GUIDE_PARTS)
             last_part = min(spans[1, k] / width_m, _GUIDE_PARTS)
             columns = guide[np.int64(last_part) + 3] - guide[np.int64(first_part)]
-            most += spans[2, k] * columns
+            max_depth += spans[2, k] * columns
             k += 1
-        if left > 1.001 * most * share:
+        if depth > 1.001 * max_depth * share:  # most beams meet too little, by a rough bound
             continue
         k = begin
-        while k < len(beam) and beam[k] == this:
+        while k < len(beam) and beam[k] == this_beam:
             rate = spans[2, k] * share
             end = _column(ranges, guide, width_m, spans[1, k])
-            place = np.float64(_column(ranges, guide, width_m, spans[0, k]))  # in columns
-            while left < (end - place) * rate and clump < CLUMPS_MOST:
-                place += left / rate
-                column = np.int64(place)
-                ray = this * subrays
+            position = np.float64(_column(ranges, guide, width_m, spans[0, k]))  # in columns
+            while depth < (end - position) * rate and clump < MAX_CLUMPS:
+                position += depth / rate
+                column = np.int64(position)
+                ray = this_beam * subrays
                 if subrays > 1:
                     ray += np.int64(bits(starts[1], scan, number, clump) % np.uint64(subrays))
                 if ranges[column] < reach[ray]:
-                    rank = uniform(starts[2], scan, number, clump) * by_range[2, column]
-                    longer = tables.step_mm * exponential[np.int64(rank * len(exponential))]
-                    diameter = by_range[1, column] + longer
-                    light = by_range[3, column] * diameter * diameter
-                    hits.ray[count] = ray
-                    hits.distance[count] = ranges[column]
-                    hits.energy[count] = subrays * min(light, by_range[4, column])
+                    quantile = uniform(starts[2], scan, number, clump)
+                    write_particle(ray, column, quantile, subrays, tables, hits, count)
                     count += 1
                 clump += 1
-                left = exponential[np.int64(bits(starts[0], scan, number, clump) >> SHIFT_TO_INDEX)]
-            left -= (end - place) * rate
+                index = np.int64(bits(starts[0], scan, number, clump) >> SHIFT_TO_INDEX)
+                depth = exponential[index]
+            depth -= (end - position) * rate
             k += 1
     return k, count
 
 
 @compiled()
-def veil(crossings, subrays, extinction, reach, hits):
-    """Multiply the energies of `SampledHits` of surfaces by what spray before them leaves."""
+def attenuate(crossings, subrays, extinction, reach, hits):
+    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray.
+
+    `reach` (beams * subrays,) is the range that the light of each sub-ray reaches, metres.
+    """
     beam = crossings.beam
     spans = crossings.spans
-    first = np.full(len(reach) // subrays, len(beam))  # crossing of each beam
+    first = np.full(len(reach) // subrays, len(beam))  # first crossing of each beam
     for c in range(len(beam)):
         first[beam[c]] = min(c, first[beam[c]])
     for k in range(len(hits.ray)):
-        this = beam_of(hits.ray[k], subrays)
+        hit_beam = beam_of(hits.ray[k], subrays)
         depth = 0.0
-        c = first[this]
-        while c < len(beam) and beam[c] == this:
+        c = first[hit_beam]
+        while c < len(beam) and beam[c] == hit_beam:
             end = min(min(hits.distance[k], reach[hits.ray[k]]), spans[1, c])
             depth += spans[2, c] * max(end - spans[0, c], 0.0)
             c += 1

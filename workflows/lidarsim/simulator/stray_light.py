@@ -1,4 +1,4 @@
-"""Stray light: retro-reflectors beside a beam, of which its receiver gets a little."""
+"""Stray light: a receiver gets a little light of retro-reflectors beside its beam."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,164 +14,207 @@ from ..base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
 from ..base.vectors import into_axes, length, products, turned
 from ..columns.table import CAUSES
 from ..scene.scene import Scene
+from ..sensor.materials import MaterialTable
 from ..sensor.random_numbers import Purpose
 from .detection import passes
-from .returns import OF_RETURNS, PulseReturns, merged, unreal
+from .returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .scene_caster import SceneCaster
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .surfaces import Surfaces, light_of
 
+if TYPE_CHECKING:
+    from .stray_loops import RayCells, RetroTriangles, StrayLight
+
 STRAY = Purpose(22, "noise of stray light's energy")
 BLOOMING = CAUSES.index("blooming")
-TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
-CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
-FAINTEST = 0.1  # of the threshold: less is never detected, see `detected`
+NEAREST_TRIANGLES = 4  # triangles of a cluster that are compared with a ray
+CLUSTER_M = 1.0  # size of a cluster of triangles, which are compared with rays together
+FAINTEST = 0.1  # of the threshold: fainter light is never detected, see `detected`
 
 
 class StrayLightStep(PulseStep):
-    """Adds the light of retro-reflectors that beams beside them receive."""
+    """Adds stray light of retro-reflectors beside beams."""
 
     role = Role.RECEIVES
     effects = ("Blooming",)
     reads = "ray", "distance"
-    writes = OF_RETURNS
+    writes = RETURN_COLUMNS
     causes = (BLOOMING,)
     purposes = (STRAY,)
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._light = light_of(setup.survey, setup.sensor)
-        self._retros = [*_retros(setup.scene, surfaces)]
+        self._clusters = [*_retro_clusters(setup.scene, surfaces)]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return whether the noise of the sensor has stray light."""
         return setup.noise.stray_light > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `PulseStep.memory`: a cause of each return, and rays."""
+        """Return the memory of a cause of each return, and of rays, in bytes."""
         return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
-        if not self._retros:
+        """Return the returns of a batch with the returns of stray light."""
+        if not self._clusters:
             return returns
-        from . import stray_loops  # not before: numba takes half a second to import
-
-        rays = np.arange(batch.start, batch.stop)
-        poses = batch.subray_poses
-        origins, directions = batch.central_rays
-        times = poses.times((rays - batch.start) * batch.subrays_per_beam)
-        # seen from the origins
-        best = np.zeros(len(rays))
-        ends = np.zeros((len(rays), 3))
         noise = self.setup.noise
         sensor = self.setup.sensor
-        extinction = self._light.extinction
-        low = sensor.min_range_m
-        high = sensor.max_range_m
-        faintest = FAINTEST * noise.threshold
-        limits = low, noise.stray_light, faintest, extinction
-        few = np.zeros(TRIANGLES_NEAR, np.int64)
-        table = self.surfaces.at(self._light.wavelength_nm)
-        for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
-            turns = None
-            places = np.zeros(3)
-            if actor is not None:
-                places, turns = poses.actor_trajectories[actor].poses(0, times)
-            seen = into_axes(origins - places, turns), into_axes(directions, turns)
-            beams = [owned(vectors.T) for vectors in seen]
-            cells = np.empty((-(-len(rays) // stray_loops.CELL_RAYS), 5))
-            stray_loops.cones(*beams, cells)
-            new = np.zeros(len(rays), np.bool_)
-            for retro in retros:
-                one = np.ones(len(retro.triangles))
-                # What they return of a beam that hits them at a distance of 10 m.
-                back = table.scattered(self.surfaces.kinds(retro.triangles), one, one)
-                given = *retro.places, back, few, *limits
-                stray_loops.leaks(*beams, cells, *given, best, ends, new)
-            if turns is not None:  # back to the axes of the scene
-                rows = np.flatnonzero(new)
-                ends[rows] = into_axes(ends[rows], turns[rows].transpose(0, 2, 1))
-        row = np.flatnonzero(best > faintest)
-        row = row[passes(noise, STRAY, best[row], *batch.keys.of(rays[row]))]
-        distance = np.sqrt(products(ends[row].T, ends[row].T))
-        within = (distance >= low) & (distance <= high)
-        row = row[within]
-        distance = distance[within]
-        free = self.caster.is_visible(
-            origins[row], ends[row], distance, times[row], poses.actor_trajectories
+        rays = np.arange(batch.start, batch.stop)
+        times = batch.subray_poses.times((rays - batch.start) * batch.subrays_per_beam)
+        light = self._strongest(batch, times)
+        row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
+        scan, number = batch.keys.scan_and_number(rays[row])
+        row = row[passes(noise, STRAY, light.energy[row], scan, number)]
+        distance = np.sqrt(products(light.points[row].T, light.points[row].T))
+        in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
+        row = row[in_range]
+        distance = distance[in_range]
+        origins, _ = batch.central_rays
+        trajectories = batch.subray_poses.actor_trajectories
+        visible = self.caster.is_visible(
+            origins[row], light.points[row], distance, times[row], trajectories
         )
-        free &= ~self._beside(returns, rays[row], distance)
-        row = row[free]
-        return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
+        visible &= ~self._has_return(returns, rays[row], distance)
+        row = row[visible]
+        stray = returns_without_surface(
+            returns, rays[row], distance[visible], light.energy[row], BLOOMING
+        )
+        return merged(returns, stray)
 
-    def _beside(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
+    def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
+        """Return the strongest stray light of the rays in the middles of beams."""
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        origins, directions = batch.central_rays
+        count = batch.stop - batch.start
+        light = stray_loops.StrayLight(
+            np.zeros(count), np.zeros((count, 3)), np.zeros(count, np.bool_)
+        )
+        limits = stray_loops.StrayLimits(
+            float(self.setup.sensor.min_range_m),
+            float(self.setup.noise.stray_light),
+            float(FAINTEST * self.setup.noise.threshold),
+            float(self._light.extinction),
+        )
+        chosen = np.zeros(NEAREST_TRIANGLES, np.int64)
+        table = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        for actor, clusters in groupby(self._clusters, key=lambda cluster: cluster.actor):
+            rotations = None
+            positions = np.zeros(3)
+            if actor is not None:
+                positions, rotations = batch.subray_poses.actor_trajectories[actor].poses(0, times)
+            cells = _ray_cells(
+                into_axes(origins - positions, rotations), into_axes(directions, rotations)
+            )
+            light.new[:] = False
+            for cluster in clusters:
+                triangles = self._triangles(cluster, table)
+                stray_loops.find_stray_light(cells, triangles, limits, chosen, light)
+            if rotations is not None:  # back to the scene frame
+                rows = np.flatnonzero(light.new)
+                to_scene = rotations[rows].transpose(0, 2, 1)
+                light.points[rows] = into_axes(light.points[rows], to_scene)
+        return light
+
+    def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
+        """Return the triangles of a cluster for loops."""
+        from .stray_loops import RetroTriangles
+
+        white = np.ones(len(cluster.triangles))
+        back = table.scattered(self.surfaces.kinds(cluster.triangles), white, white)
+        return RetroTriangles(cluster.corners, *cluster.bounds, back)
+
+    def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Return whether a ray (n,) has a return within the receiver's gap of a distance: (n,)."""
         first = np.searchsorted(returns.ray, ray, side="left")
         last = np.searchsorted(returns.ray, ray, side="right")
-        beside = np.zeros(len(ray), np.bool_)
+        close = np.zeros(len(ray), np.bool_)
         for number in range(int((last - first).max(initial=0))):
-            some = np.flatnonzero(first + number < last)
-            own = returns.distance[first[some] + number]
-            beside[some] |= np.abs(own - distance[some]) <= self.setup.half_pulse_m
-        return beside
+            rows = np.flatnonzero(first + number < last)
+            return_distance = returns.distance[first[rows] + number]
+            close[rows] |= np.abs(return_distance - distance[rows]) <= self.setup.half_pulse_m
+        return close
+
+
+def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
+    """Return rays (n, 3) for loops, with cones around cells of rays."""
+    from . import stray_loops
+
+    cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
+    cells = stray_loops.RayCells(owned(origins.T), owned(directions.T), cones)
+    stray_loops.bound_cells(*cells)
+    return cells
+
+
+class _Bounds(NamedTuple):
+    """Bounds of triangles."""
+
+    middles: Floats  # (k, 3)
+    centre: Floats  # (3,): of a ball around the triangles
+    radius: float  # of the ball, metres
 
 
 @dataclass(frozen=True)
-class _Retro:
-    """Triangles of retro-reflectors that are near to each other."""
+class _RetroCluster:
+    """A cluster of triangles of retro-reflectors."""
 
-    triangles: Ints32  # (k,): their numbers
-    corners: Floats  # (k, 3, 3): in the scene's axes, or those of an actor
+    triangles: Ints32  # (k,): numbers
+    corners: Floats  # (k, 3, 3): in the scene frame, or in the frame of an actor
     actor: int | None = None
 
     @cached_property
-    def places(self) -> tuple[Floats, Floats, Floats, float]:
-        """Return corners, middles, and the middle and the radius of a ball around them."""
+    def bounds(self) -> _Bounds:
+        """Middles of the triangles, and a ball around the triangles."""
         a, b, c = self.corners.transpose(1, 0, 2)
-        middle = self.corners.reshape(-1, 3).mean(axis=0)
-        radius = float(length(self.corners.reshape(-1, 3) - middle).max())
-        return self.corners, ((a + b) + c) / 3, middle, radius
+        centre = self.corners.reshape(-1, 3).mean(axis=0)
+        radius = float(length(self.corners.reshape(-1, 3) - centre).max())
+        return _Bounds(((a + b) + c) / 3, centre, radius)
 
 
-def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
-    """Retro-reflectors of a scene, its instances and actors."""
+def _retro_clusters(scene: Scene, surfaces: Surfaces) -> Iterator[_RetroCluster]:
+    """Yield the retro-reflectors of a scene, its instances and actors, in clusters."""
     retro = surfaces.materials.retro
     owners = surfaces.material_kinds.object
-    of_object = np.zeros(len(scene.all_names), np.bool_)  # whether an object has some
-    of_object[owners[retro]] = True
+    has_retro = np.zeros(len(scene.all_names), np.bool_)  # by objects
+    has_retro[owners[retro]] = True
 
-    def those_of(faces: Integers, vertices: Floats, first: int, actor: int | None = None) -> Any:
-        """Clusters of the retro-reflectors among triangles that are numbered from `first` on."""
+    def clusters_of(
+        faces: Integers, vertices: Floats, first: int, actor: int | None = None
+    ) -> Iterator[_RetroCluster]:
+        """Yield the clusters of faces, whose triangles are numbered from `first` on."""
         rows = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
         return _clusters(first + rows, vertices[faces[rows]], actor)
 
-    if of_object[: len(scene.names)].any():
-        yield from those_of(scene.faces, scene.vertices, 0)
-    begin = len(scene.faces)
+    if has_retro[: len(scene.names)].any():
+        yield from clusters_of(scene.faces, scene.vertices, 0)
+    first = len(scene.faces)
     shared = scene.instances
     if shared is not None:
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
             mesh = shared.parts[part]
-            if of_object[owner]:
+            if has_retro[owner]:
                 vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
-                yield from those_of(mesh.faces, vertices, begin)
-            begin += len(mesh.faces)
+                yield from clusters_of(mesh.faces, vertices, first)
+            first += len(mesh.faces)
     for number, actor in enumerate(scene.actors):
         faces = actor.mesh.faces
-        if of_object[len(scene.names) + number]:
-            yield from those_of(faces, actor.mesh.vertices, begin, number)
-        begin += len(faces)
+        if has_retro[len(scene.names) + number]:
+            yield from clusters_of(faces, actor.mesh.vertices, first, number)
+        first += len(faces)
 
 
-def _clusters(triangles: Integers, corners: Floats, actor: int | None = None) -> Iterator[_Retro]:
-    """Divide triangles into some that are near to each other."""
+def _clusters(
+    triangles: Integers, corners: Floats, actor: int | None = None
+) -> Iterator[_RetroCluster]:
+    """Divide triangles into clusters, by the cells of a grid."""
     if not len(triangles):
         return
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)
-    which = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-    for number in range(int(which.max()) + 1):
-        some = np.flatnonzero(which == number)
-        yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
+    cluster = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    for number in range(int(cluster.max()) + 1):
+        rows = np.flatnonzero(cluster == number)
+        yield _RetroCluster(triangles[rows].astype(np.int32), corners[rows], actor)

@@ -5,203 +5,323 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
 from raybeam.embree_rays import any_axes
 
+from ..base.arrays import Bools, Floats, Ints
 from ..base.elementary_loops import arctan2, sin_cos
 from ..sensor.optics import LIGHT_M_NS
 from .surface_loops import at_right_angles
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
-STRAY_MOST = math.radians(30.0)  # no stray light comes from farther aside
-INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
+MAX_STRAY = math.radians(30.0)  # largest angle to a ray from which stray light comes
+# Share of the way from an edge to the middle of a triangle, by which rays to the edge are moved
+# inwards, to hit the triangle.
+INWARDS = 0.02
+
+
+class RayCells(NamedTuple):
+    """Rays, and cones around cells of `CELL_RAYS` consecutive rays."""
+
+    origins: Floats  # (3, n)
+    directions: Floats  # (3, n)
+    cones: Floats  # (c, 5): axis, half angle, and how far origins move, metres
+
+
+class RetroTriangles(NamedTuple):
+    """A cluster of triangles of retro-reflectors."""
+
+    corners: Floats  # (t, 3, 3)
+    middles: Floats  # (t, 3)
+    centre: Floats  # (3,): of a ball around the triangles
+    radius: float  # of the ball, metres
+    back: Floats  # (t,): light that a triangle returns of a beam at a distance of 10 m
+
+
+class StrayLimits(NamedTuple):
+    """Limits of stray light."""
+
+    min_range_m: float
+    share: float  # stray light at an angle of a degree, by the light within the beam
+    faintest: float  # smallest energy that may be detected
+    extinction: float  # 1/m
+
+
+class StrayLight(NamedTuple):
+    """Strongest stray light of rays, to which loops write."""
+
+    energy: Floats  # (n,)
+    points: Floats  # (n, 3): where the light comes from, as seen from the rays' origins
+    new: Bools  # (n,): whether the light was written
+
+
+class SpotPairs(NamedTuple):
+    """Pairs of a spot and the rays that may see the spot: (p,) each."""
+
+    spot: Ints
+    first: Ints  # first and last rays, as rows of `ReceivingRays.order`
+    stop: Ints
+
+
+class ReceivingRays(NamedTuple):
+    """Rays of a receiver."""
+
+    order: Ints  # (n,): rows in the order of firing times
+    fired_ns: Floats  # (n,)
+    origins: Floats  # (n, 3)
+    directions: Floats  # (n, 3)
+
+
+class LitSpots(NamedTuple):
+    """Spots on surfaces, lit by pulses of foreign sensors."""
+
+    time_ns: Floats  # (s,)
+    positions: Floats  # (s, 3)
+
+
+class ReceptionLimits(NamedTuple):
+    """Limits of the pulses that a receiver gets."""
+
+    cosine: float  # of the largest angle between a ray and a spot
+    min_range_m: float
+    max_range_m: float
+
+
+class ReceivedSpots(NamedTuple):
+    """Arrays to which loops write rays that receive the light of spots: (k,) each."""
+
+    row: Ints  # of the ray
+    spot: Ints
+    distance: Floats  # at which the spot seems to be, metres
+    range_m: Floats  # at which the spot is
+
+    def first(self, count: int) -> ReceivedSpots:
+        """Return the first rows, which a loop has written."""
+        return ReceivedSpots(
+            self.row[:count], self.spot[:count], self.distance[:count], self.range_m[:count]
+        )
 
 
 @inlined
 def _angle(cosine):
-    """Angle with a cosine, which may be rounded."""
+    """Return the angle of a cosine, which may be rounded beyond 1."""
     cosine = min(max(cosine, -1.0), 1.0)
     return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
 
 
 @compiled()
-def cones(starts, ahead, out):
-    """Write cones around cells of rays (3, n), (c, 5): axis, half angle, and how far they move."""
-    count = starts.shape[1]
-    for c in range(len(out)):
-        begin = c * CELL_RAYS
-        end = min((c + 1) * CELL_RAYS, count)
-        x = y = z = far = 0.0
-        for k in range(begin, end):
-            x = x + ahead[0, k]
-            y = y + ahead[1, k]
-            z = z + ahead[2, k]
-            a = starts[0, k] - starts[0, begin]
-            b = starts[1, k] - starts[1, begin]
-            d = starts[2, k] - starts[2, begin]
-            far = max(far, (a * a + b * b) + d * d)
+def bound_cells(origins, directions, cones):
+    """Write cones (c, 5) around cells of rays (3, n), see `RayCells`."""
+    count = origins.shape[1]
+    for c in range(len(cones)):
+        first = c * CELL_RAYS
+        stop = min((c + 1) * CELL_RAYS, count)
+        x = y = z = max_square = 0.0
+        for k in range(first, stop):
+            x = x + directions[0, k]
+            y = y + directions[1, k]
+            z = z + directions[2, k]
+            a = origins[0, k] - origins[0, first]
+            b = origins[1, k] - origins[1, first]
+            d = origins[2, k] - origins[2, first]
+            max_square = max(max_square, (a * a + b * b) + d * d)
         length = max(math.sqrt((x * x + y * y) + z * z), 1e-9)
         x = x / length
         y = y / length
         z = z / length
-        least = 1.0
-        for k in range(begin, end):
-            least = min(least, (x * ahead[0, k] + y * ahead[1, k]) + z * ahead[2, k])
-        out[c, 0] = x
-        out[c, 1] = y
-        out[c, 2] = z
-        out[c, 3] = _angle(least)
-        out[c, 4] = math.sqrt(far)
+        min_cosine = 1.0
+        for k in range(first, stop):
+            cosine = (x * directions[0, k] + y * directions[1, k]) + z * directions[2, k]
+            min_cosine = min(min_cosine, cosine)
+        cones[c, 0] = x
+        cones[c, 1] = y
+        cones[c, 2] = z
+        cones[c, 3] = _angle(min_cosine)
+        cones[c, 4] = math.sqrt(max_square)
 
 
 @stage
-def _nearest(corners, t, ray):
-    """Find where a triangle is nearest to a ray by angle, seen from its start, and its tangent.
+def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
+    """Return the tangent of the angle between a ray and a triangle, and the nearest point.
 
-    That is -1 if the triangle is not in front of the ray.
+    The point is seen from the ray's origin. The tangent is 0 if the ray meets the triangle, and -1
+    if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
-    (a, b, c, d, e, f), best, place = any_axes(dx, dy, dz), np.inf, (0.0, 0.0, 0.0)
-    left = right = True
-    for one in range(3):
-        other = one + 1 if one < 2 else 0
-        # Of the two corners: seen from the start, depth, and place on a plane at a distance of 1.
-        px = corners[t, one, 0] - ox
-        py = corners[t, one, 1] - oy
-        pz = corners[t, one, 2] - oz
-        qx = corners[t, other, 0] - ox
-        qy = corners[t, other, 1] - oy
-        qz = corners[t, other, 2] - oz
-        p = (px * dx + py * dy) + pz * dz
-        q = (qx * dx + qy * dy) + qz * dz
-        if not (p > 0 and q > 0):
-            return -1.0, place
-        x = ((px * a + py * b) + pz * c) / p
-        y = ((px * d + py * e) + pz * f) / p
-        u = ((qx * a + qy * b) + qz * c) / q - x
-        v = ((qx * d + qy * e) + qz * f) / q - y
-        turn = x * v - y * u
-        left = left and turn >= 0
-        right = right and turn <= 0
-        along = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
-        off = math.sqrt((x + along * u) * (x + along * u) + (y + along * v) * (y + along * v))
-        if off < best:
+    a, b, c, d, e, f = any_axes(dx, dy, dz)
+    min_tangent = np.inf
+    nearest = (0.0, 0.0, 0.0)
+    all_left = True
+    all_right = True
+    for corner in range(3):
+        next_corner = corner + 1 if corner < 2 else 0
+        # p and q are the two corners as seen from the origin, p_depth and q_depth their depths; on
+        # a plane at a distance of 1, (x, y) is the first corner, and (u, v) leads to the second.
+        px = corners[t, corner, 0] - ox
+        py = corners[t, corner, 1] - oy
+        pz = corners[t, corner, 2] - oz
+        qx = corners[t, next_corner, 0] - ox
+        qy = corners[t, next_corner, 1] - oy
+        qz = corners[t, next_corner, 2] - oz
+        p_depth = (px * dx + py * dy) + pz * dz
+        q_depth = (qx * dx + qy * dy) + qz * dz
+        if not (p_depth > 0 and q_depth > 0):
+            return -1.0, nearest
+        x = ((px * a + py * b) + pz * c) / p_depth
+        y = ((px * d + py * e) + pz * f) / p_depth
+        u = ((qx * a + qy * b) + qz * c) / q_depth - x
+        v = ((qx * d + qy * e) + qz * f) / q_depth - y
+        cross_product = x * v - y * u
+        all_left = all_left and cross_product >= 0
+        all_right = all_right and cross_product <= 0
+        step = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
+        tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
+        if tangent < min_tangent:
             # A step on the plane is not the same share of the way between the corners.
-            share = along * p / (along * p + (1 - along) * q)
-            place = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
-            best = off
-    return (0.0 if left or right else best), place
+            share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
+            nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
+            min_tangent = tangent
+    return (0.0 if all_left or all_right else min_tangent), nearest
+
+
+@inlined
+def _cosine_of_reach(rays, c, triangles, limits):
+    """Return whether a cell of rays may receive light of triangles, and the cosine of their angle.
+
+    The angle is between a ray and the centre of the triangles, at which the light of the nearest
+    triangle becomes too faint.
+    """
+    cones = rays.cones
+    first = c * CELL_RAYS
+    x = triangles.centre[0] - rays.origins[0, first]
+    y = triangles.centre[1] - rays.origins[1, first]
+    z = triangles.centre[2] - rays.origins[2, first]
+    size = triangles.radius + cones[c, 4]
+    distance = math.sqrt((x * x + y * y) + z * z)
+    half_size = math.pi
+    axis_angle = 0.0
+    if distance > size:
+        sine = size / distance
+        half_size = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
+        axis_angle = _angle(((cones[c, 0] * x + cones[c, 1] * y) + cones[c, 2] * z) / distance)
+    nearest_m = max(distance - size, max(limits.min_range_m, 1e-3))
+    in_beam = triangles.back[0] * at_right_angles(nearest_m, limits.extinction)
+    reach = math.radians(math.sqrt(limits.share / (limits.faintest / max(in_beam, 1e-300))))
+    reach = min(reach, MAX_STRAY) + half_size
+    _, cosine = sin_cos(min(reach, math.pi))
+    return axis_angle <= cones[c, 3] + reach, cosine
+
+
+@inlined
+def _choose_triangles(middles, ray, chosen):
+    """Write the triangles whose middles are nearest to a ray by angle; return their number."""
+    ox, oy, oz, dx, dy, dz = ray
+    count = min(len(middles), len(chosen))
+    for number in range(count):
+        chosen[number] = number
+    if len(middles) > count:
+        for number in range(count):
+            max_cosine = -2.0
+            for t in range(len(middles)):
+                is_chosen = False
+                for earlier in range(number):
+                    is_chosen |= chosen[earlier] == t
+                x = middles[t, 0] - ox
+                y = middles[t, 1] - oy
+                z = middles[t, 2] - oz
+                cosine = (x * dx + y * dy) + z * dz
+                cosine = cosine / math.sqrt((x * x + y * y) + z * z)
+                if not is_chosen and cosine > max_cosine:
+                    max_cosine = cosine
+                    chosen[number] = t
+    return count
+
+
+@inlined
+def _add_light(k, t, ray, triangles, limits, strongest):
+    """Write the light of a triangle to ray `k` if the light is stronger than the `strongest`."""
+    middles = triangles.middles
+    tangent, nearest = _nearest_point(triangles.corners, t, ray)
+    angle = math.degrees(arctan2(tangent, 1.0))
+    if 0 < angle < math.degrees(MAX_STRAY):
+        x = nearest[0] + INWARDS * ((middles[t, 0] - ray[0]) - nearest[0])
+        y = nearest[1] + INWARDS * ((middles[t, 1] - ray[1]) - nearest[1])
+        z = nearest[2] + INWARDS * ((middles[t, 2] - ray[2]) - nearest[2])
+        distance = math.sqrt((x * x + y * y) + z * z)
+        in_beam = triangles.back[t] * at_right_angles(distance, limits.extinction)
+        energy = min(limits.share / (angle * angle), 1.0) * in_beam
+        if energy > strongest.energy[k]:
+            strongest.energy[k] = energy
+            strongest.new[k] = True
+            strongest.points[k, 0] = x
+            strongest.points[k, 1] = y
+            strongest.points[k, 2] = z
 
 
 @compiled()
-def leaks(starts, ahead, cells, corners, middles, middle, radius, back, few, nearest_m, share,
-          faintest, extinction, best, ends, new):  # fmt: skip
-    """Keep where rays (3, n) receive more light of near triangles than `best` (n,), and mark them.
+def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
+    """Write the light of `triangles` to rays where the light is stronger than the `strongest`.
 
-    `back` (t,) is what triangles at a distance of 10 m return of a beam. The light comes from the
-    point of the triangles that is nearest to a ray by angle, which is written to `ends` (n, 3). Of
-    many triangles, those nearest to a ray are asked, as many as `few` has room for.
+    `rays` are `RayCells`, `triangles` `RetroTriangles`, `limits` `StrayLimits`, and `strongest` is
+    `StrayLight`. The light comes from the point of the triangles that is nearest to a ray by angle.
+    `chosen` is scratch memory: the triangles nearest to a ray are compared, as many as its size.
     """
-    count = starts.shape[1]
-    triangles = len(corners)
-    for c in range(len(cells)):
-        begin = c * CELL_RAYS
-        end = min((c + 1) * CELL_RAYS, count)
-        x = middle[0] - starts[0, begin]
-        y = middle[1] - starts[1, begin]
-        z = middle[2] - starts[2, begin]
-        size = radius + cells[c, 4]
-        far = math.sqrt((x * x + y * y) + z * z)
-        wide = math.pi
-        off = 0.0
-        if far > size:
-            sine = size / far
-            wide = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
-            off = _angle(((cells[c, 0] * x + cells[c, 1] * y) + cells[c, 2] * z) / far)
-        # The angle at which the light becomes too faint.
-        whole = back[0] * at_right_angles(max(far - size, max(nearest_m, 1e-3)), extinction)
-        reach = math.radians(math.sqrt(share / (faintest / max(whole, 1e-300))))
-        reach = min(reach, STRAY_MOST) + wide
-        if off > cells[c, 3] + reach:
+    centre = triangles.centre
+    origins = rays.origins
+    directions = rays.directions
+    count = origins.shape[1]
+    for c in range(len(rays.cones)):
+        in_reach, cosine = _cosine_of_reach(rays, c, triangles, limits)
+        if not in_reach:
             continue
-        _, cosine = sin_cos(min(reach, math.pi))
-        for k in range(begin, end):
-            x = middle[0] - starts[0, k]
-            y = middle[1] - starts[1, k]
-            z = middle[2] - starts[2, k]
-            ox = starts[0, k]
-            oy = starts[1, k]
-            oz = starts[2, k]
-            dx = ahead[0, k]
-            dy = ahead[1, k]
-            dz = ahead[2, k]
+        for k in range(c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)):
+            ox = origins[0, k]
+            oy = origins[1, k]
+            oz = origins[2, k]
+            dx = directions[0, k]
+            dy = directions[1, k]
+            dz = directions[2, k]
+            x = centre[0] - ox
+            y = centre[1] - oy
+            z = centre[2] - oz
             if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
                 continue
-            chosen = min(triangles, len(few))
-            for number in range(chosen):
-                few[number] = number
-            if triangles > chosen:  # those whose middles are nearest
-                for number in range(chosen):
-                    most = -2.0
-                    for t in range(triangles):
-                        taken = False
-                        for before in range(number):
-                            taken |= few[before] == t
-                        x = middles[t, 0] - ox
-                        y = middles[t, 1] - oy
-                        z = middles[t, 2] - oz
-                        towards = (x * dx + y * dy) + z * dz
-                        towards = towards / math.sqrt((x * x + y * y) + z * z)
-                        if not taken and towards > most:
-                            most = towards
-                            few[number] = t
-            for number in range(chosen):
-                t = few[number]
-                off, place = _nearest(corners, t, (ox, oy, oz, dx, dy, dz))
-                angle = math.degrees(arctan2(off, 1.0))
-                if not 0 < angle < math.degrees(STRAY_MOST):
-                    continue
-                x = place[0] + INWARDS * ((middles[t, 0] - ox) - place[0])
-                y = place[1] + INWARDS * ((middles[t, 1] - oy) - place[1])
-                z = place[2] + INWARDS * ((middles[t, 2] - oz) - place[2])
-                distance = math.sqrt((x * x + y * y) + z * z)
-                energy = min(share / (angle * angle), 1.0) * (
-                    back[t] * at_right_angles(distance, extinction)
-                )
-                if energy > best[k]:
-                    best[k] = energy
-                    new[k] = True
-                    ends[k, 0] = x
-                    ends[k, 1] = y
-                    ends[k, 2] = z
+            ray = (ox, oy, oz, dx, dy, dz)
+            for number in range(_choose_triangles(triangles.middles, ray, chosen)):
+                _add_light(k, chosen[number], ray, triangles, limits, strongest)
 
 
 @compiled()
-def received(spots, low, high, order, fired, starts, ahead, times, places, cosine, nearest_m,
-             farthest_m, row, spot, distance, far):  # fmt: skip
-    """Write rays that receive the light of spots, from where it seems to come; returns how many.
+def receive(pairs, rays, spots, limits, output):
+    """Write rays that receive the light of spots to `output`, `ReceivedSpots`; return their number.
 
-    Rays `order[low]` to `order[high]` may see each of `spots` (k,). Starts, directions and places
-    are (n, 3); times are nanoseconds, of firing and of when the spots are lit.
+    `pairs` are `SpotPairs`, `rays` `ReceivingRays`, `spots` `LitSpots`, and `limits`
+    `ReceptionLimits`. The distance of a spot is that of a pulse which the ray would have sent.
     """
+    origins = rays.origins
+    directions = rays.directions
+    positions = spots.positions
     count = 0
-    for pair in range(len(spots)):
-        s = spots[pair]
-        for k in range(low[pair], high[pair]):
-            r = order[k]
-            x = places[s, 0] - starts[r, 0]
-            y = places[s, 1] - starts[r, 1]
-            z = places[s, 2] - starts[r, 2]
-            away = math.sqrt((x * x + y * y) + z * z)
-            along = (x * ahead[r, 0] + y * ahead[r, 1]) + z * ahead[r, 2]
-            seems = (times[s] + away / LIGHT_M_NS - fired[r]) * (LIGHT_M_NS / 2)
-            if away > 0 and along >= cosine * away and nearest_m <= seems <= farthest_m:
-                row[count] = r
-                spot[count] = s
-                distance[count] = seems
-                far[count] = away
+    for pair in range(len(pairs.spot)):
+        s = pairs.spot[pair]
+        for k in range(pairs.first[pair], pairs.stop[pair]):
+            r = rays.order[k]
+            x = positions[s, 0] - origins[r, 0]
+            y = positions[s, 1] - origins[r, 1]
+            z = positions[s, 2] - origins[r, 2]
+            range_m = math.sqrt((x * x + y * y) + z * z)
+            ahead = (x * directions[r, 0] + y * directions[r, 1]) + z * directions[r, 2]
+            delay_ns = spots.time_ns[s] + range_m / LIGHT_M_NS - rays.fired_ns[r]
+            distance = delay_ns * (LIGHT_M_NS / 2)
+            in_view = range_m > 0 and ahead >= limits.cosine * range_m
+            if in_view and limits.min_range_m <= distance <= limits.max_range_m:
+                output.row[count] = r
+                output.spot[count] = s
+                output.distance[count] = distance
+                output.range_m[count] = range_m
                 count += 1
     return count

@@ -1,14 +1,17 @@
-"""Loops over hits: what surfaces they are on, how these lie, and what light they send back."""
+"""Loops over hits: surfaces of hits, their normals, and the light that surfaces send back or on."""
 
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from raybeam.compiled import compiled, inlined
 from raybeam.rays import UNIT_SLACK
 
+from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ..base.elementary_loops import exp, sin_cos
 from ..sensor.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
 from ..sensor.materials import fresnel as fresnel_of_arrays
@@ -18,236 +21,377 @@ fresnel = inlined(fresnel_of_arrays)
 within_water = inlined(within_water_of_arrays)
 
 
+class TriangleNumbers(NamedTuple):
+    """Numbers of triangles: faces of the scene, then of instances, then of actors."""
+
+    instance_starts: Ints  # (i + 1,): first triangle of each instance, and of actors
+    owners: Ints32  # (f + a + 1,): objects of the triangles of faces and actors; the last is -1
+    instance_objects: Ints32  # (i,)
+    instance_rows: Ints  # (i,): stored row of the first triangle of each instance
+    actor_shifts: Ints  # (actors,): from numbers of an actor's triangles to stored rows
+    static_objects: int  # number of objects that are no actors
+
+
+class TriangleOwners(NamedTuple):
+    """Owners of triangles: (n,) each."""
+
+    row: Ints  # among the stored triangles, which actors and instances share
+    object: Ints32
+    instance: Ints  # or -1
+
+
+class HitSurfaces(NamedTuple):
+    """Surfaces of hits: (n,) each."""
+
+    row: Ints  # of the normal among stored triangles, or `~row` among deformed triangles
+    kind: Ints32  # of the surface
+    instance: Ints  # or -1
+    run: Ints  # row of the actor's pose, or -1; empty without actors
+
+
+class NormalTables(NamedTuple):
+    """Normals of triangles, and the rotations of instances and actors."""
+
+    stored: Floats32  # (f, 3): unit normals of stored triangles
+    deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
+    instances: Floats  # (i, 3, 3): from normals of parts to normals of instances, of any length
+    poses: Floats  # (12, m): of actors, by runs: position, and rotation by rows
+
+
+class Incidence(NamedTuple):
+    """Incidence of rays on surfaces."""
+
+    normals: Floats  # (3, n): unit normals
+    cosines: Floats  # (n,): products of normals and directions, of either sign
+    back: Floats  # (n,): light that is sent back at a distance of 10 m
+
+
+class WaterFilm(NamedTuple):
+    """Water on surfaces."""
+
+    level: float  # smallest z of the normal, on the visible side, of surfaces that hold water
+    wet: float  # share of these surfaces that is below water
+    dry: Bools  # (kinds,): whether a kind of surface stays dry
+
+
+class OnwardOptics(NamedTuple):
+    """Optics of kinds of surfaces: (kinds,) each."""
+
+    specular: Floats  # share of light that is mirrored at normal incidence
+    passes: Bools  # whether light passes as through glass
+    straight: Bools  # whether light is not refracted
+    leafy: Bools  # whether the surface bounds leaves, and sends nothing back
+
+
+class OnwardHits(NamedTuple):
+    """Hits from which light goes on: (n,) each."""
+
+    kind: Ints32
+    cosines: Floats  # of either sign
+    film: Bools  # whether there may be water; empty without water
+    share: Floats  # of the light that arrives, out and back
+    distance: Floats  # metres
+
+
+class OnwardLimits(NamedTuple):
+    """Water and detection of light that goes on."""
+
+    wet: float  # share of surfaces with a film that is below water
+    brightest: float  # largest energy at a distance of 10 m
+    extinction: float  # 1/m
+    faintest: float  # light that can return no more energy is dropped
+
+
+class ActorTriangles(NamedTuple):
+    """Numbers of the triangles of actors."""
+
+    parts: Ints32  # (shapes, parts): first triangle of each part of a shape
+    shape: Ints  # (actors,)
+    firsts: Ints32  # (actors,): first triangle of each actor
+
+
+class JoinedHits(NamedTuple):
+    """Arrays to which the nearest hits are written: (n,) each."""
+
+    ray: Ints
+    distance: Floats  # metres
+    triangle: Ints32
+
+
+class TrackTable(NamedTuple):
+    """Straight tracks among trajectories, with their segments in the order of tracks."""
+
+    member: Ints  # (w,): number among the tracks of each trajectory, -1 for other trajectories
+    first: Ints  # (t,): first segment of each track
+    segments: Ints  # (t,): number of segments of each track
+    # (4, t): seconds: start by the track's clock, first and last time of its poses, and how far
+    # outside these a time may be; inf for any time.
+    limits: Floats
+    times: Floats  # (s,): start of each segment, seconds
+    start: Floats  # (3, s), and the following as `Track.segments`
+    speed: Floats  # (3, s)
+    rotation: Floats  # (3, 9, s)
+    rates: Floats  # (s,)
+
+
 @inlined
 def _product(x, y, z, a, b, c):
-    """As `motion.products`."""
+    """Return a scalar product, in the order of `vectors.products`."""
     return (x * a + y * b) + z * c
 
 
 @inlined
-def _instance(t, begins):
-    """Find the last instance whose triangles begin at or before one, by halves."""
-    low = 0
-    high = len(begins) - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if begins[middle] <= t:
-            low = middle
+def _instance_of(t, instance_starts):
+    """Return the instance that contains a triangle, by binary search."""
+    lower = 0
+    upper = len(instance_starts) - 1
+    while upper - lower > 1:
+        middle = (lower + upper) // 2
+        if instance_starts[middle] <= t:
+            lower = middle
         else:
-            high = middle
-    return low
+            upper = middle
+    return lower
 
 
 @compiled()
-def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
-    """Write rows among the triangles that are kept once, objects, and instances or -1.
+def find_owners(triangle, numbers, output):
+    """Write the stored rows, objects and instances of triangles (n,) to `output`, `TriangleOwners`.
 
-    Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
-    and `firsts` are objects and first rows of instances.
+    `numbers` are `TriangleNumbers`.
     """
-    plain = begins[0]
-    actors = begins[-1]
+    starts = numbers.instance_starts
+    owners = numbers.owners
+    rows = output.row
+    objects = output.object
+    instances = output.instance
+    face_count = starts[0]
+    actors_start = starts[-1]
     for k in range(len(triangle)):
         t = np.int64(triangle[k])
-        which[k] = -1
-        if t < plain:
+        instances[k] = -1
+        if t < face_count:
             rows[k] = t
             objects[k] = owners[t]
-        elif t >= actors:
-            owner = owners[t - (actors - plain)]
-            rows[k] = t + to_kept[owner - standing]
+        elif t >= actors_start:
+            owner = owners[t - (actors_start - face_count)]
+            rows[k] = t + numbers.actor_shifts[owner - numbers.static_objects]
             objects[k] = owner
         else:
-            low = _instance(t, begins)
-            rows[k] = firsts[low] + t - begins[low]
-            objects[k] = shared[low]
-            which[k] = low
+            i = _instance_of(t, starts)
+            rows[k] = numbers.instance_rows[i] + t - starts[i]
+            objects[k] = numbers.instance_objects[i]
+            instances[k] = i
+
+
+@inlined
+def _instance_normal(matrices, i, x, y, z):
+    """Return the unit normal of an instance, rounded in the order of columns.cu."""
+    a = _product(matrices[i, 0, 0], matrices[i, 0, 1], matrices[i, 0, 2], x, y, z)
+    b = _product(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2], x, y, z)
+    c = _product(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2], x, y, z)
+    length = np.sqrt((a * a + b * b) + c * c)
+    return a / length, b / length, c / length
+
+
+@inlined
+def _actor_normal(poses, run, x, y, z):
+    """Return a normal rotated by the pose (12, m) of a run."""
+    a = _product(poses[3, run], poses[4, run], poses[5, run], x, y, z)
+    b = _product(poses[6, run], poses[7, run], poses[8, run], x, y, z)
+    c = _product(poses[9, run], poses[10, run], poses[11, run], x, y, z)
+    return a, b, c
 
 
 @compiled()
-def meet(
-    rows, kinds, which, directions, turns, table, own, run, poses, reflectance, retro,
-    normals, along, back,
-):  # fmt: skip
-    """Write unit normals (3, n), their products with directions (3, n), and light sent back.
+def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
+    """Write how rays with directions (3, n) meet surfaces to `output`, `Incidence`.
 
-    Normals in `table` (f, 3), or `own` at `~row` for rows below 0, are turned by
-    instances, and by poses (12, m) of each `run`. The light
-    is what surfaces send back that are neither textured nor rough, at a distance of 10 m. No view
-    of an array is made: it would be counted, which takes five times as long as all the rest.
+    `hits` are `HitSurfaces`, `tables` `NormalTables`; `reflectance` and `retro` are by kinds of
+    surfaces. The light that is sent back is that of surfaces that are neither textured nor rough.
+    No view of an array is made: a view would be counted, which takes five times as long as the
+    rest of the loop.
     """
+    rows = hits.row
+    kinds = hits.kind
+    instances = hits.instance
+    run = hits.run
+    stored = tables.stored
+    deformed = tables.deformed
+    normals = output.normals
+    cosines = output.cosines
+    back = output.back
     for k in range(len(rows)):
         row = rows[k]
-        i = which[k]
+        i = instances[k]
         kind = kinds[k]
         if row >= 0:
-            x = table[row, 0]
-            y = table[row, 1]
-            z = table[row, 2]
+            x = stored[row, 0]
+            y = stored[row, 1]
+            z = stored[row, 2]
         else:
-            x = own[~row, 0]
-            y = own[~row, 1]
-            z = own[~row, 2]
+            x = deformed[~row, 0]
+            y = deformed[~row, 1]
+            z = deformed[~row, 2]
         x = np.float64(x)
         y = np.float64(y)
         z = np.float64(z)
-        if i >= 0:  # in one order of rounding, that of columns.cu
-            a = _product(turns[i, 0, 0], turns[i, 0, 1], turns[i, 0, 2], x, y, z)
-            b = _product(turns[i, 1, 0], turns[i, 1, 1], turns[i, 1, 2], x, y, z)
-            c = _product(turns[i, 2, 0], turns[i, 2, 1], turns[i, 2, 2], x, y, z)
-            length = np.sqrt((a * a + b * b) + c * c)
-            x = a / length
-            y = b / length
-            z = c / length
+        if i >= 0:
+            x, y, z = _instance_normal(tables.instances, i, x, y, z)
         if len(run) and run[k] >= 0:
-            p = run[k]
-            x, y, z = (
-                _product(poses[3, p], poses[4, p], poses[5, p], x, y, z),
-                _product(poses[6, p], poses[7, p], poses[8, p], x, y, z),
-                _product(poses[9, p], poses[10, p], poses[11, p], x, y, z),
-            )
+            x, y, z = _actor_normal(tables.poses, run[k], x, y, z)
         cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
         normals[0, k] = x
         normals[1, k] = y
         normals[2, k] = z
-        along[k] = cosine
+        cosines[k] = cosine
         back[k] = reflectance[kind] * (RETRO_GAIN if retro[kind] else abs(cosine))
 
 
 @inlined
 def at_right_angles(distance, extinction):
-    """As `materials.at_right_angles`, of one distance."""
-    far = max(distance, NEAREST_M)
-    nearer = REFERENCE_M / far
+    """Return the energy of white surfaces at normal incidence, as `materials.at_right_angles`."""
+    range_m = max(distance, NEAREST_M)
+    nearer = REFERENCE_M / range_m
     nearer = nearer * nearer
-    return nearer * exp(-2 * extinction * far) if extinction else nearer
+    return nearer * exp(-2 * extinction * range_m) if extinction else nearer
 
 
 @compiled()
 def fade(distance, extinction, energy):
-    """Multiply energies by what `at_right_angles` says of distances."""
+    """Multiply energies (n,) by `at_right_angles` of their distances (n,)."""
     for k in range(len(energy)):
         energy[k] *= at_right_angles(distance[k], extinction)
 
 
 @compiled()
-def soak(up, along, kinds, dry, shares, level, wet, film, back):
-    """Mark where there may be water, and multiply the light sent back by what is below it.
+def soak(up, cosines, kinds, shares, water, film, back):
+    """Mark hits where there may be water in `film`, and multiply their light by that below water.
 
-    It is where z of the normals `up`, of the side that is seen, is at least `level`, but on kinds
-    of surfaces that are `dry`; `shares` of light are scattered.
+    `up` are z of the normals, `shares` the shares of light that surfaces scatter, `water` is a
+    `WaterFilm`, and `back` the light that is sent back: (n,) each.
     """
+    level = water.level
+    wet = water.wet
+    dry = water.dry
     for k in range(len(up)):
-        upright = up[k] if along[k] < 0 else -up[k]
+        upright = up[k] if cosines[k] < 0 else -up[k]
         film[k] = upright >= level and not dry[kinds[k]]
         if film[k]:
-            mirrored = fresnel(abs(along[k]), WATER_INDEX)
+            mirrored = fresnel(abs(cosines[k]), WATER_INDEX)
             back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
 
 
 @compiled()
-def onward(
-    on, off, kinds, along, shares, wet, film, before, distance, specular, passes, straight, leafy,
-    brightest, extinction, faintest, share,
-):  # fmt: skip
-    """Find what light goes on from rows `on` of hits, through surfaces or `off` them.
+def divide_light(rows, reflected, hits, shares, optics, limits, share):
+    """Write the share of light that goes on from `rows` of hits, through surfaces or reflected.
 
-    Where light is not `straight`, it is refracted: what a surface mirrors is then neither taken off
-    nor alone. A share `wet` of what has a `film` is below water. Light that can return no more than
-    `faintest` is dropped: writes the other rows, and the `share` that is left of that `before`, out
-    and back; returns how many.
+    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`; `shares` (k,) are
+    the shares of light that surfaces scatter. Where light is refracted, a surface's mirrored light
+    is neither taken off nor alone. Light that is too faint is dropped: overwrites `rows` and
+    `reflected` by the remaining light, and writes its `share`, out and back. Returns the number of
+    rows.
     """
     count = 0
-    for j in range(len(on)):
-        k = on[j]
-        kind = kinds[k]
-        cosine = abs(along[k])
-        first = specular[kind]
+    for j in range(len(rows)):
+        k = rows[j]
+        kind = hits.kind[k]
+        cosine = abs(hits.cosines[k])
+        first = optics.specular[kind]
         grazing = 1 - min(cosine, 1.0)
         square = grazing * grazing
-        mirrors = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
-        if passes[kind]:
-            mirrors = fresnel(cosine, GLASS_INDEX)
-        goes = mirrors if off[j] else 1 - mirrors if passes[kind] else 1.0
-        goes = goes if straight[kind] else 1.0
-        goes *= 1.0 if leafy[kind] else 1 - shares[j]
-        if len(film) and film[k]:
-            goes = (1 - wet) * goes + wet * fresnel(cosine, WATER_INDEX)
-        goes = before[k] * (goes * goes)
-        if goes * (brightest * at_right_angles(distance[k], extinction)) > faintest:
-            on[count] = k
-            off[count] = off[j]
-            share[count] = goes
+        mirrored = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
+        if optics.passes[kind]:
+            mirrored = fresnel(cosine, GLASS_INDEX)
+        onward = mirrored if reflected[j] else 1 - mirrored if optics.passes[kind] else 1.0
+        onward = onward if optics.straight[kind] else 1.0
+        onward *= 1.0 if optics.leafy[kind] else 1 - shares[j]
+        if len(hits.film) and hits.film[k]:
+            onward = (1 - limits.wet) * onward + limits.wet * fresnel(cosine, WATER_INDEX)
+        onward = hits.share[k] * (onward * onward)
+        brightest = limits.brightest * at_right_angles(hits.distance[k], limits.extinction)
+        if onward * brightest > limits.faintest:
+            rows[count] = k
+            reflected[count] = reflected[j]
+            share[count] = onward
             count += 1
     return count
 
 
 @compiled()
-def set_off(origins, directions, step, away, starts, ahead):
-    """Write where light starts `away` from its ends, and make its directions units; all (3, n)."""
-    for k in range(len(step)):
-        for axis in range(3):
-            end = origins[axis, k] + step[k] * directions[axis, k]
-            starts[axis, k] = end + away[k] * ahead[axis, k]
-        x = ahead[0, k]
-        y = ahead[1, k]
-        z = ahead[2, k]
-        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does, for all at a time
-            most = max(max(abs(x), abs(y)), abs(z))
-            x = x / most
-            y = y / most
-            z = z / most
-            length = np.sqrt((x * x + y * y) + z * z)
-            ahead[0, k] = x / length
-            ahead[1, k] = y / length
-            ahead[2, k] = z / length
+def start_behind(origins, directions, step_m, clear_m, starts, onward):
+    """Write where light starts `clear_m` (n,) behind its ends, and normalise its directions.
 
-
-@compiled()
-def times(ray, start, subrays, begins, delays, out):
-    """Write when rays are fired, of which `subrays` are of a beam, from beam `start` on."""
-    low = 0
-    firing = -1
-    each = len(delays)
-    for k in range(len(ray)):  # they follow each other
-        beam = start + ray[k] // subrays
-        if firing < 0 or not low <= beam < low + each:
-            firing = int(beam // each)
-            low = firing * each
-        out[k] = begins[firing] + delays[beam - low]
-
-
-@compiled()
-def merge(
-    ray, triangle, nearest, body, instance, on_body, parts, shape, firsts, out, out_m, out_triangle
-):
-    """Write hits in the order of rays, those on bodies in place of others; returns how many.
-
-    `nearest` and those after it are as of `raybeam.crossing.Nearest`, of all rays; triangles of
-    bodies begin at `firsts`, and those of their `parts` from there, by `shape`.
+    The light ends `step_m` (n,) from `origins` along `directions`, and goes on along `onward`,
+    which becomes unit vectors; `starts` is written. Vectors are (3, n).
     """
+    for k in range(len(step_m)):
+        for axis in range(3):
+            end = origins[axis, k] + step_m[k] * directions[axis, k]
+            starts[axis, k] = end + clear_m[k] * onward[axis, k]
+        x = onward[0, k]
+        y = onward[1, k]
+        z = onward[2, k]
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does for all rays
+            largest = max(max(abs(x), abs(y)), abs(z))
+            x = x / largest
+            y = y / largest
+            z = z / largest
+            length = np.sqrt((x * x + y * y) + z * z)
+            onward[0, k] = x / length
+            onward[1, k] = y / length
+            onward[2, k] = z / length
+
+
+@compiled()
+def firing_times(ray, start, subrays, firing_starts, delays, times):
+    """Write the firing times of rays (n,), of which `subrays` are of a beam, from beam `start` on.
+
+    `firing_starts` are by firings, `delays` by the beams of a firing.
+    """
+    first_beam = 0
+    firing = -1
+    channels = len(delays)
+    for k in range(len(ray)):  # mostly, rays are consecutive
+        beam = start + ray[k] // subrays
+        if firing < 0 or not first_beam <= beam < first_beam + channels:
+            firing = int(beam // channels)
+            first_beam = firing * channels
+        times[k] = firing_starts[firing] + delays[beam - first_beam]
+
+
+@compiled()
+def merge(ray, triangle, nearest, actors, output):
+    """Write the nearest hits of rays, on static bodies and actors, to `output`, `JoinedHits`.
+
+    `ray` and `triangle` (k,) are hits on static bodies, in the order of rays. `nearest` are the
+    nearest hits of all rays on actors, `raybeam.crossing.Nearest`, with distances to static bodies
+    for rays that miss all actors; `actors` are `ActorTriangles`. Returns the number of hits.
+    """
+    bodies = nearest.body
     i = 0
     count = 0
-    for k in range(len(body)):
-        own = body[k]
+    for k in range(len(bodies)):
+        actor = bodies[k]
         hit = i < len(ray) and ray[i] == k
-        if own >= 0:
-            out_triangle[count] = on_body[k] + parts[shape[own], instance[k]] + firsts[own]
+        if actor >= 0:
+            part_triangle = actors.parts[actors.shape[actor], nearest.instance[k]]
+            output.triangle[count] = nearest.triangle[k] + part_triangle + actors.firsts[actor]
         elif hit:
-            out_triangle[count] = triangle[i]
+            output.triangle[count] = triangle[i]
         i += int(hit)
-        if hit or own >= 0:
-            out[count] = k
-            out_m[count] = nearest[k]
+        if hit or actor >= 0:
+            output.ray[count] = k
+            output.distance[count] = nearest.distance[k]
             count += 1
     return count
 
 
 @compiled()
-def runs(number, times, first, run):
-    """Write for each actor's time its run, and the first of each; returns how many runs.
+def find_runs(number, times, first, run):
+    """Write the run of each row, and the first row of each run; return the number of runs.
 
-    In a run, actors and times are equal; numbers below 0 are in none.
+    In a run, actors and times are equal; rows with actors below 0 have the run -1.
     """
     count = 0
     last = -1
@@ -263,46 +407,57 @@ def runs(number, times, first, run):
     return count
 
 
-@compiled()
-def on_tracks(
-    number, times_ns, member, first, count, limits, times, start, speed, turn, rates, out
-):
-    """Write poses (12, n) on straight tracks, with the operations of `Track.poses`.
+@inlined
+def _segment_at(tracks, track, time_s):
+    """Return the last segment of a track that has started at a time, by binary search."""
+    segment = tracks.first[track]
+    room = tracks.segments[track] - 1
+    while room:
+        half = (room + 1) // 2
+        if tracks.times[segment + half] <= time_s:
+            segment = segment + half
+            room = room - half
+        else:
+            room = half - 1
+    return segment
 
-    Returns the first row whose time is not within its track, or -1; leaves other ways out.
+
+@inlined
+def _write_pose(tracks, segment, elapsed_s, poses, k):
+    """Write the pose `elapsed_s` after the start of a segment to column `k` of `poses`."""
+    for axis in range(3):
+        poses[axis, k] = tracks.speed[axis, segment] * elapsed_s + tracks.start[axis, segment]
+    sine, cosine = sin_cos(elapsed_s * tracks.rates[segment])
+    for part in range(9):
+        poses[3 + part, k] = (
+            tracks.rotation[0, part, segment] + sine * tracks.rotation[1, part, segment]
+        ) + cosine * tracks.rotation[2, part, segment]
+
+
+@compiled()
+def poses_on_tracks(number, times_ns, tracks, poses):
+    """Write poses (12, n) of trajectories on straight tracks, with the operations of `Track.poses`.
+
+    `number` (n,) are trajectories, and `tracks` is a `TrackTable`; other trajectories are left out.
+    Returns the first row whose time is outside of its track, or -1.
     """
+    limits = tracks.limits
     for k in range(len(number)):
-        way = member[number[k]]
-        if way < 0:
+        track = tracks.member[number[k]]
+        if track < 0:
             continue
         if k and number[k] == number[k - 1] and times_ns[k] == times_ns[k - 1]:
             for part in range(12):
-                out[part, k] = out[part, k - 1]
+                poses[part, k] = poses[part, k - 1]
             continue
-        at = times_ns[k] / 1e9 + limits[0, way]
-        low = limits[1, way]
-        high = limits[2, way]
-        strict = limits[3, way]
-        if max(low - at, at - high) > strict:
+        time_s = times_ns[k] / 1e9 + limits[0, track]
+        first_s = limits[1, track]
+        last_s = limits[2, track]
+        slack_s = limits[3, track]
+        if max(first_s - time_s, time_s - last_s) > slack_s:
             return k
-        if strict == np.inf:
-            at = min(max(at, low), high)
-        # the last that has begun, by halves
-        segment = first[way]
-        room = count[way] - 1
-        while room:
-            half = (room + 1) // 2
-            if times[segment + half] <= at:
-                segment = segment + half
-                room = room - half
-            else:
-                room = half - 1
-        since = at - times[segment]
-        for axis in range(3):
-            out[axis, k] = speed[axis, segment] * since + start[axis, segment]
-        sine, cosine = sin_cos(since * rates[segment])
-        for part in range(9):
-            out[3 + part, k] = (
-                turn[0, part, segment] + sine * turn[1, part, segment]
-            ) + cosine * turn[2, part, segment]
+        if slack_s == np.inf:
+            time_s = min(max(time_s, first_s), last_s)
+        segment = _segment_at(tracks, track, time_s)
+        _write_pose(tracks, segment, time_s - tracks.times[segment], poses, k)
     return -1

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from copy import copy
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,42 +23,56 @@ from ..sensor.trajectory import velocities
 from .actor_trajectories import ActorTrajectories
 from .voxels import Grids
 
+if TYPE_CHECKING:
+    from .surface_loops import Incidence, TriangleNumbers, TriangleOwners
+
 _log = logging.getLogger(__name__)
 
-LEVEL = math.sqrt(0.75)  # z of the normals of surfaces that water stays on, up to 30 degrees
-BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
+LEVEL = math.sqrt(0.75)  # smallest z of the normals of surfaces that hold water: 30 degrees
+BLOCK_FACES = 1 << 18  # triangles whose normals are computed at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
 
 
-_NONE = np.zeros(0, np.intp)
+_NO_ROWS = np.zeros(0, np.intp)
 _NO_NORMALS = np.zeros((0, 3), np.float32)
 
 
-class Light(NamedTuple):
-    """Light of a sensor in the air."""
+class SensorLight(NamedTuple):
+    """Wavelength of a sensor, and the air and water that its light meets."""
 
     wavelength_nm: float
     extinction: float  # 1/m
-    wet: float = 0.0  # share of what faces up that is below a film of water
+    wet: float = 0.0  # share of surfaces that face up that is below a film of water
 
 
-class Lit(NamedTuple):
-    """How rays meet surfaces."""
+class _Corners(NamedTuple):
+    """Corners of triangles of actors that deform, in the frames of the actors: (n, 3, 3) each."""
+
+    corners: Floats  # metres
+    velocities: Floats  # m/s
+    at_rest: Floats  # corners of the mesh at rest
+
+
+class LitHits(NamedTuple):
+    """Hits of rays on surfaces."""
 
     normals: Floats  # (n, 3)
-    along: Floats  # (n,): cosines of the angles between normals and directions, of either sign
+    cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # (n,): rows of the table of materials
     energy: Floats  # (n,): see `Surfaces.energy`
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 
-def light_of(survey: Survey, sensor: Sensor) -> Light:
-    """Light of a sensor in the air of a survey, in floats: of an int, loops compile once more."""
-    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
+def light_of(survey: Survey, sensor: Sensor) -> SensorLight:
+    """Return the light of a sensor in the air of a survey.
+
+    Values are floats: for an int, loops would be compiled once more.
+    """
+    return SensorLight(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
 
 
 def warn_of_grey(scene: Scene, survey: Survey) -> None:
-    """Warn if a survey is to take colours for reflectance, and nothing has colours."""
+    """Warn if a survey takes colours for reflectance, and the scene has no colours."""
     if not scene.coloured and any(m.reflectance == "texture" for m in survey.materials):
         _log.warning(
             "a material has reflectance: texture, but nothing in the scene has colours, so that "
@@ -69,8 +83,9 @@ def warn_of_grey(scene: Scene, survey: Survey) -> None:
 class Surfaces:
     """Optical properties of triangles.
 
-    Triangles are numbered by the scene's faces, then instance by instance, then by actors.
-    `wavelengths` are those of all sensors, nanometres.
+    Triangles are numbered by the scene's faces, then instance by instance, then by actors. Stored
+    triangles are the scene's faces, then the meshes of actors, then the parts of instances, each
+    once. `wavelengths` are the wavelengths of all sensors, nanometres.
 
     Raises
     ------
@@ -86,226 +101,308 @@ class Surfaces:
     ) -> None:
         self._scene = scene
         self._materials = materials
-        self._standing = len(scene.names)  # objects
+        self._static_objects = len(scene.names)  # objects
         self.counters = scene.counters
         kinds = scene.surface_kinds
         self._tables = {
             nm: MaterialTable.build(materials, kinds, nm, scene.has_voxels) for nm in wavelengths
         }
         self.material_kinds = kinds
-        self.grids = Grids.of(scene.instances)
+        self.grids = Grids.from_instances(scene.instances)
         shared = scene.instances
         plain = len(scene.faces)
         sizes = np.zeros(0, np.int64) if shared is None else shared.sizes
-        # Where the triangles of each instance begin, and those of actors.
-        self._begins = plain + np.cumsum([0, *sizes])
+        # First triangle of each instance, and of actors.
+        self._instance_starts = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
-        self._meshes, self._shape = distinct_meshes(scene.actors)
-        self._firsts = firsts = plain + np.cumsum([0, *(len(mesh.faces) for mesh in self._meshes)])
-        # What leads from a triangle of an actor to its row among those that are kept once.
-        self._to_kept = firsts[self._shape] - self._begins[-1] - np.cumsum([0, *moving])[:-1]
-        self._parts_begin = int(firsts[-1])
-        owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
+        self._meshes, self._actor_shape = distinct_meshes(scene.actors)
+        mesh_sizes = [len(mesh.faces) for mesh in self._meshes]
+        self._shape_starts = starts = plain + np.cumsum([0, *mesh_sizes])
+        actor_starts = self._instance_starts[-1] + np.cumsum([0, *moving])[:-1]
+        # By actors: from the numbers of triangles to stored rows.
+        self._actor_shifts = starts[self._actor_shape] - actor_starts
+        self._parts_start = int(starts[-1])
+        owners = np.arange(self._static_objects, self._static_objects + len(moving), dtype=np.int32)
         # Objects of the triangles of faces and of actors; the last is of no triangle.
-        owned = [scene.face_object, np.repeat(owners, moving), np.full(1, -1, np.int32)]
-        self.owners = np.concatenate(owned)
-        self._turns = np.zeros((0, 3, 3)) if shared is None else _turns(shared.transforms)
+        objects = [scene.face_object, np.repeat(owners, moving), np.full(1, -1, np.int32)]
+        self.owners = np.concatenate(objects)
+        self._normal_matrices = (
+            np.zeros((0, 3, 3)) if shared is None else _normal_matrices(shared.transforms)
+        )
 
     @property
     def materials(self) -> MaterialTable:
         """Materials of kinds of surfaces, at all wavelengths the same but for reflectance."""
         return next(iter(self._tables.values()))
 
-    def at(self, wavelength_nm: float) -> MaterialTable:
+    def at_wavelength(self, wavelength_nm: float) -> MaterialTable:
         """Materials of kinds of surfaces at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
     def moved(self, scene: Scene, rows: Indices) -> Surfaces:
-        """Return the same with some of the scene's instances in other places."""
+        """Return surfaces of a scene whose instances `rows` are placed anew."""
         assert scene.instances is not None
-        made = copy(self)
-        made._scene = scene
-        made._turns = self._turns.copy()
-        made._turns[rows] = _turns(scene.instances.transforms[rows])
-        made.grids = self.grids and self.grids.moved(scene.instances)
-        return made
+        surfaces = copy(self)
+        surfaces._scene = scene
+        surfaces._normal_matrices = self._normal_matrices.copy()
+        surfaces._normal_matrices[rows] = _normal_matrices(scene.instances.transforms[rows])
+        surfaces.grids = self.grids and self.grids.moved(scene.instances)
+        return surfaces
 
-    def _find(self, triangle: Integers) -> tuple[Indices, Ints32, Indices]:
-        """Rows among the triangles that are kept once, objects, and instances or -1: (n,) each."""
+    def _locate(self, triangle: Integers) -> TriangleOwners:
+        """Return the stored rows, objects and instances of triangles (n,)."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         count = len(triangle)
-        (rows, which), objects = np.empty((2, count), np.int64), np.empty(count, np.int32)
-        surface_loops.find(owned(triangle, np.int32), *self._numbers, rows, objects, which)
-        return rows, objects, which
+        row, instance = np.empty((2, count), np.int64)
+        located = surface_loops.TriangleOwners(row, np.empty(count, np.int32), instance)
+        surface_loops.find_owners(owned(triangle, np.int32), self._triangle_numbers, located)
+        return located
 
     @cached_property
-    def _numbers(self) -> tuple[Any, ...]:
-        """Numbers of triangles, objects and instances, see `surface_loops.find`."""
-        shared = self._scene.instances
-        none = np.zeros(0, np.int64)
-        placed = (
-            (none, none) if shared is None else (shared.owner, self._first_of_part[shared.part])
-        )
-        owner = owned(placed[0], np.int32)
-        firsts = owned(placed[1], np.int64)
-        begins = owned(self._begins, np.int64)
-        to_kept = owned(self._to_kept, np.int64)
-        return begins, owned(self.owners, np.int32), owner, firsts, to_kept, self._standing
+    def _triangle_numbers(self) -> TriangleNumbers:
+        """Numbers of triangles, objects and instances, for loops."""
+        from .surface_loops import TriangleNumbers
 
-    def normals(self, triangle: Integers, times: Floats | Ints, ways: ActorTrajectories) -> Floats:
+        shared = self._scene.instances
+        no_instances = np.zeros(0, np.int64)
+        return TriangleNumbers(
+            instance_starts=owned(self._instance_starts, np.int64),
+            owners=owned(self.owners, np.int32),
+            instance_objects=owned(no_instances if shared is None else shared.owner, np.int32),
+            instance_rows=owned(
+                no_instances if shared is None else self._part_starts[shared.part], np.int64
+            ),
+            actor_shifts=owned(self._actor_shifts, np.int64),
+            static_objects=self._static_objects,
+        )
+
+    def normals(
+        self, triangle: Integers, times: Floats | Ints, trajectories: ActorTrajectories
+    ) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
-        Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
+        Normals of actors are rotated by the poses of the actors at times (n,), nanoseconds.
         """
-        return self._met(triangle, np.zeros((len(triangle), 3)), self.materials, times, ways)[0].T
+        directions = np.zeros((len(triangle), 3))
+        incidence, _ = self._meet(triangle, directions, self.materials, times, trajectories)
+        return incidence.normals.T
 
-    def _met(
+    def _meet(
         self,
         triangle: Integers,
         directions: Floats,
         table: MaterialTable,
         times: Floats | Ints,
-        ways: ActorTrajectories,
-    ) -> tuple[Floats, Floats, Ints32, Floats]:
-        """Return normals (3, n), products with directions, kinds of surfaces, light sent back."""
+        trajectories: ActorTrajectories,
+    ) -> tuple[Incidence, Ints32]:
+        """Return how rays with directions (n, 3) meet triangles (n,), and kinds of surfaces (n,).
+
+        The light that is sent back is that of surfaces that are neither textured nor rough.
+        """
         from . import surface_loops  # not before: numba takes half a second to import
 
         poses = np.zeros((12, 0))
         run = np.zeros(0, np.int64)
-        rows, objects, which = self._find(triangle)
-        kinds = self._kinds_of(rows, objects)
-        own = _NO_NORMALS
-        if ways:
-            actors = objects - np.int64(self._standing)
-            poses, run = ways.runs(actors, owned(times))
-            if len(on := ways.deforming(actors)):
-                corners, *_ = self._bent(rows[on], actors[on], times[on], ways)
-                own = _normals(corners)
-                rows[on] = ~np.arange(len(on))
-        normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
-        given = self._turns, self.unit_normals, own, run, poses, table.reflectance, table.retro
-        hits = rows, kinds, which, owned(directions.T)
-        surface_loops.meet(*hits, *given, normals, along, back)
-        return normals, along, kinds, back
+        row, objects, instance = self._locate(triangle)
+        kinds = self._kinds_of(row, objects)
+        deformed_normals = _NO_NORMALS
+        if trajectories:
+            actors = objects - np.int64(self._static_objects)
+            poses, run = trajectories.runs(actors, owned(times))
+            if len(deforming := trajectories.deforming(actors)):
+                deformed = self._deformed(
+                    row[deforming], actors[deforming], times[deforming], trajectories
+                )
+                deformed_normals = _normals(deformed.corners)
+                row[deforming] = ~np.arange(len(deforming))
+        cosines, back = np.empty((2, len(row)))
+        incidence = surface_loops.Incidence(np.empty((3, len(row))), cosines, back)
+        surface_loops.meet(
+            surface_loops.HitSurfaces(row, kinds, instance, run),
+            owned(directions.T),
+            surface_loops.NormalTables(
+                self.unit_normals, deformed_normals, self._normal_matrices, poses
+            ),
+            table.reflectance,
+            table.retro,
+            incidence,
+        )
+        return incidence, kinds
 
     def lit(
         self,
         triangle: Integers,
         directions: Floats,
         distance: Floats,
-        light: Light,
+        light: SensorLight,
         times: Floats | Ints,
-        ways: ActorTrajectories,
+        trajectories: ActorTrajectories,
         colours: UInts32 | None = None,
-    ) -> Lit:
-        """How rays (n,) with unit directions (n, 3) meet triangles; others as of `energy`."""
+    ) -> LitHits:
+        """Return how rays (n,) with unit directions (n, 3) meet triangles, and their energies.
+
+        Parameters
+        ----------
+        triangle, distance
+            (n,): triangles on which the rays end, and the distances in metres.
+        light
+            Light of the sensor.
+        times
+            (n,): nanoseconds, for the poses of actors.
+        trajectories
+            Trajectories of the actors.
+        colours
+            (n,): packed, needed where materials are `textured`.
+        """
         from . import surface_loops
 
-        table = self.at(light.wavelength_nm)
-        normals, along, kinds, back = self._met(triangle, directions, table, times, ways)
+        table = self.at_wavelength(light.wavelength_nm)
+        incidence, kinds = self._meet(triangle, directions, table, times, trajectories)
+        normals, cosines, back = incidence
         bright = luminance(colours) if table.textured and colours is not None else None
         if table.textured or table.roughness.any():
-            back = table.scattered(kinds, np.abs(along), bright)
+            back = table.scattered(kinds, np.abs(cosines), bright)
         film = None
         if light.wet:
-            film = np.empty(len(along), np.bool_)
-            dry = table.passes | table.leafy
+            film = np.empty(len(cosines), np.bool_)
+            water = surface_loops.WaterFilm(LEVEL, light.wet, table.passes | table.leafy)
             shares = table.shares(kinds, bright)
-            given = normals[2], along, kinds, dry, shares, LEVEL, light.wet
-            surface_loops.soak(*given, film, back)
+            surface_loops.soak(normals[2], cosines, kinds, shares, water, film, back)
         surface_loops.fade(owned(distance), light.extinction, back)
-        return Lit(normals.T, along, kinds, back, film)
+        return LitHits(normals.T, cosines, kinds, back, film)
 
-    def _bent(
-        self, rows: Indices, actors: Integers, times: Floats | Ints, ways: ActorTrajectories
-    ) -> tuple[Floats, Floats, Floats]:
-        """Corners of triangles of actors that deform, at times, their velocities, and at rest.
+    def _deformed(
+        self,
+        rows: Indices,
+        actors: Integers,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
+    ) -> _Corners:
+        """Return the corners of triangles of actors that deform, at times (n,), nanoseconds.
 
-        Each is (n, 3, 3), in the axes of the actors; triangles are rows of those kept once.
+        `rows` (n,) are rows of stored triangles, and `actors` (n,) their actors.
         """
-        corners, speeds, rest = np.empty((3, len(rows), 3, 3))
-        frames, rates = ways.played(actors, times)
-        shapes = self._shape[actors]
-        for one in np.unique(shapes).tolist():
-            mesh = self._meshes[one]
-            own = np.flatnonzero(shapes == one)
+        corners, corner_velocities, at_rest = np.empty((3, len(rows), 3, 3))
+        frames, frame_rates = trajectories.played(actors, times)
+        shapes = self._actor_shape[actors]
+        for shape in np.unique(shapes).tolist():
+            mesh = self._meshes[shape]
+            of_shape = np.flatnonzero(shapes == shape)
             assert mesh.animation is not None
-            vertex = mesh.faces[rows[own] - self._firsts[one]]
-            corners[own], moves = mesh.animation.vertices_at(frames[own], vertex)
-            speeds[own] = moves * rates[own, None, None]
-            rest[own] = mesh.vertices[vertex]
-        return corners, speeds, rest
+            vertex = mesh.faces[rows[of_shape] - self._shape_starts[shape]]
+            corners[of_shape], steps = mesh.animation.vertices_at(frames[of_shape], vertex)
+            corner_velocities[of_shape] = steps * frame_rates[of_shape, None, None]
+            at_rest[of_shape] = mesh.vertices[vertex]
+        return _Corners(corners, corner_velocities, at_rest)
 
-    def _on_actors(self, triangle: Integers, ways: ActorTrajectories) -> tuple[Indices, Integers]:
-        """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
-        if not ways:
-            return _NONE, _NONE
-        rows = np.flatnonzero(triangle >= self._begins[-1])
-        return rows, self.objects(triangle[rows]) - self._standing
+    def _actor_rows(
+        self, triangle: Integers, trajectories: ActorTrajectories
+    ) -> tuple[Indices, Integers]:
+        """Return the rows of triangles (n,) that belong to actors, and the actors: (k,) each.
+
+        Without trajectories, there are no rows.
+        """
+        if not trajectories:
+            return _NO_ROWS, _NO_ROWS
+        rows = np.flatnonzero(triangle >= self._instance_starts[-1])
+        return rows, self.objects(triangle[rows]) - self._static_objects
 
     def colours(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
     ) -> UInts32:
-        """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
+        """Return the colours of points (n, 3) on triangles (n,), packed: (n,).
+
+        Actors have their poses at times (n,), nanoseconds.
+        """
         if self._lookup is None:
             return np.full(len(triangle), packed(GREY[0])[0])
-        out = np.empty(len(triangle), np.uint32)
+        result = np.empty(len(triangle), np.uint32)
         for begin in range(0, len(triangle), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            out[block] = self._colours(triangle[block], points[block], times[block], ways)
-        return out
+            result[block] = self._block_colours(
+                triangle[block], points[block], times[block], trajectories
+            )
+        return result
 
-    def _colours(
-        self, triangle: Integers, points: Floats, times: Any, ways: ActorTrajectories
+    def _block_colours(
+        self, triangle: Integers, points: Floats, times: Any, trajectories: ActorTrajectories
     ) -> UInts32:
+        """Return the colours of points of a block of hits, see `colours`."""
         assert self._lookup is not None
-        rows, _, which = self._find(triangle)
-        on = np.flatnonzero(which >= 0)
-        if len(on) or ways:
+        stored_rows, _, instance = self._locate(triangle)
+        on_instances = np.flatnonzero(instance >= 0)
+        if len(on_instances) or trajectories:
             points = points.copy()
-        if len(on):
+        if len(on_instances):
             assert self._scene.instances is not None
-            back = points[on] - self._scene.instances.transforms[which[on], :, 3]
-            points[on] = into_axes(back, self._turns[which[on]])
-        moving, actor = self._on_actors(triangle, ways)
-        if len(moving):
-            places, rotations = ways.poses(actor, times[moving].astype(np.float64))
-            points[moving] = into_axes(points[moving] - places, rotations)
-            if len(bent := ways.deforming(actor)):  # to where they are on the mesh at rest
-                on = moving[bent]
-                corners, _, rest = self._bent(rows[on], actor[bent], times[on], ways)
-                points[on] = applied(rest.transpose(0, 2, 1), _weights(corners, points[on]))
-        return self._lookup.colours_at(rows, points)
+            placed = instance[on_instances]
+            from_origins = points[on_instances] - self._scene.instances.transforms[placed, :, 3]
+            points[on_instances] = into_axes(from_origins, self._normal_matrices[placed])
+        on_actors, actor = self._actor_rows(triangle, trajectories)
+        if len(on_actors):
+            positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
+            points[on_actors] = into_axes(points[on_actors] - positions, rotations)
+            if len(deforming := trajectories.deforming(actor)):  # to the mesh at rest
+                rows = on_actors[deforming]
+                deformed = self._deformed(
+                    stored_rows[rows], actor[deforming], times[rows], trajectories
+                )
+                weights = _weights(deformed.corners, points[rows])
+                points[rows] = applied(deformed.at_rest.transpose(0, 2, 1), weights)
+        return self._lookup.colours_at(stored_rows, points)
 
     def velocities(
-        self, triangle: Integers, points: Floats, times: Floats | Ints, ways: ActorTrajectories
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
     ) -> Floats:
-        """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
-        out = np.zeros((len(triangle), 3))
-        moving, actor = self._on_actors(triangle, ways)
+        """Return the velocities of points (n, 3) on triangles (n,) in the scene frame, m/s: (n, 3).
+
+        Actors have their poses at times (n,), nanoseconds.
+        """
+        result = np.zeros((len(triangle), 3))
+        on_actors, actor = self._actor_rows(triangle, trajectories)
         for number in np.unique(actor).tolist():
-            way = ways[number]
-            rows = moving[actor == number]
-            if way.moves:
-                at = times[rows].astype(np.float64)
-                places, _ = way.poses(0, at)
-                velocity, rate = velocities(way, 0, at)
-                out[rows] = velocity + np.cross(rate, points[rows] - places)
-        if len(bent := ways.deforming(actor)):
-            rows = moving[bent]
-            own = actor[bent]
-            at = times[rows].astype(np.float64)
-            places, turns = ways.poses(own, at)
-            corners, speeds, _ = self._bent(self._find(triangle[rows])[0], own, at, ways)
-            weights = _weights(corners, into_axes(points[rows] - places, turns))
-            out[rows] += applied(turns, applied(speeds.transpose(0, 2, 1), weights))
-        return out
+            trajectory = trajectories[number]
+            rows = on_actors[actor == number]
+            if trajectory.moves:
+                times_ns = times[rows].astype(np.float64)
+                positions, _ = trajectory.poses(0, times_ns)
+                velocity, rate = velocities(trajectory, 0, times_ns)
+                result[rows] = velocity + np.cross(rate, points[rows] - positions)
+        if len(deforming := trajectories.deforming(actor)):
+            rows = on_actors[deforming]
+            result[rows] += self._deformation_velocities(
+                triangle[rows], points[rows], times[rows], actor[deforming], trajectories
+            )
+        return result
+
+    def _deformation_velocities(
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
+        actor: Integers,
+        trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the velocities of points by the deformation of actors: (n, 3), m/s."""
+        times_ns = times.astype(np.float64)
+        positions, rotations = trajectories.poses(actor, times_ns)
+        deformed = self._deformed(self._locate(triangle).row, actor, times_ns, trajectories)
+        weights = _weights(deformed.corners, into_axes(points - positions, rotations))
+        return applied(rotations, applied(deformed.velocities.transpose(0, 2, 1), weights))
 
     @cached_property
     def _lookup(self) -> Lookup | None:
-        """Colours of the triangles that are kept once; None if there are none."""
-        bodies = self._kept
+        """Colours of the stored triangles; None if the scene has no colours."""
+        bodies = self._stored_bodies
         sizes = [len(faces) for _, faces, _ in bodies]
         colours = join_colours([colours for _, _, colours in bodies], sizes)
         if colours is None:
@@ -318,56 +415,60 @@ class Surfaces:
         return Lookup(colours, corners)
 
     def bodies(self) -> tuple[Ints, Floats]:
-        """Return what bodies the triangles belong to, in the order of `SceneCaster`.
+        """Return the bodies to which triangles belong, in the order of `SceneCaster`.
 
         Returns
         -------
         bodies
-            (b, 3): the scene's faces, if there are any, each instance, and all actors as one. Of
-            each its first triangle, its object, or -1 if `owners` has that of each triangle, and
-            the row of its first normal in `unit_normals`, or -1 for the actors, which share theirs.
-            In `owners`, actors begin behind the scene's faces.
-        turns
-            (b, 3, 3): matrices that take its normals to the scene's axes, but for their length.
+            (b, 3): the scene's faces, unless there are no faces, each instance, and all actors as
+            one body. Columns are the first triangle; the object, or -1 if `owners` has the object
+            of each triangle; and the row of the first normal in `unit_normals`, or -1 for actors,
+            which share normals. In `owners`, actors follow the scene's faces.
+        normal_matrices
+            (b, 3, 3): matrices from normals in `unit_normals` to normals in the scene frame, of any
+            length.
         """
-        plain, actors = self._begins[[0, -1]]
-        one = np.eye(3)[None]
+        plain, actors = self._instance_starts[[0, -1]]
+        identity = np.eye(3)[None]
         bodies: list[Any] = [[[actors - plain, -1, -1]]]
-        turns = [one]
+        normal_matrices = [identity]
         if (shared := self._scene.instances) is not None:
-            firsts = self._first_of_part[shared.part]
-            bodies.insert(0, np.stack([self._begins[:-1], shared.owner, firsts], axis=1))
-            turns.insert(0, self._turns)
+            firsts = self._part_starts[shared.part]
+            bodies.insert(0, np.stack([self._instance_starts[:-1], shared.owner, firsts], axis=1))
+            normal_matrices.insert(0, self._normal_matrices)
         if plain:
             bodies.insert(0, [[0, -1, 0]])
-            turns.insert(0, one)
-        return np.concatenate(bodies).astype(np.int64), np.concatenate(turns)
+            normal_matrices.insert(0, identity)
+        return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
 
     def objects(self, triangle: Integers) -> Ints32:
-        """Objects of triangles (n,); -1 of no surface."""
+        """Return the objects of triangles (n,): (n,); -1 without a surface."""
         if self._scene.instances is None:
             return self.owners[triangle]
-        return self._find(triangle)[1]
+        return self._locate(triangle).object
 
     def kinds(self, triangle: Integers) -> Ints32:
-        """Kinds of surfaces of triangles (n,), rows of the table of materials; -1 of no surface."""
+        """Return the kinds of surfaces of triangles (n,): (n,); -1 without a surface.
+
+        Kinds are rows of the table of materials.
+        """
         if self._kind_in_object is None:
             return self.objects(triangle)
-        rows, objects, _ = self._find(triangle)
+        rows, objects, _ = self._locate(triangle)
         return self._kinds_of(rows, objects)
 
     def _kinds_of(self, rows: Indices, objects: Ints32) -> Ints32:
-        """Kinds of surfaces of triangles, by rows among those that are kept once, and objects."""
+        """Return the kinds of surfaces of stored triangles, by rows and objects: (n,)."""
         if self._kind_in_object is None:
             return objects
         kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
-        return np.where(objects < 0, np.int32(-1), self._merged[kinds])
+        return np.where(objects < 0, np.int32(-1), self._material_kind[kinds])
 
     @cached_property
     def _kind_in_object(self) -> Ints32 | None:
-        """Number of the kind of each triangle kept once among those of its object, (f,).
+        """Kind of each stored triangle, numbered within its object: (f,).
 
-        None if each object has one kind, which then has the number of the object.
+        None if each object has a single kind, which has the number of the object.
         """
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
@@ -383,8 +484,8 @@ class Surfaces:
         return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
-        """Numbers of the names of triangles' materials, see `Scene.material_names`; -1 for none."""
-        rows, objects, _ = self._find(triangle)
+        """Return the materials of triangles, as numbers of `Scene.material_names`; -1 for none."""
+        rows, objects, _ = self._locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
             kinds = kinds + self._kind_in_object[rows]
@@ -397,11 +498,11 @@ class Surfaces:
         return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
 
     @cached_property
-    def _merged(self) -> Ints32:
-        """First kind of the same object that has the same material, for each kind.
+    def _material_kind(self) -> Ints32:
+        """First kind of the same object that has the same material, for each kind: (kinds,).
 
-        A surface with several names is one surface where one entry is for all of them: closed, if
-        it holds a medium.
+        A surface with several names is one surface where a single material is for all names:
+        closed, if the surface holds a medium.
         """
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)
@@ -410,43 +511,43 @@ class Surfaces:
         return rows[which.reshape(-1)].astype(np.int32)
 
     def instances(self, triangle: Integers) -> Indices:
-        """Instances that triangles (n,) belong to; each belongs to one."""
-        return np.searchsorted(self._begins, triangle, side="right") - 1
+        """Return the instances of triangles (n,), which all belong to instances: (n,)."""
+        return np.searchsorted(self._instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
-        """Counters of hits of triangles (n,), see `Scene.counters`."""
+        """Return the counters of hits on triangles (n,), see `Scene.counters`: (n,)."""
         if self._scene.instances is None:
             return triangle
-        plain, actors = self._begins[[0, -1]]
-        which = self._find(triangle)[2]
-        apart = actors - plain - (len(self._begins) - 1)
-        own = np.where(triangle >= actors, triangle - apart, triangle)
-        return np.where(which >= 0, plain + which, own)
+        plain, actors = self._instance_starts[[0, -1]]
+        instance = self._locate(triangle).instance
+        shift = actors - plain - (len(self._instance_starts) - 1)  # an instance has one counter
+        face_or_actor = np.where(triangle >= actors, triangle - shift, triangle)
+        return np.where(instance >= 0, plain + instance, face_or_actor)
 
     def energy(
         self,
         triangle: Integers,
         cosine: Floats,
         distance: Floats,
-        light: Light,
+        light: SensorLight,
         colours: UInts32 | None = None,
     ) -> Floats:
-        """Received energy of rays that end on triangles (n,), at distances in metres.
+        """Return the received energy of rays that end on triangles (n,), at distances in metres.
 
         ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
         retro-reflector, a gain replaces the cosine. Where materials are `textured`, the colours
         (n,) are needed.
         """
-        table = self.at(light.wavelength_nm)
+        table = self.at_wavelength(light.wavelength_nm)
         bright = luminance(colours) if table.textured and colours is not None else None
         scattered = table.scattered(self.kinds(triangle), cosine, bright)
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
-        """Whether surfaces that hold a medium are closed, and point inwards, by kinds: (k,).
+        """Whether surfaces that hold a medium are closed, and whether they point inwards: (kinds,).
 
-        They point inwards if they are closed and have a negative volume.
+        Surfaces point inwards if they are closed and have a negative volume.
         """
         table = self.materials
         scene = self._scene
@@ -455,8 +556,8 @@ class Surfaces:
         for number in np.flatnonzero(table.leafy | table.refracts).tolist():
             bodies: list[tuple[Floats, Integers]] = []
             owner = int(self.material_kinds.object[number])
-            if owner >= self._standing:
-                mesh = scene.actors[owner - self._standing].mesh
+            if owner >= self._static_objects:
+                mesh = scene.actors[owner - self._static_objects].mesh
                 bodies.append((mesh.vertices, self._of_kind(number, mesh.faces, mesh.materials)))
             else:
                 bodies.append((scene.vertices, self._faces_of(number)))
@@ -473,44 +574,45 @@ class Surfaces:
         return closed, closed & (volume < 0)
 
     @cached_property
-    def _by_object(self) -> tuple[Indices, Indices]:
-        """Rows of the scene's faces in the order of objects, and where those of each begin."""
+    def _faces_by_object(self) -> tuple[Indices, Indices]:
+        """Rows of the scene's faces by objects, and where each object starts in this order."""
         owners = self._scene.face_object
         order = np.argsort(owners, kind="stable")
-        return order, np.searchsorted(owners[order], np.arange(self._standing + 1))
+        return order, np.searchsorted(owners[order], np.arange(self._static_objects + 1))
 
     def _faces_of(self, number: int) -> Integers:
-        """Those of the scene's faces that are of a kind of surface."""
-        order, begins = self._by_object
+        """Return the scene's faces of a kind of surface, (f, 3)."""
+        order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[number])
-        rows = order[begins[owner] : begins[owner + 1]]
+        rows = order[starts[owner] : starts[owner + 1]]
         if self._scene.materials is None:
             return self._scene.faces[rows]
         materials = self._scene.materials.of_object(owner, rows)
         return self._of_kind(number, self._scene.faces[rows], materials)
 
     def _of_kind(self, number: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
-        """Those of some faces of an object that are of a kind of surface."""
+        """Select the faces of a kind of surface from faces of an object, (f, 3)."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds
         index = 0 if materials is None or materials.index is None else materials.index
-        kind = self._merged[kinds.first[kinds.object[number]] + index]
+        kind = self._material_kind[kinds.first[kinds.object[number]] + index]
         return faces[np.broadcast_to(kind == number, len(faces))]
 
     @cached_property
     def media(self) -> tuple[int, ...]:
         """Kinds of surfaces of the scene's faces that hold a medium within a closed surface."""
-        table, (closed, _) = self.materials, self.solids
-        held = (table.leafy | table.refracts) & closed
-        held &= self.material_kinds.object < self._standing
-        return tuple(np.flatnonzero(held).tolist())
+        table = self.materials
+        closed, _ = self.solids
+        holds_medium = (table.leafy | table.refracts) & closed
+        holds_medium &= self.material_kinds.object < self._static_objects
+        return tuple(np.flatnonzero(holds_medium).tolist())
 
     def spread_out(self, by_m: float) -> Floats:
-        """Vertices of the scene's faces, where surfaces of media are so many metres further out.
+        """Return the vertices of the scene's faces, with surfaces of media moved outwards.
 
-        Water that touches its basin, or leaves that touch others, would share a surface with them,
-        and light that meets one of two would miss the other.
+        Water that touches its basin, or leaves that touch other leaves, would share a surface with
+        the basin, and light that meets one surface would miss the other.
         """
         if not self.media:
             return self._scene.vertices
@@ -520,31 +622,29 @@ class Surfaces:
             faces = self._faces_of(number)
             if not len(faces):
                 continue
-            used, corners = np.unique(faces, return_inverse=True)
-            places, same = np.unique(vertices[used], axis=0, return_inverse=True)
-            same = same.reshape(-1)
-            corners = same[corners.reshape(-1)].reshape(-1, 3)
-            a, b, c = places[corners].transpose(1, 0, 2)
+            vertex_rows, corners = np.unique(faces, return_inverse=True)
+            positions, vertex_position = np.unique(
+                vertices[vertex_rows], axis=0, return_inverse=True
+            )
+            vertex_position = vertex_position.reshape(-1)
+            corners = vertex_position[corners.reshape(-1)].reshape(-1, 3)
+            a, b, c = positions[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
             normals /= np.maximum(length(normals)[:, None], 1e-300)
-            # Each vertex goes where all of its triangles are so much further out, or nearly.
-            squares = np.zeros((len(places), 3, 3))
-            sums = np.zeros((len(places), 3))
+            # Least squares: a vertex moves to where all its triangles are `by_m` further out.
+            squares = np.zeros((len(positions), 3, 3))
+            sums = np.zeros((len(positions), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
             np.add.at(sums, corners, normals[:, None])
             squares += 1e-3 * np.eye(3)
             step = by_m * applied(inverse(squares), sums)
-            places += np.clip(step, -4 * by_m, 4 * by_m)
-            vertices[used] = places[same]
+            positions += np.clip(step, -4 * by_m, 4 * by_m)
+            vertices[vertex_rows] = positions[vertex_position]
         return vertices
 
     @property
-    def _kept(self) -> list[tuple[Floats, Integers, Colours | None]]:
-        """Vertices, faces and colours of the triangles that are kept once.
-
-        Those of the meshes of actors follow the scene's, and those of the parts of instances follow
-        them.
-        """
+    def _stored_bodies(self) -> list[tuple[Floats, Integers, Colours | None]]:
+        """Vertices, faces and colours of stored triangles: scene, meshes of actors, and parts."""
         scene = self._scene
         bodies: list[tuple[Floats, Integers, Colours | None]] = [
             (scene.vertices, scene.faces, scene.colours)
@@ -557,27 +657,27 @@ class Surfaces:
 
     @cached_property
     def unit_normals(self) -> Floats32:
-        """Unit normals of `_kept`: (f, 3)."""
-        bodies = self._kept
-        out = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
-        at = 0
+        """Unit normals of the stored triangles: (f, 3)."""
+        bodies = self._stored_bodies
+        normals = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
+        row = 0
         for vertices, faces, _ in bodies:
             for begin in range(0, len(faces), BLOCK_FACES):
                 block = faces[begin : begin + BLOCK_FACES]
-                out[at : at + len(block)] = _normals(vertices[block])
-                at += len(block)
-        return out
+                normals[row : row + len(block)] = _normals(vertices[block])
+                row += len(block)
+        return normals
 
     @cached_property
-    def _first_of_part(self) -> Indices:
-        """Rows at which the parts of instances begin."""
+    def _part_starts(self) -> Indices:
+        """Stored row of the first triangle of each part of instances."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
-        return self._parts_begin + np.cumsum([0, *sizes[:-1]])
+        return self._parts_start + np.cumsum([0, *sizes[:-1]])
 
 
-def _turns(transforms: Floats) -> Floats:
-    """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
+def _normal_matrices(transforms: Floats) -> Floats:
+    """Return matrices (n, 3, 3) from normals of parts to normals of instances, of any length."""
     return np.ascontiguousarray(inverse(transforms[:, :, :3]).transpose(0, 2, 1))
 
 
@@ -589,39 +689,39 @@ def _normals(corners: Floats) -> Floats32:
 
 
 def _weights(corners: Floats, points: Floats) -> Floats:
-    """Weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on them."""
+    """Return weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on triangles."""
     a, b, c = corners.transpose(1, 2, 0)
-    one = b - a
-    other = c - a
-    to = points.T - a
-    square = products(one, one)
-    both = products(one, other)
-    square_2 = products(other, other)
-    along = products(to, one)
-    along_2 = products(to, other)
-    area = np.maximum(square * square_2 - both * both, 1e-300)
-    v = (square_2 * along - both * along_2) / area
-    w = (square * along_2 - both * along) / area
+    edge_1 = b - a
+    edge_2 = c - a
+    offset = points.T - a
+    square_1 = products(edge_1, edge_1)
+    edge_product = products(edge_1, edge_2)
+    square_2 = products(edge_2, edge_2)
+    product_1 = products(offset, edge_1)
+    product_2 = products(offset, edge_2)
+    area = np.maximum(square_1 * square_2 - edge_product * edge_product, 1e-300)
+    v = (square_2 * product_1 - edge_product * product_2) / area
+    w = (square_1 * product_2 - edge_product * product_1) / area
     return np.stack([1 - v - w, v, w], axis=1)
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:
-    """Whether a surface has no gaps: each edge is one of two triangles that wind alike."""
-    used, corners = np.unique(faces, return_inverse=True)
-    # Vertices of flat shading are one for each triangle.
-    _, same = np.unique(vertices[used], axis=0, return_inverse=True)
-    corners = same.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
-    ahead = corners.reshape(-1)
-    after = np.roll(corners, -1, axis=1).reshape(-1)
-    some = ahead != after
-    there, back = (
-        np.sort(one[some] * len(used) + other[some])
-        for one, other in ((ahead, after), (after, ahead))
-    )
-    return bool(np.array_equal(there, back))
+    """Return whether a surface has no gaps: two triangles that wind alike share each edge."""
+    vertex_rows, corners = np.unique(faces, return_inverse=True)
+    # With flat shading, triangles share positions, not vertices.
+    _, vertex_position = np.unique(vertices[vertex_rows], axis=0, return_inverse=True)
+    corners = vertex_position.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
+    starts = corners.reshape(-1)
+    stops = np.roll(corners, -1, axis=1).reshape(-1)
+    edges = starts != stops
+    starts = starts[edges]
+    stops = stops[edges]
+    forward = np.sort(starts * len(vertex_rows) + stops)
+    backward = np.sort(stops * len(vertex_rows) + starts)
+    return bool(np.array_equal(forward, backward))
 
 
 def _volume(vertices: Floats, faces: Integers) -> float:
-    """Volume within a closed surface, m³; negative if its triangles wind the other way."""
+    """Return the volume within a closed surface, m³; negative if its triangles wind inwards."""
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)

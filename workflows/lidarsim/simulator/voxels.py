@@ -1,9 +1,9 @@
-"""Light through grids of leaf area density: where its optical depth is used up."""
+"""Passage of light through grids of leaf area density, until its optical depth is used up."""
 
 from __future__ import annotations
 
 from copy import copy
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,144 +11,218 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.vectors import applied, inverse, matmul
 from ..scene.scene_instances import Instances
 
-BLOCK_RAYS = 1 << 13  # that go through grids at a time, to fit a cache
-_LEVEL = 1e-30  # along an axis, light this slow meets no other voxel
+BLOCK_RAYS = 1 << 13  # rays that are followed at a time, to fit a cache
+_LEVEL = 1e-30  # voxels a metre: along an axis, slower light stays in its layer of voxels
+
+
+class GridPassage(NamedTuple):
+    """Passage of light through grids: arrays (n,), and (n, k) by grids."""
+
+    metres: Floats  # (n,): to the leaf that light meets; inf without a leaf
+    remaining_depth: Floats  # (n,): optical depth until a leaf; -inf if light meets a leaf
+    density: Floats  # (n, k): optical depth for each metre of the grids at the leaf
+
+
+class _GridRays(NamedTuple):
+    """Light in the voxels of k grids around the light; the last axis of all arrays is the ray."""
+
+    row: Indices  # (n,): of the light that is followed
+    even_depth: Floats  # (n,): optical depth for each metre of other media
+    length: Floats  # (n,): length of the path, metres
+    depth: Floats  # (n,): remaining optical depth until a leaf
+    metres: Floats  # (n,): distance from the start
+    cell: Floats  # (3, k, n): voxel of the light
+    step: Floats  # (3, k, n): -1, 0 or 1, the direction of the light
+    pace: Floats  # (3, k, n): metres for each voxel; 0 for light that stays in its layer
+    shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` metres
+    size: Floats  # (3, k, n): voxels of the grid
+    first: Floats  # (k, n): number of the grid's first voxel
+    crossing: Floats  # (k, n): mean projection of the leaves; 0 without a grid
+
+    def take(self, rows: Indices) -> _GridRays:
+        """Return the light of selected rows."""
+        return _GridRays._make(array[..., rows] for array in self)
 
 
 class Grids:
-    """The grids of the instances of a scene, densities once for each part."""
+    """The grids of the instances of a scene, with the densities of each part stored once."""
 
     def __init__(self, shared: Instances) -> None:
-        found = [part.voxels for part in shared.parts]
-        sizes = [(0, 0, 0) if one is None else one.density.shape for one in found]
+        voxels = [part.voxels for part in shared.parts]
+        sizes = [(0, 0, 0) if grid is None else grid.density.shape for grid in voxels]
         self._sizes = np.array(sizes, np.float64)
-        self._begins = np.cumsum([0, *(int(np.prod(size)) for size in sizes[:-1])])
-        kept = [one.density.reshape(-1) for one in found if one is not None]
-        self._values = kept[0] if len(kept) == 1 else np.concatenate(kept)
+        self._starts = np.cumsum([0, *(int(np.prod(size)) for size in sizes[:-1])])
+        densities = [grid.density.reshape(-1) for grid in voxels if grid is not None]
+        self._values = densities[0] if len(densities) == 1 else np.concatenate(densities)
         self._matrices = np.array(
-            [np.eye(3, 4) if one is None else one.matrix for one in found], np.float64
+            [np.eye(3, 4) if grid is None else grid.matrix for grid in voxels], np.float64
         )
-        self._place(shared)
+        self._place_instances(shared)
 
     @classmethod
-    def of(cls, shared: Instances | None) -> Grids | None:
-        """Return those of instances; None if there are none."""
+    def from_instances(cls, shared: Instances | None) -> Grids | None:
+        """Return the grids of instances; None without grids."""
         if shared is None or all(part.voxels is None for part in shared.parts):
             return None
         return cls(shared)
 
     def moved(self, shared: Instances) -> Grids:
-        """Return the same with the instances in other places."""
-        made = copy(self)
-        made._place(shared)
-        return made
+        """Return the grids with the instances placed anew."""
+        grids = copy(self)
+        grids._place_instances(shared)
+        return grids
 
-    def _place(self, shared: Instances) -> None:
-        """Find what takes places in the scene to those in the grid of each instance."""
+    def _place_instances(self, shared: Instances) -> None:
+        """Compute the matrices from the scene frame to the grid of each instance, in voxels."""
         self._part = shared.part
-        to = shared.transforms
+        to_scene = shared.transforms
         matrices = self._matrices[self._part]
-        self._origins = applied(to[:, :, :3], matrices[:, :, 3]) + to[:, :, 3]
-        self._back = inverse(matmul(to[:, :, :3], matrices[:, :, :3]))
+        self._origins = applied(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
+        self._to_grid = inverse(matmul(to_scene[:, :, :3], matrices[:, :, :3]))
 
     def through(
         self,
-        which: Indices,
+        instances: Indices,
         starts: Floats,
-        ways: Floats,
+        directions: Floats,
         crossing: Floats,
-        even: Floats,
+        even_depth: Floats,
         length: Floats,
-        left: Floats,
-    ) -> tuple[Floats, Floats, Floats]:
-        """Follow light (n,) through the grids around it, by voxels (Amanatides and Woo 1987).
+        depth: Floats,
+    ) -> GridPassage:
+        """Follow light (n,) through grids, voxel by voxel (Amanatides and Woo 1987).
 
         Parameters
         ----------
-        which
-            (n, k): instances with grids around it; -1 for none.
-        starts, ways
-            (n, 3): where it is, and where it goes.
+        instances
+            (n, k): instances with grids around the light; -1 for none.
+        starts, directions
+            (n, 3): origins of the light, and directions, in the scene frame.
         crossing
-            (n, k): mean projection of the leaves in each.
-        even
-            (n,): optical depth for each metre in what else is around it.
+            (n, k): mean projection of the leaves in each grid.
+        even_depth
+            (n,): optical depth for each metre of other media around the light.
         length
-            (n,): how far it goes, metres.
-        left
-            (n,): optical depth after which it meets a leaf.
-
-        Returns
-        -------
-        Metres to that leaf (n,), inf if there is none; what is left of `left` (n,), -inf if there
-        is a leaf; and optical depths for each metre of the grids there (n, k).
+            (n,): length of the path, metres.
+        depth
+            (n,): optical depth after which the light meets a leaf.
         """
-        if len(left) > BLOCK_RAYS:
-            given: tuple[Any, ...] = which, starts, ways, crossing, even, length, left
-            blocks = (slice(k, k + BLOCK_RAYS) for k in range(0, len(left), BLOCK_RAYS))
-            found = [self.through(*(values[block] for values in given)) for block in blocks]
-            metres, rest, there = map(np.concatenate, zip(*found, strict=True))
-            return metres, rest, there
-        metres = np.full(len(left), np.inf)
-        rest = np.full(len(left), -np.inf)
-        there = np.zeros(which.shape)
-        back = self._back[which].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
-        x, y, z = (starts[:, None] - self._origins[which]).transpose(2, 1, 0)
-        u, v, w = ways.T[:, None]
-        # Product by product, for the same bits in every block.
-        place = np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in back])
-        way = np.stack([(row[0] * u + row[1] * v) + row[2] * w for row in back])
-        level = np.abs(way) < _LEVEL
-        step = np.where(level, 0, np.sign(way))
-        pace = 1 / np.where(level, 1, way)
-        cell = np.floor(place)
-        size = np.moveaxis(self._sizes[self._part[which]], 2, 0).swapaxes(1, 2)
-        first = self._begins[self._part[which]].T
-        # The border ahead of `cell` is at `cell * pace + shift` metres.
-        shift = np.where(level | (which.T < 0), np.inf, ((step > 0) - place) * pace)
-        pace[level] = 0
-        crossing = np.where(which < 0, 0, crossing).T
-        rows = np.arange(len(left))
-        at = np.zeros(len(left))
-        left = left.copy()
-        while len(rows):
-            density, inside = self._density(cell, size, first)
-            density *= crossing
-            total = even.copy()
-            for one in density:
-                total += one
-            beyond = ~inside & np.isfinite(shift).any(axis=0)
-            if beyond.any():  # nothing is there any more, where it goes away
-                away = ((cell < 0) & (step <= 0)) | ((cell >= size) & (step >= 0))
-                shift[:, beyond & away.any(axis=0)] = np.inf
-            border = cell * pace + shift
-            ahead = np.minimum.reduce(border.reshape(-1, len(rows)))
-            stop = np.minimum(ahead, length)
-            lost = total * np.maximum(stop - at, 0)
-            met = lost > left
-            metres[rows[met]] = at[met] + left[met] / total[met]
-            there[rows[met]] = density[:, met].T
-            done = met | (ahead >= length)
-            left = left - lost
-            if done.any():
-                ends = rows[done & ~met]
-                rest[ends] = left[done & ~met]
-                on = np.flatnonzero(~done)
-                cell, step, pace, shift, size, border = (
-                    array[:, :, on] for array in (cell, step, pace, shift, size, border)
-                )
-                first = first[:, on]
-                crossing = crossing[:, on]
-                rows = rows[on]
-                ahead, even, left, length = (a[on] for a in (ahead, even, left, length))
-            cell = np.where(border <= ahead, cell + step, cell)
-            at = np.maximum(ahead, 0)  # the first may be before the start, by rounding
-        return metres, rest, there
+        parts = [
+            self._block_through(
+                instances[block],
+                starts[block],
+                directions[block],
+                crossing[block],
+                even_depth[block],
+                length[block],
+                depth[block],
+            )
+            for block in (
+                slice(k, k + BLOCK_RAYS) for k in range(0, max(len(depth), 1), BLOCK_RAYS)
+            )
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return GridPassage(*map(np.concatenate, zip(*parts, strict=True)))
 
-    def _density(self, cell: Floats, size: Floats, first: Any) -> tuple[Floats, Bools]:
-        """Densities of voxels (3, k, n), and whether they are in their grids: (k, n)."""
-        i, j, k = cell
-        inside = np.asarray(((cell >= 0) & (cell < size)).all(axis=0))
-        index = ((i * size[1] + j) * size[2] + k) + first
+    def _block_through(
+        self,
+        instances: Indices,
+        starts: Floats,
+        directions: Floats,
+        crossing: Floats,
+        even_depth: Floats,
+        length: Floats,
+        depth: Floats,
+    ) -> GridPassage:
+        """Follow a block of light, see `through`."""
+        passage = GridPassage(
+            np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
+        )
+        rays = self._enter(instances, starts, directions, crossing, even_depth, length, depth)
+        while len(rays.row):
+            density, inside = self._density(rays)
+            density *= rays.crossing
+            total = rays.even_depth.copy()
+            for grid_density in density:
+                total += grid_density
+            border = _border(rays, inside)
+            ahead = np.minimum.reduce(border.reshape(-1, len(rays.row)))
+            lost = total * np.maximum(np.minimum(ahead, rays.length) - rays.metres, 0)
+            leaf = lost > rays.depth
+            row = rays.row[leaf]
+            passage.metres[row] = rays.metres[leaf] + rays.depth[leaf] / total[leaf]
+            passage.density[row] = density[:, leaf].T
+            remaining = rays.depth - lost
+            at_end = ~leaf & (ahead >= rays.length)
+            passage.remaining_depth[rays.row[at_end]] = remaining[at_end]
+            rays = rays._replace(
+                depth=remaining,
+                metres=np.maximum(ahead, 0),  # a first border may be before the start, by rounding
+                cell=np.where(border <= ahead, rays.cell + rays.step, rays.cell),
+            )
+            followed = ~(leaf | at_end)
+            if not followed.all():
+                rays = rays.take(np.flatnonzero(followed))
+        return passage
+
+    def _enter(
+        self,
+        instances: Indices,
+        starts: Floats,
+        directions: Floats,
+        crossing: Floats,
+        even_depth: Floats,
+        length: Floats,
+        depth: Floats,
+    ) -> _GridRays:
+        """Return light in the voxels at its start, see `through`."""
+        to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
+        x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
+        u, v, w = directions.T[:, None]
+        # Product by product, for the same bits in every block.
+        position = np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in to_grid])
+        direction = np.stack([(row[0] * u + row[1] * v) + row[2] * w for row in to_grid])
+        level = np.abs(direction) < _LEVEL
+        step = np.where(level, 0, np.sign(direction))
+        pace = 1 / np.where(level, 1, direction)
+        never = level | (instances.T < 0)
+        shift = np.where(never, np.inf, ((step > 0) - position) * pace)
+        pace[level] = 0
+        return _GridRays(
+            row=np.arange(len(depth)),
+            even_depth=even_depth,
+            length=length,
+            depth=depth,
+            metres=np.zeros(len(depth)),
+            cell=np.floor(position),
+            step=step,
+            pace=pace,
+            shift=shift,
+            size=np.moveaxis(self._sizes[self._part[instances]], 2, 0).swapaxes(1, 2),
+            first=self._starts[self._part[instances]].T,
+            crossing=np.where(instances < 0, 0, crossing).T,
+        )
+
+    def _density(self, rays: _GridRays) -> tuple[Floats, Bools]:
+        """Return the densities at light, and whether its voxels are in a grid: (k, n) each."""
+        i, j, k = rays.cell
+        size = rays.size
+        inside = np.asarray(((rays.cell >= 0) & (rays.cell < size)).all(axis=0))
+        index = ((i * size[1] + j) * size[2] + k) + rays.first
         values = self._values[np.where(inside, index, 0).astype(np.intp)]
         return np.where(inside, values, 0.0), inside
+
+
+def _border(rays: _GridRays, inside: Bools) -> Floats:
+    """Return the distances to the borders ahead of light, (3, k, n), metres.
+
+    Writes infinite shifts for light that leaves a grid for ever.
+    """
+    beyond = ~inside & np.isfinite(rays.shift).any(axis=0)
+    if beyond.any():
+        in_front = (rays.cell < 0) & (rays.step <= 0)
+        behind = (rays.cell >= rays.size) & (rays.step >= 0)
+        leaves = (in_front | behind).any(axis=0)
+        rays.shift[:, beyond & leaves] = np.inf
+    return np.asarray(rays.cell * rays.pace + rays.shift)

@@ -1,4 +1,4 @@
-"""Loops over pulses that sample their waveforms and find returns in them: see waveform.py."""
+"""Loops over pulses that sample waveforms and find returns in the samples: see waveform.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -14,54 +14,73 @@ from raybeam.compiled import compiled, inlined, stage
 from ..base.arrays import Bools, Floats, Ints
 from ..base.elementary_loops import exp, log
 from ..sensor.optics import CUT
-from .pulse_loops import continue_surfaces
+from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 
-# All in standard deviations of the system waveform.
-# Hits within this are one echo in closed form: position and height err by 1e-3 at most.
+# In standard deviations of the system waveform:
+# hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
 NARROW = 0.25
-MEET = (
-    1.0  # planes of neighbouring hits that meet as closely are one surface, see `continue_surfaces`
-)
-APART = 6.0  # Gaussians that are farther apart are fitted separately
-CLOSE = 1.0  # Gaussians that are nearer are one return
+# planes of neighbouring hits that meet as closely are one surface, see `continue_surfaces`
+MEET = 1.0
+# Gaussians that are farther apart are fitted separately
+APART = 6.0
+# Gaussians that are nearer are one return
+CLOSE = 1.0
+# a fit may move a Gaussian so far from its first guess
+MOVES = 2.0
 
-FAINT = 0.01  # of the strongest echo around: weaker ones are not found
-CURVED = 0.005  # of the greatest curvature of that, likewise for Gaussians
-TOGETHER = 4  # Gaussians that are fitted together at most
-STEPS = 30  # of Levenberg and Marquardt at most
-# share of the squares that a step must gain, and squares that are none
-GAIN = 1e-3
-ENOUGH = 1e-9
-MOVES = 2.0  # standard deviations that a fit may move from its first guess
+FAINT = 0.01  # lowest peak that is found, by the highest peak of the waveform
+CURVED = 0.005  # smallest curvature of a Gaussian that is found, by the highest peak
+TOGETHER = 4  # largest number of Gaussians that are fitted together
+STEPS = 30  # largest number of steps of Levenberg and Marquardt
+GAIN = 1e-3  # smallest gain of a step after which a fit goes on, by the sum of squares
+ENOUGH = 1e-9  # sum of squares at which a fit stops
 HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
-_AREA = math.sqrt(2 * math.pi)
+_AREA = math.sqrt(2 * math.pi)  # of a Gaussian of height and standard deviation 1
+_KEY_STEPS = 1024  # steps of a sample in which times of hits and peaks are compared
 
 
 class WaveMarks(NamedTuple):
-    """Marks of hits by beam, then by distance: (n,) each."""
+    """Marks of hits in the order of beams and distances: (n,) each."""
 
     solid: Bools  # whether a surface was hit
-    new: Bools  # whether a waveform or a return begins here
+    starts: Bools  # whether a waveform or a return starts at the hit
     apart: Bools  # whether the surface of the hit before does not continue
     searched: Bools  # whether a surface was hit, of waveforms that may be searched
     every: Bools  # True
 
 
+class WaveHits(NamedTuple):
+    """Hits that have energy, in the order of beams and distances."""
+
+    beam: Ints  # (n,)
+    pulses: PulseHits
+    energy: Floats  # (n,)
+    velocity: Floats  # (n,): radial, m/s; empty if returns have none
+    marks: WaveMarks
+
+
 class WaveLight(NamedTuple):
-    """Light of hits by beam, then by distance: (n,) each."""
+    """Light of hits in the order of beams and distances: (n,) each."""
 
-    energy: Floats
-    velocity: Floats  # radial, m/s; empty if returns have none
-
-
-class WaveEchoes(NamedTuple):
-    """Echoes of hits in waveforms that were searched, see `search`."""
-
-    number: Ints  # (n,): number of the echo of which a hit is part, or -1
-    shapes: Floats  # (3, n): time of the echo, samples, its energy and width
+    time: Floats  # samples
+    energy: Floats  # of a pulse of energy 1
 
 
-class MadeWaveReturns(NamedTuple):
+class WaveSampling(NamedTuple):
+    """Sampling and search of waveforms."""
+
+    sigma: float  # standard deviation of the system waveform, samples
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
+
+
+class WavePeaks(NamedTuple):
+    """Peaks that hits have in waveforms that were searched, see `search`."""
+
+    number: Ints  # (n,): number of the peak to which a hit belongs, or -1
+    shapes: Floats  # (3, n): time of the peak, samples, its energy and width
+
+
+class WaveReturnArrays(NamedTuple):
     """Arrays to which returns are written: (k,) each."""
 
     beam: Ints
@@ -69,11 +88,11 @@ class MadeWaveReturns(NamedTuple):
     distance: Floats  # metres
     energy: Floats
     velocity: Floats  # radial, m/s
-    width: Floats  # of the system waveform's
+    width: Floats  # by the width of the system waveform
 
-    def first(self, count: int) -> MadeWaveReturns:
+    def first(self, count: int) -> WaveReturnArrays:
         """Return copies of the first returns, which a loop has written."""
-        return MadeWaveReturns(
+        return WaveReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
             self.distance[:count].copy(),
@@ -83,438 +102,603 @@ class MadeWaveReturns(NamedTuple):
         )
 
 
+class FitScratch(NamedTuple):
+    """Scratch memory for a fit of `TOGETHER` Gaussians to `length` samples."""
+
+    best: Floats  # (3, TOGETHER): heights, positions and widths; first the guess, then the fit
+    guess: Floats  # (3, TOGETHER)
+    trial: Floats  # (3, TOGETHER)
+    lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): Cholesky's lower triangle
+    slopes: Floats  # (3 * TOGETHER, length): of the Gaussians, by parameter
+    new_slopes: Floats  # (3 * TOGETHER, length)
+    residual: Floats  # (length,)
+    new_residual: Floats  # (length,)
+    step: Floats  # (3 * TOGETHER,)
+
+
+class GaussianScratch(NamedTuple):
+    """Scratch memory for a decomposition of `length` samples into Gaussians: (length,) each."""
+
+    curvature: Floats  # second differences of the samples
+    minima: Ints  # samples where the curvature has a minimum
+    x: Floats  # samples of a piece, in standard deviations of the system waveform
+    y: Floats  # heights of a piece, by the highest peak
+    time: Floats  # of the Gaussians, samples
+    height: Floats
+    width: Floats
+    fit: FitScratch
+
+
+class SearchScratch(NamedTuple):
+    """Scratch memory for waveforms of up to `length` samples."""
+
+    samples: Floats  # (length,)
+    peaks: Floats  # (3, length): times of peaks, samples, their energies and widths
+    stops: Ints  # (length,): where peaks end, in `_KEY_STEPS` of a sample, from the first sample
+    gaussians: GaussianScratch
+
+
+class SampledWaveform(NamedTuple):
+    """Samples of a part of a waveform."""
+
+    samples: Floats  # (length or more,)
+    length: np.int64
+    first: np.int64  # number of the first sample
+    top: float  # highest sample
+    sigma: float  # standard deviation of the system waveform, samples
+
+
 @stage
-def _sampled(when, share, begin, stop, sigma, many, low, w, length):
-    """Write the sum of echoes `begin` to `stop` to samples from `low` on; returns the highest."""
+def _sample(light, begin, stop, first, length, sigma, samples):
+    """Write the sum of the pulses of hits `begin` to `stop`; return the highest sample.
+
+    `samples` are numbered from `first` on; `length` samples are written.
+    """
+    time = light.time
+    energy = light.energy
+    pulse_samples = np.int64(2 * CUT * sigma) + 1
     for s in range(length):
-        w[s] = 0.0
+        samples[s] = 0.0
     for k in range(begin, stop):
-        first = np.int64(math.ceil(when[k] - CUT * sigma))
-        for s in range(first - low, first - low + many):
-            z = (s + low - when[k]) / sigma
-            w[s] += share[k] * exp(-0.5 * (z * z))
-    top = w[0]
+        first_of_pulse = np.int64(math.ceil(time[k] - CUT * sigma))
+        for s in range(first_of_pulse - first, first_of_pulse - first + pulse_samples):
+            z = (s + first - time[k]) / sigma
+            samples[s] += energy[k] * exp(-0.5 * (z * z))
+    top = samples[0]
     for s in range(length):
-        top = max(top, w[s])
+        top = max(top, samples[s])
     return top
 
 
-@stage
-def _peaks(w, length, low, top, sigma, until, found):
-    """Find local maxima: the last sample of each times 1024, and the echoes; returns how many.
+@inlined
+def _is_peak(samples, s, top):
+    """Return whether a sample is a local maximum that is not too faint."""
+    w = samples[s]
+    return w > samples[s - 1] and w >= samples[s + 1] and w >= FAINT * top
 
-    Their times and heights are those of the Gaussian through three samples, their energies the
-    areas between the lowest samples to both sides. Rows of `found` are times, energies and widths.
+
+@inlined
+def _vertex(samples, peak):
+    """Return the shift, samples, and the height of the Gaussian through three samples."""
+    if not (samples[peak - 1] > 0 and samples[peak + 1] > 0):
+        return 0.0, samples[peak]
+    log_before = log(samples[peak - 1])
+    log_peak = log(samples[peak])
+    log_behind = log(samples[peak + 1])
+    curve = min(log_before - 2 * log_peak + log_behind, -1e-12)
+    shift = min(max((log_before - log_behind) / (2 * curve), -0.5), 0.5)
+    height = exp(log_peak - (log_behind - log_before) * (log_behind - log_before) / (8 * curve))
+    return shift, height
+
+
+@stage
+def _peaks(wave, stops, peaks):
+    """Write the local maxima of a waveform to `stops` and `peaks`; return their number.
+
+    See `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
+    are the areas between the lowest samples to both sides.
     """
+    samples = wave.samples
+    length = wave.length
+    top = wave.top
     count = 0
     begin = 0
     s = 1
     while s < length - 1:
-        if not (w[s] > w[s - 1] and w[s] >= w[s + 1] and w[s] >= FAINT * top):
+        if not _is_peak(samples, s, top):
             s += 1
             continue
-        at = s
+        peak = s
         last = s
         s += 1
-        while s < length:  # to the next, or the end
-            if w[s] < w[last]:
+        while s < length:  # to the next peak, or the end
+            if samples[s] < samples[last]:
                 last = s
-            if s < length - 1 and w[s] > w[s - 1] and w[s] >= w[s + 1] and w[s] >= FAINT * top:
+            if s < length - 1 and _is_peak(samples, s, top):
                 break
             s += 1
         area = 0.0
         for k in range(begin, last + 1):
-            area += w[k]
-        height = w[at]
-        beside = 0.0
-        if w[at - 1] > 0 and w[at + 1] > 0:
-            before = log(w[at - 1])
-            here = log(w[at])
-            behind = log(w[at + 1])
-            curve = min(before - 2 * here + behind, -1e-12)
-            beside = min(max((before - behind) / (2 * curve), -0.5), 0.5)
-            height = exp(here - (behind - before) * (behind - before) / (8 * curve))
-        energy = area / (sigma * _AREA)
-        until[count] = 1024 * last
-        found[0, count] = at + low + beside
-        found[1, count] = energy
-        found[2, count] = energy / height
+            area += samples[k]
+        shift, height = _vertex(samples, peak)
+        energy = area / (wave.sigma * _AREA)
+        stops[count] = _KEY_STEPS * last
+        peaks[0, count] = peak + wave.first + shift
+        peaks[1, count] = energy
+        peaks[2, count] = energy / height
         begin = last + 1
         count = count + 1
     return count
 
 
 @stage
-def _misses(x, y, samples, peaks, count, rest, slopes):
-    """Write what a sum of Gaussians misses of samples, and its slopes; returns the squares."""
+def _residual(x, y, samples, gaussians, count, residual, slopes):
+    """Write the residual of a sum of Gaussians, and its slopes; return the sum of squares."""
     for s in range(samples):
-        rest[s] = y[s]
+        residual[s] = y[s]
     for k in range(count):
-        height = peaks[0, k]
-        place = peaks[1, k]
-        width = peaks[2, k]
+        height = gaussians[0, k]
+        position = gaussians[1, k]
+        width = gaussians[2, k]
         for s in range(samples):
-            z = (x[s] - place) / width
+            z = (x[s] - position) / width
             bell = exp(-0.5 * (z * z))
-            rest[s] -= height * bell
+            residual[s] -= height * bell
             slope = height * bell * z / width
             slopes[k, s] = bell
             slopes[count + k, s] = slope
             slopes[2 * count + k, s] = slope * z
     cost = 0.0
     for s in range(samples):
-        cost += rest[s] * rest[s]
+        cost += residual[s] * residual[s]
     return cost
 
 
 @stage
-def _step(rest, slopes, samples, count, damping, lower, step):
-    """Solve the equations of a step of Levenberg and Marquardt, by Cholesky's method."""
-    size = 3 * count
-    for row in range(size):
-        towards = 0.0
-        for s in range(samples):
-            towards += slopes[row, s] * rest[s]
-        step[row] = towards
-        for column in range(row + 1):
-            left = 0.0
-            for s in range(samples):
-                left += slopes[row, s] * slopes[column, s]
-            if row == column:
-                left = left * (1 + damping) + 1e-12
-            for k in range(column):
-                left -= lower[row, k] * lower[column, k]
-            if row == column:
-                lower[row, row] = math.sqrt(max(left, 1e-30))
-            else:
-                lower[row, column] = left / lower[column, column]
+def _solve(lower, size, step):
+    """Solve equations by their Cholesky factor; `step` holds the right side, then the result."""
     for row in range(size):
         for k in range(row):
             step[row] -= lower[row, k] * step[k]
         step[row] /= lower[row, row]
-    for back in range(size):
-        row = size - 1 - back
+    for from_last in range(size):
+        row = size - 1 - from_last
         for k in range(row + 1, size):
             step[row] -= lower[k, row] * step[k]
         step[row] /= lower[row, row]
 
 
 @stage
-def _fitted(x, y, samples, count, memory):
-    """Fit a sum of Gaussians by least squares: heights, places and widths (3, count).
+def _step(residual, slopes, samples, count, damping, lower, step):
+    """Write a step of Levenberg and Marquardt for `count` Gaussians, by Cholesky's method."""
+    size = 3 * count
+    for row in range(size):
+        gradient = 0.0
+        for s in range(samples):
+            gradient += slopes[row, s] * residual[s]
+        step[row] = gradient
+        for column in range(row + 1):
+            element = 0.0
+            for s in range(samples):
+                element += slopes[row, s] * slopes[column, s]
+            if row == column:
+                element = element * (1 + damping) + 1e-12
+            for k in range(column):
+                element -= lower[row, k] * lower[column, k]
+            if row == column:
+                lower[row, row] = math.sqrt(max(element, 1e-30))
+            else:
+                lower[row, column] = element / lower[column, column]
+    _solve(lower, size, step)
 
-    The method is that of Levenberg and Marquardt; it ends when a step gains nothing, or after
-    `STEPS`. Heights are `HIGHEST` at most, places within `MOVES` of the guess, and widths, standard
-    deviations, at least 1. The first of `memory` holds the guess, and receives the fit.
+
+@stage
+def _fit(x, y, samples, count, scratch):
+    """Fit a sum of `count` Gaussians to `samples` by least squares, in `scratch.best`.
+
+    The method is that of Levenberg and Marquardt; the fit stops when a step gains too little, or
+    after `STEPS`. Heights are at most `HIGHEST`, positions within `MOVES` of the guess, and widths,
+    standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess.
     """
-    best, guess, trial, lower, slopes, new_slopes, rest, new_rest, step = memory
+    best = scratch.best
+    guess = scratch.guess
+    trial = scratch.trial
+    step = scratch.step
+    slopes = scratch.slopes
+    new_slopes = scratch.new_slopes
+    residual = scratch.residual
+    new_residual = scratch.new_residual
     for row in range(3):
         for k in range(count):
             guess[row, k] = best[row, k]
     widest = max((x[samples - 1] - x[0]) / (4 * count), 1.5)
     damping = 1e-3
-    cost = _misses(x, y, samples, best, count, rest, slopes)
+    cost = _residual(x, y, samples, best, count, residual, slopes)
     for _ in range(STEPS):
-        _step(rest, slopes, samples, count, damping, lower, step)
+        _step(residual, slopes, samples, count, damping, scratch.lower, step)
         for k in range(count):
-            place = best[1, k] + step[count + k]
+            position = best[1, k] + step[count + k]
             trial[0, k] = min(max(best[0, k] + step[k], 0.0), HIGHEST)
-            trial[1, k] = min(max(place, guess[1, k] - MOVES), guess[1, k] + MOVES)
+            trial[1, k] = min(max(position, guess[1, k] - MOVES), guess[1, k] + MOVES)
             trial[2, k] = min(max(best[2, k] + step[2 * count + k], 1.0), widest)
-        now = _misses(x, y, samples, trial, count, new_rest, new_slopes)
-        better = now < cost
-        ends = better and cost - now <= GAIN * cost
-        ends = ends or now <= ENOUGH or damping >= 1e6
+        new_cost = _residual(x, y, samples, trial, count, new_residual, new_slopes)
+        better = new_cost < cost
+        converged = better and cost - new_cost <= GAIN * cost
+        converged = converged or new_cost <= ENOUGH or damping >= 1e6
         if better:
             for k in range(count):
                 best[0, k] = trial[0, k]
                 best[1, k] = trial[1, k]
                 best[2, k] = trial[2, k]
-            rest, new_rest, slopes, new_slopes = new_rest, rest, new_slopes, slopes
-            cost = now
-        if ends:
+            residual, new_residual, slopes, new_slopes = new_residual, residual, new_slopes, slopes
+            cost = new_cost
+        if converged:
             break
         damping = damping / 10 if better else damping * 10
 
 
 @stage
-def _gaussians(w, length, low, top, sigma, until, found, at, lines, memory):
-    """Decompose a waveform into Gaussians; as `_peaks`.
-
-    There is one for each minimum of the second derivative (after Hofton et al. 2000, who take the
-    points of inflection around them), none narrower than the system waveform.
-    """
-    bent, x, y, time, height, width = lines
-    fit = memory[0]
-    bent[0] = bent[length - 1] = 0.0
+def _guess_gaussians(wave, scratch):
+    """Write the minima of the second derivative to `minima`; return their number."""
+    samples = wave.samples
+    length = wave.length
+    variance = wave.sigma * wave.sigma
+    curvature = scratch.curvature
+    curvature[0] = curvature[length - 1] = 0.0
     for s in range(1, length - 1):
-        bent[s] = w[s - 1] - 2 * w[s] + w[s + 1]
+        curvature[s] = samples[s - 1] - 2 * samples[s] + samples[s + 1]
     count = 0
     for s in range(1, length - 1):
-        low_point = bent[s] < bent[s - 1] and bent[s] <= bent[s + 1]
-        if low_point and w[s] >= FAINT * top and -bent[s] * (sigma * sigma) >= CURVED * top:
-            at[count] = s
+        minimum = curvature[s] < curvature[s - 1] and curvature[s] <= curvature[s + 1]
+        visible = samples[s] >= FAINT * wave.top
+        if minimum and visible and -curvature[s] * variance >= CURVED * wave.top:
+            scratch.minima[count] = s
             count += 1
-    # of a piece that is fitted by itself: its first Gaussian and sample
-    begin = 0
-    first = 0
-    while begin < count:
-        stop = begin + 1
-        while stop < count and stop - begin < TOGETHER and at[stop] - at[stop - 1] <= APART * sigma:
-            stop += 1
-        end = (at[stop] + at[stop - 1]) // 2 + 1 if stop < count else length
-        origin = at[begin]
-        sums = 0.0
-        whole = 0.0
-        for s in range(first, end):
-            x[s - first] = (s - origin) / sigma
-            y[s - first] = w[s] / top
-            sums += w[s]
-        for k in range(begin, stop):
-            fit[0, k - begin] = min(w[at[k]], -bent[at[k]] * (sigma * sigma)) / top
-            fit[1, k - begin] = (at[k] - origin) / sigma
-            fit[2, k - begin] = 1.0
-        _fitted(x, y, end - first, stop - begin, memory)
-        for k in range(stop - begin):
-            whole += fit[0, k] * fit[2, k]
-        for k in range(begin, stop):
-            # What is beyond a cut, no sample tells; so energies are those of the piece together.
-            height[k] = fit[0, k - begin] * (sums / whole / (sigma * _AREA))
-            time[k] = fit[1, k - begin] * sigma + (origin + low)
-            width[k] = fit[2, k - begin]
-        begin = stop
-        first = end
-    # Each by its time, also where a fit went beyond its piece; those that are close are one.
-    kept = 0
+    return count
+
+
+@stage
+def _fit_piece(wave, begin, stop, first, end, scratch):
+    """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform."""
+    samples = wave.samples
+    sigma = wave.sigma
+    minima = scratch.minima
+    fit = scratch.fit.best
+    origin = minima[begin]
+    total = 0.0
+    area = 0.0
+    for s in range(first, end):
+        scratch.x[s - first] = (s - origin) / sigma
+        scratch.y[s - first] = samples[s] / wave.top
+        total += samples[s]
+    for k in range(begin, stop):
+        s = minima[k]
+        fit[0, k - begin] = min(samples[s], -scratch.curvature[s] * (sigma * sigma)) / wave.top
+        fit[1, k - begin] = (s - origin) / sigma
+        fit[2, k - begin] = 1.0
+    _fit(scratch.x, scratch.y, end - first, stop - begin, scratch.fit)
+    for k in range(stop - begin):
+        area += fit[0, k] * fit[2, k]
+    for k in range(begin, stop):
+        # Samples say nothing about what is beyond a cut, so the energies of a piece are scaled to
+        # the sum of its samples.
+        scratch.height[k] = fit[0, k - begin] * (total / area / (sigma * _AREA))
+        scratch.time[k] = fit[1, k - begin] * sigma + (origin + wave.first)
+        scratch.width[k] = fit[2, k - begin]
+
+
+@stage
+def _sort_gaussians(scratch, count, faintest):
+    """Sort Gaussians that are at least `faintest` high by time; return their number.
+
+    A fit may move a Gaussian beyond its piece.
+    """
+    time = scratch.time
+    height = scratch.height
+    width = scratch.width
+    sorted_count = 0
     for k in range(count):
-        if not height[k] >= FAINT * top:
+        if not height[k] >= faintest:
             continue
-        a = time[k]
-        b = height[k]
-        c = width[k]
-        place = kept
-        while place > 0 and time[place - 1] > a:
-            time[place] = time[place - 1]
-            height[place] = height[place - 1]
-            width[place] = width[place - 1]
-            place -= 1
-        time[place] = a
-        height[place] = b
-        width[place] = c
-        kept += 1
-    out = 0
+        time_k = time[k]
+        height_k = height[k]
+        width_k = width[k]
+        row = sorted_count
+        while row > 0 and time[row - 1] > time_k:
+            time[row] = time[row - 1]
+            height[row] = height[row - 1]
+            width[row] = width[row - 1]
+            row -= 1
+        time[row] = time_k
+        height[row] = height_k
+        width[row] = width_k
+        sorted_count += 1
+    return sorted_count
+
+
+@stage
+def _join_gaussians(wave, scratch, count, stops, peaks):
+    """Join close Gaussians, write the result to `stops` and `peaks`, and return its size."""
+    sigma = wave.sigma
+    time = scratch.time
+    height = scratch.height
+    width = scratch.width
+    peak = 0
     begin = 0
-    while begin < kept:
+    while begin < count:
         stop = begin
         energy = 0.0
         position = 0.0
         spread = 0.0
-        while stop == begin or (stop < kept and time[stop] - time[stop - 1] < CLOSE * sigma):
+        while stop == begin or (stop < count and time[stop] - time[stop - 1] < CLOSE * sigma):
             energy += height[stop] * width[stop]
             position += height[stop] * width[stop] * time[stop]
             stop += 1
         position /= energy
         for k in range(begin, stop):
-            off = (time[k] - position) / sigma
-            spread += height[k] * width[k] * (width[k] * width[k] + off * off)
-        found[0, out] = position
-        found[1, out] = energy
-        found[2, out] = math.sqrt(spread / energy)
-        if out:
-            middle = (found[0, out - 1] + position) / 2
-            until[out - 1] = np.int64(np.rint(middle * 1024)) - 1024 * low
-        until[out] = 1024 * length
+            offset = (time[k] - position) / sigma
+            spread += height[k] * width[k] * (width[k] * width[k] + offset * offset)
+        peaks[0, peak] = position
+        peaks[1, peak] = energy
+        peaks[2, peak] = math.sqrt(spread / energy)
+        if peak:
+            middle = (peaks[0, peak - 1] + position) / 2
+            stops[peak - 1] = np.int64(np.rint(middle * _KEY_STEPS)) - _KEY_STEPS * wave.first
+        stops[peak] = _KEY_STEPS * wave.length
         begin = stop
-        out = out + 1
-    return out
+        peak = peak + 1
+    return peak
+
+
+@stage
+def _gaussians(wave, scratch, stops, peaks):
+    """Decompose a waveform into Gaussians; write and return the same as `_peaks`.
+
+    Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who take the
+    points of inflection around the minima), none narrower than the system waveform.
+    """
+    minima = scratch.minima
+    count = _guess_gaussians(wave, scratch)
+    # A piece is fitted by itself: `begin` is its first Gaussian, `first` its first sample.
+    begin = 0
+    first = 0
+    while begin < count:
+        stop = begin + 1
+        while (
+            stop < count
+            and stop - begin < TOGETHER
+            and minima[stop] - minima[stop - 1] <= APART * wave.sigma
+        ):
+            stop += 1
+        end = (minima[stop] + minima[stop - 1]) // 2 + 1 if stop < count else wave.length
+        _fit_piece(wave, begin, stop, first, end, scratch)
+        begin = stop
+        first = end
+    count = _sort_gaussians(scratch, count, FAINT * wave.top)
+    return _join_gaussians(wave, scratch, count, stops, peaks)
 
 
 @compiled()
-def ordered(each, ray, distance, energy, row):
-    """Write rows of hits that have energy, by beam, then by distance; returns how many.
+def order_hits(subrays, ray, distance, energy, row):
+    """Write the rows of hits that have energy to `row[:, 0]`, by beam, then by distance.
 
-    The second number is that of the hits of a beam, at most.
+    Returns the number of hits, and the largest number of hits of a beam, of `subrays` sub-rays.
     """
     count = 0
     begin = 0
-    most = 0
+    max_hits = 0
     beam = -1
     for k in range(len(ray)):
         if not energy[k] > 0:
             continue
-        if ray[k] // each != beam:
+        if ray[k] // subrays != beam:
             begin = count
-            beam = ray[k] // each
-        place = count
-        while place > begin and distance[row[place - 1, 0]] > distance[k]:
-            row[place, 0] = row[place - 1, 0]
-            place -= 1
-        row[place, 0] = k
+            beam = ray[k] // subrays
+        index = count
+        while index > begin and distance[row[index - 1, 0]] > distance[k]:
+            row[index, 0] = row[index - 1, 0]
+            index -= 1
+        row[index, 0] = k
         count += 1
-        most = max(most, count - begin)
-    return count, most
+        max_hits = max(max_hits, count - begin)
+    return count, max_hits
 
 
 @inlined
-def _end(beam, begin):
-    """Where the hits of a beam end that begin at a row."""
+def _end_of_beam(beam, begin):
+    """Return the row after the last hit of a beam whose first hit is row `begin`."""
     end = begin + 1
     while end < len(beam) and beam[end] == beam[begin]:
         end += 1
     return end
 
 
-@compiled()
-def divide(beam, sigma_m, hits, marks, subrays, neighbours, parts):
-    """Mark where waveforms begin, and write those to be searched to `parts` (k, 2); how many.
+@inlined
+def _is_apart(apart, first, end):
+    """Return whether a surface does not continue at a hit after `first` and before `end`."""
+    any_apart = False
+    for k in range(first + 1, end):
+        any_apart |= apart[k]
+    return any_apart
 
-    Hits that are together, and yet not narrow, are searched unless they are on one surface. `beam`
-    is that of each of `hits`, which are `PulseHits`; `marks` are `WaveMarks`.
+
+@compiled()
+def divide(hits, sigma_m, neighbours, parts):  # noqa: PLR0914 - a compiled loop
+    """Mark where waveforms start, and write the rows of waveforms to search; return their number.
+
+    Hits that are together, and yet not narrow, are searched unless they are on one surface. `hits`
+    are `WaveHits`, `sigma_m` is the standard deviation of the system waveform, and `parts` (k, 2)
+    receives first hits and the hits after the last.
     """
-    distance = hits.distance
-    new = marks.new
-    apart = marks.apart
-    searched = marks.searched
+    beam = hits.beam
+    distance = hits.pulses.distance
+    starts = hits.marks.starts
+    apart = hits.marks.apart
+    searched = hits.marks.searched
+    surface_marks = SurfaceMarks(searched, hits.marks.every, apart)
     count = 0
     begin = 0
     while begin < len(beam):
-        end = _end(beam, begin)
-        before = count
+        end = _end_of_beam(beam, begin)
+        first_part = count
         first = begin
         for k in range(begin, end):
-            new[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
+            starts[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
             apart[k] = True
             searched[k] = False
         for k in range(begin + 1, end + 1):
-            if k < end and not new[k]:
+            if k < end and not starts[k]:
                 continue
             if distance[k - 1] - distance[first] > NARROW * sigma_m:
                 parts[count, 0] = first
                 parts[count, 1] = k
                 count += 1
                 for hit in range(first, k):
-                    searched[hit] = marks.solid[hit]
+                    searched[hit] = hits.marks.solid[hit]
             first = k
-        if count > before and len(neighbours.pairs):
-            continue_surfaces(
-                begin, end, marks.every, apart, searched, hits, MEET * sigma_m, subrays, neighbours
-            )
-        last = count
-        count = before
-        for part in range(before, last):
-            first = parts[part, 0]
-            end_of_part = parts[part, 1]
-            for k in range(first + 1, end_of_part):
-                if apart[k]:
-                    parts[count, 0] = first
-                    parts[count, 1] = end_of_part
-                    count += 1
-                    break
+        if count > first_part and len(neighbours.pairs):
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
+        last_part = count
+        count = first_part
+        for part in range(first_part, last_part):
+            if _is_apart(apart, parts[part, 0], parts[part, 1]):
+                parts[count, 0] = parts[part, 0]
+                parts[count, 1] = parts[part, 1]
+                count += 1
         begin = end
     return count
 
 
-def room_for(length):
-    """Make scratch memory for waveforms of so many samples, see `search`."""
-    fits = np.empty((3, 3, TOGETHER))
+def room_for(length: int) -> SearchScratch:
+    """Return scratch memory for waveforms of up to `length` samples."""
     size = 3 * TOGETHER
-    slopes = np.empty((2, size, length))
-    rest = np.empty((2, length))
-    memory = *fits, np.empty((size, size)), *slopes, *rest, np.empty(size)
-    marks = np.empty((2, length), np.int64)
-    lines = np.empty((7, length))
-    return lines[0], np.empty((3, length)), *marks, (*lines[1:],), memory
+    fit = FitScratch(
+        best=np.empty((3, TOGETHER)),
+        guess=np.empty((3, TOGETHER)),
+        trial=np.empty((3, TOGETHER)),
+        lower=np.empty((size, size)),
+        slopes=np.empty((size, length)),
+        new_slopes=np.empty((size, length)),
+        residual=np.empty(length),
+        new_residual=np.empty(length),
+        step=np.empty(size),
+    )
+    gaussians = GaussianScratch(
+        curvature=np.empty(length),
+        minima=np.empty(length, np.int64),
+        x=np.empty(length),
+        y=np.empty(length),
+        time=np.empty(length),
+        height=np.empty(length),
+        width=np.empty(length),
+        fit=fit,
+    )
+    peaks = np.empty((3, length))
+    return SearchScratch(np.empty(length), peaks, np.empty(length, np.int64), gaussians)
+
+
+@inlined
+def _peak_of_hit(time, wave, stops, count):
+    """Return the number of the peak of a waveform, among `count`, to which a hit belongs."""
+    key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
+    number = 0
+    while number < count - 1 and stops[number] < key:
+        number += 1
+    return number
 
 
 @compiled()
-def search(when, share, parts, sampling, new, echoes, room):
-    """Find the echoes of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` in each.
+def search(light, parts, sampling, starts, peaks, scratch):  # noqa: PLR0914 - a compiled loop
+    """Find the peaks of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` each.
 
-    `sampling` is the standard deviation of the system waveform in samples, and whether waveforms
-    are decomposed into Gaussians. Writes `WaveEchoes`, and marks hits that begin an echo.
+    `light` is a `WaveLight`, `sampling` a `WaveSampling`, and `scratch` a `SearchScratch`. Writes
+    `peaks`, `WavePeaks`, and marks in `starts` (n,) the first hits of peaks.
     """
-    sigma, decomposes = sampling
-    before = 0
-    many = np.int64(2 * CUT * sigma) + 1
-    w, rows, until, at, lines, memory = room
+    sigma = sampling.sigma
+    time = light.time
+    first_number = 0
+    pulse_samples = np.int64(2 * CUT * sigma) + 1
     for part in range(len(parts)):
         begin = parts[part, 0]
         stop = parts[part, 1]
-        low = np.int64(math.ceil(when[begin] - CUT * sigma)) - 1
-        length = np.int64(math.ceil(when[stop - 1] - CUT * sigma)) + many - low + 1
-        top = _sampled(when, share, begin, stop, sigma, many, low, w, length)
-        if decomposes:
-            count = _gaussians(w, length, low, top, sigma, until, rows, at, lines, memory)
+        first = np.int64(math.ceil(time[begin] - CUT * sigma)) - 1
+        last_first = np.int64(math.ceil(time[stop - 1] - CUT * sigma))
+        length = last_first + pulse_samples - first + 1
+        top = _sample(light, begin, stop, first, length, sigma, scratch.samples)
+        wave = SampledWaveform(scratch.samples, length, first, top, sigma)
+        if sampling.decomposes:
+            count = _gaussians(wave, scratch.gaussians, scratch.stops, scratch.peaks)
         else:
-            count = _peaks(w, length, low, top, sigma, until, rows)
+            count = _peaks(wave, scratch.stops, scratch.peaks)
         for k in range(begin, stop):
-            key = np.int64(np.rint(when[k] * 1024)) - 1024 * low
-            number = 0
-            while number < count - 1 and until[number] < key:
-                number += 1
-            echoes.number[k] = before + number if count else -1
+            number = _peak_of_hit(time[k], wave, scratch.stops, count)
+            peaks.number[k] = first_number + number if count else -1
             for row in range(3):
-                echoes.shapes[row, k] = rows[row, number]
+                peaks.shapes[row, k] = scratch.peaks[row, number]
             if k > begin:
-                new[k] = echoes.number[k] != echoes.number[k - 1]
-        before += count
+                starts[k] = peaks.number[k] != peaks.number[k - 1]
+        first_number += count
+
+
+@inlined
+def _write_return(hits, begin, stop, sigma_m, subrays, row, output):
+    """Write the return of hits `begin` to `stop`, a Gaussian with their mean and variance."""
+    energy = hits.energy
+    velocity = hits.velocity
+    distance = hits.pulses.distance
+    best = begin
+    sum_energy = 0.0
+    mean_m = 0.0
+    sum_velocity = 0.0
+    spread = 0.0
+    for hit in range(begin, stop):
+        sum_energy += energy[hit]
+        mean_m += energy[hit] * distance[hit]
+        if len(velocity):
+            sum_velocity += energy[hit] * velocity[hit]
+        if energy[hit] > energy[best]:
+            best = hit
+    mean_m /= sum_energy
+    for hit in range(begin, stop):
+        offset = (distance[hit] - mean_m) / sigma_m
+        spread += energy[hit] * (offset * offset)
+    output.beam[row] = hits.beam[begin]
+    output.row[row] = hits.pulses.row[best, 0]
+    output.distance[row] = mean_m
+    output.energy[row] = sum_energy / subrays
+    output.velocity[row] = sum_velocity / sum_energy
+    output.width[row] = math.sqrt(1 + spread / sum_energy)
 
 
 @compiled()
-def returns(beam, digitizer_m, hits, marks, subrays, neighbours, light, echoes, made):
-    """Make the returns of waveforms of beams, see `waveform.returns_in`; returns their number.
+def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):
+    """Write the returns of the waveforms of beams to `output`, see `waveform.returns_in`.
 
-    `digitizer_m` are the standard deviation of the system waveform in range and the samples in a
-    metre; `hits` are `PulseHits`, `marks` `WaveMarks`, `light` `WaveLight`, `echoes` `WaveEchoes`,
-    and `made` `MadeWaveReturns`.
+    `hits` are `WaveHits`, `peaks` `WavePeaks`, and `output` is a `WaveReturnArrays`; `sigma_m` is
+    the standard deviation of the system waveform in range. Returns the number of returns.
     """
-    sigma_m, per_m = digitizer_m
-    energy = light.energy
-    velocity = light.velocity
-    distance = hits.distance
-    number = echoes.number
-    new = marks.new
+    beam = hits.beam
+    number = peaks.number
+    starts = hits.marks.starts
+    surface_marks = SurfaceMarks(hits.marks.solid, starts, starts)
     count = 0
     begin = 0
     while begin < len(beam):
-        end = _end(beam, begin)
+        end = _end_of_beam(beam, begin)
         several = False
         for k in range(begin + 1, end):
-            several |= new[k]
+            several |= starts[k]
         if several and len(neighbours.pairs):
-            continue_surfaces(
-                begin, end, new, new, marks.solid, hits, MEET * sigma_m, subrays, neighbours
-            )
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
         for k in range(begin + 1, end + 1):
-            if k < end and not new[k]:
+            if k < end and not starts[k]:
                 continue
-            best = begin
-            sum_energy = 0.0
-            mean_m = 0.0
-            sum_velocity = 0.0
-            spread = 0.0
-            for hit in range(begin, k):
-                sum_energy += energy[hit]
-                mean_m += energy[hit] * distance[hit]
-                if len(velocity):
-                    sum_velocity += energy[hit] * velocity[hit]
-                if energy[hit] > energy[best]:
-                    best = hit
-            mean_m /= sum_energy
-            for hit in range(begin, k):
-                off = (distance[hit] - mean_m) / sigma_m
-                spread += energy[hit] * (off * off)
-            made.beam[count] = beam[begin]
-            made.row[count] = hits.row[best, 0]
-            made.distance[count] = mean_m
-            made.energy[count] = sum_energy / subrays
-            made.velocity[count] = sum_velocity / sum_energy
-            made.width[count] = math.sqrt(1 + spread / sum_energy)
-            # An echo with nothing else on its surface.
+            _write_return(hits, begin, k, sigma_m, neighbours.subrays, count, output)
+            # A peak whose hits are all in the return replaces the Gaussian of the hits.
             if number[begin] >= 0 and number[begin] == number[k - 1]:
-                made.distance[count] = echoes.shapes[0, begin] / per_m
-                made.energy[count] = echoes.shapes[1, begin]
-                made.width[count] = echoes.shapes[2, begin]
+                output.distance[count] = peaks.shapes[0, begin] / samples_per_m
+                output.energy[count] = peaks.shapes[1, begin]
+                output.width[count] = peaks.shapes[2, begin]
             count += 1
             begin = k
     return count

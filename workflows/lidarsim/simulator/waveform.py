@@ -1,23 +1,27 @@
-"""Waveforms: what a receiver gets of a pulse over time, and the returns that are found in it.
+"""Waveforms: the light of a pulse that a receiver gets over time, and the returns in a waveform.
 
 Pulse and receiver are Gaussian. So a waveform is a sum of Gaussians, one for each hit of a sub-ray,
 as wide as the pulse appears to the receiver: the system waveform (Wagner et al. 2006). Its height
-is in units of energy: an echo that nothing has stretched is as high as its energy.
+is in units of energy: a return that no slope has stretched is as high as its energy.
 
-Loops of wave_loops.py find the returns, pulse by pulse, so the batches do not matter.
+Loops of wave_loops.py find the returns, pulse by pulse, so batches do not change the result.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..base.arrays import Floats, owned
+from ..base.arrays import Floats, Ints, owned
 from ..sensor.optics import CUT, FWHM, LIGHT_M_NS
-from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made
+from .returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, required
 from .separation import neighbours_of
 from .step import PulseBatch, PulseStep, Role, Setup
+
+if TYPE_CHECKING:
+    from .wave_loops import WaveHits, WavePeaks
 
 
 class WaveformStep(PulseStep):
@@ -26,37 +30,38 @@ class WaveformStep(PulseStep):
     role = Role.CHANGES | Role.RECEIVES
     effects = ("Waveforms",)
     reads = "ray", "distance", "triangle", "energy", "velocity"
-    writes = *OF_RETURNS, "velocity", "width", "amplitude"
+    writes = *RETURN_COLUMNS, "velocity", "width", "amplitude"
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `PulseStep.applies`."""
+        """Return whether the sensor finds returns in waveforms."""
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """See `PulseStep.apply`."""
-        found = returns_in(returns, Digitizer.of(self.setup), batch.subrays_per_beam, batch.planes)
-        return found._replace(ray=batch.start + found.ray)
+        """Return the returns in the waveforms of the hits of a batch."""
+        digitizer = Digitizer.for_sensor(self.setup)
+        in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
+        return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
 
 
 @dataclass(frozen=True)
 class Digitizer:
-    """Standard deviation of the system waveform and the time between samples, ns."""
+    """Sampling of waveforms, and the search for returns."""
 
-    sigma_ns: float
-    sample_ns: float
-    decomposes: bool  # into Gaussians; else it finds peaks
+    sigma_ns: float  # standard deviation of the system waveform
+    sample_ns: float  # time between samples
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
 
     @classmethod
-    def of(cls, setup: Setup) -> Digitizer:
-        """Make that of a sensor."""
+    def for_sensor(cls, setup: Setup) -> Digitizer:
+        """Return the digitizer of a sensor."""
         reporting = setup.reporting
         system_ns = reporting.system_ns(setup.sensor.optics)
         return cls(system_ns, reporting.sample_ns, reporting.waveform == "gaussian")
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of the system waveform in range."""
+        """Standard deviation of the system waveform in range, metres."""
         return self.sigma_ns * LIGHT_M_NS / 2
 
     @property
@@ -66,71 +71,52 @@ class Digitizer:
 
     @property
     def reach(self) -> int:
-        """Samples before and behind an echo that it reaches."""
+        """Samples that a return reaches before and behind its peak."""
         return int(np.ceil(CUT * self.sigma))
 
     @property
-    def per_m(self) -> float:
+    def samples_per_m(self) -> float:
         """Samples in a metre of range."""
         return 2 / LIGHT_M_NS / self.sample_ns
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
-        """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
+        """Return heights of returns (n,) by energy and full width at half maximum, ns.
+
+        A width of 0 is unknown.
+        """
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
 
 
 def returns_in(
-    hits: PulseReturns, digitizer: Digitizer, each: int = 1, planes: Planes | None = None
+    hits: PulseReturns, digitizer: Digitizer, subrays: int = 1, planes: Planes | None = None
 ) -> PulseReturns:
-    """Make returns of the waveforms of beams; arguments and order as of `separated`.
+    """Return the returns in the waveforms of beams, in the order of beams and distances.
 
     Hits that lie close together, or on one surface (see `pulse_loops.continue_surfaces`), are one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
-    and colour of a return are those of its strongest hit.
-    """
-    from . import pulse_loops, wave_loops  # not before: numba takes half a second to import
+    and colour of a return come from its strongest hit.
 
-    ray = owned(hits.ray, np.int64)
-    distance = owned(hits.distance)
-    energy = owned(made(hits.energy))
-    row = np.empty((len(ray), 2), np.int64)
-    count, hits_most = wave_loops.ordered(each, ray, distance, energy, row)
-    row = row[:count]
-    order = row[:, 0]
-    light = wave_loops.WaveLight(
-        energy[order], np.zeros(0) if hits.velocity is None else owned(hits.velocity[order])
-    )
-    pulse_hits = pulse_loops.PulseHits(
-        subray=ray[order],
-        distance=distance[order],
-        row=row,
-        subray_hits=np.empty(hits_most * each, np.int64),
-        changes=np.empty(hits_most + 1, np.int64),
-    )
-    marks = wave_loops.WaveMarks(
-        solid=hits.triangle[order] != NO_SURFACE,
-        new=np.empty(count, np.bool_),
-        apart=np.empty(count, np.bool_),
-        searched=np.empty(count, np.bool_),
-        every=np.ones(count, np.bool_),
-    )
-    echoes = wave_loops.WaveEchoes(np.full(count, -1), np.empty((3, count)))
-    beam = pulse_hits.subray // each
-    neighbours = neighbours_of(each, planes)
+    Parameters
+    ----------
+    hits
+        Hits of sub-rays, in the order of sub-rays.
+    digitizer
+        Sampling of the waveforms.
+    subrays
+        Sub-rays of a beam.
+    planes
+        Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+    """
+    from . import wave_loops  # not before: numba takes half a second to import
+
+    wave_hits = _wave_hits(hits, subrays)
+    count = len(wave_hits.beam)
+    neighbours = neighbours_of(subrays, planes)
     parts = np.empty((count, 2), np.int64)
-    parts_count = wave_loops.divide(
-        beam, digitizer.sigma_m, pulse_hits, marks, each, neighbours, parts
-    )
-    parts = parts[:parts_count]
-    if len(parts):
-        lengths_m = pulse_hits.distance[parts[:, 1] - 1] - pulse_hits.distance[parts[:, 0]]
-        longest = int(float(lengths_m.max()) * digitizer.per_m)
-        room = wave_loops.room_for(longest + 2 * digitizer.reach + 8)
-        sampling = (digitizer.sigma, digitizer.decomposes)
-        when = pulse_hits.distance * digitizer.per_m
-        wave_loops.search(when, light.energy / each, parts, sampling, marks.new, echoes, room)
-    returns = wave_loops.MadeWaveReturns(
+    parts = parts[: wave_loops.divide(wave_hits, digitizer.sigma_m, neighbours, parts)]
+    peaks = _search(wave_hits, digitizer, subrays, parts)
+    output = wave_loops.WaveReturnArrays(
         beam=np.empty(count, np.int64),
         row=np.empty(count, np.int64),
         distance=np.empty(count),
@@ -138,17 +124,68 @@ def returns_in(
         velocity=np.empty(count),
         width=np.empty(count),
     )
-    digitizer_m = (digitizer.sigma_m, digitizer.per_m)
-    count = wave_loops.returns(
-        beam, digitizer_m, pulse_hits, marks, each, neighbours, light, echoes, returns
+    count = wave_loops.make_returns(
+        wave_hits, digitizer.sigma_m, digitizer.samples_per_m, neighbours, peaks, output
     )
-    returns = returns.first(count)
-    width = returns.width * (FWHM * digitizer.sigma_ns)
-    return hits.take(returns.row)._replace(
-        ray=returns.beam,
-        distance=returns.distance,
-        energy=returns.energy,
-        velocity=None if hits.velocity is None else returns.velocity,
+    output = output.first(count)
+    width = output.width * (FWHM * digitizer.sigma_ns)
+    return hits.take(output.row)._replace(
+        ray=output.beam,
+        distance=output.distance,
+        energy=output.energy,
+        velocity=None if hits.velocity is None else output.velocity,
         width=width,
-        amplitude=digitizer.amplitude(returns.energy, width),
+        amplitude=digitizer.amplitude(output.energy, width),
     )
+
+
+def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
+    """Return the hits that have energy for loops, by beam, then by distance."""
+    from . import pulse_loops, wave_loops
+
+    ray = owned(hits.ray, np.int64)
+    distance = owned(hits.distance)
+    energy = owned(required(hits.energy))
+    row = np.empty((len(ray), 2), np.int64)
+    count, max_hits = wave_loops.order_hits(subrays, ray, distance, energy, row)
+    row = row[:count]
+    order = row[:, 0]
+    pulse_hits = pulse_loops.PulseHits(
+        subray=ray[order],
+        distance=distance[order],
+        row=row,
+        subray_hits=np.empty(max_hits * subrays, np.int64),
+        changes=np.empty(max_hits + 1, np.int64),
+    )
+    marks = wave_loops.WaveMarks(
+        solid=hits.triangle[order] != NO_SURFACE,
+        starts=np.empty(count, np.bool_),
+        apart=np.empty(count, np.bool_),
+        searched=np.empty(count, np.bool_),
+        every=np.ones(count, np.bool_),
+    )
+    return wave_loops.WaveHits(
+        beam=pulse_hits.subray // subrays,
+        pulses=pulse_hits,
+        energy=energy[order],
+        velocity=np.zeros(0) if hits.velocity is None else owned(hits.velocity[order]),
+        marks=marks,
+    )
+
+
+def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> WavePeaks:
+    """Return the peaks of hits in waveforms; parts (k, 2) are first hits and ends of waveforms."""
+    from . import wave_loops
+
+    count = len(hits.beam)
+    peaks = wave_loops.WavePeaks(np.full(count, -1), np.empty((3, count)))
+    if not len(parts):
+        return peaks
+    distance = hits.pulses.distance
+    lengths_m = distance[parts[:, 1] - 1] - distance[parts[:, 0]]
+    longest = int(float(lengths_m.max()) * digitizer.samples_per_m)
+    scratch = wave_loops.room_for(longest + 2 * digitizer.reach + 8)
+    sampling = wave_loops.WaveSampling(digitizer.sigma, digitizer.decomposes)
+    light = wave_loops.WaveLight(distance * digitizer.samples_per_m, hits.energy / subrays)
+    wave_loops.search(light, parts, sampling, hits.marks.starts, peaks, scratch)
+    return peaks
