@@ -30,7 +30,7 @@ from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
 from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
-from .recordings import Recording, Turn, open_recording
+from .recordings import RecordedPoints, Recording, open_recording
 
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
@@ -156,7 +156,7 @@ def compare(
     )
     found = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg)
     first, second = recordings
-    if not first.whole and not second.whole:
+    if not first.is_cloud and not second.is_cloud:
         pairs = _pairs(first, second, match, found.notes)
         for number in sweeps or ():
             if not 0 <= number < len(pairs):
@@ -167,12 +167,12 @@ def compare(
             pairs = [pairs[number] for number in sorted({*sweeps})]
         budget = MOST_VALUES // len(pairs)
         for i, j in pairs:
-            found.add(first.turn(i), second.turn(j), budget)
+            found.add(first.read_points(i), second.read_points(j), budget)
         return found.result(len(pairs))
-    one = first if first.whole else second
+    one = first if first.is_cloud else second
     if sweeps or match == "time":
         raise LidarError(f"{one.name} has no sweeps: leave out --sweep and --match.")
-    if not first.whole or not second.whole:
+    if not first.is_cloud or not second.is_cloud:
         found.notes.append(f"{one.name} has no sweeps: all points of both are compared at once")
     found.add(found.cloud(first, most_points), found.cloud(second, most_points), MOST_VALUES)
     return found.result(0)
@@ -232,22 +232,22 @@ class _Comparing:
         if text not in self.notes:
             self.notes.append(text)
 
-    def cloud(self, one: Recording, most: int) -> Turn:
+    def cloud(self, one: Recording, most: int) -> RecordedPoints:
         """Read all points in the world's axes, or about so many, chosen evenly."""
         share = 1.0 if one.points is None else min(1.0, most / max(one.points, 1))
         parts = []
         for number in range(one.count):
-            part = one.turn(number, in_world=True)
+            part = one.read_points(number, in_world=True)
             parts.append(part.part(even_indices(len(part), round(share * len(part)))))
         if share == 1 or not parts:
-            return Turn.joined(parts)
+            return RecordedPoints.joined(parts)
         self.note(
             f"{one.name} has {one.points:,} points, of which {100 * share:.3g} % are compared, "
             "chosen evenly: distances to it are too long"
         )
-        return replace(Turn.joined(parts), rings=None)
+        return replace(RecordedPoints.joined(parts), rings=None)
 
-    def add(self, a: Turn, b: Turn, budget: int) -> None:
+    def add(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
         """Compare two sweeps or clouds, of each at most so many cells and points."""
         self.points += len(a), len(b)
         if max(len(a), len(b)) > budget:
@@ -266,7 +266,7 @@ class _Comparing:
             else:
                 found.append((distance, some.light, other.light[index]))
 
-    def _add_images(self, a: Turn, b: Turn, budget: int) -> None:
+    def _add_images(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
         first, second = self.recordings
         same = first.firings and first.firings == second.firings
         make = paired_images if same else range_images
@@ -320,7 +320,11 @@ class _Comparing:
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
             **{
-                key: {"name": one.name, "sweeps": None if one.whole else one.count, "points": count}
+                key: {
+                    "name": one.name,
+                    "sweeps": None if one.is_cloud else one.count,
+                    "points": count,
+                }
                 for key, one, count in zip("ab", self.recordings, self.points.tolist(), strict=True)
             },
             "pairs": pairs,
@@ -348,7 +352,7 @@ class _Comparing:
             "paired_by": images.paired_by,
             "columns": images.ranges[0].shape[1],
             "azimuth_step_deg": images.step_deg,
-            "hidden_points": dict(zip("ab", images.hidden, strict=True)),
+            "hidden_points": dict(zip("ab", images.hidden_shares, strict=True)),
             "residual": _residuals(residuals),
             "no_return": _no_return(sum(n for _, n in self.rings.values())) if gaps else None,
             "rings": [
@@ -448,7 +452,7 @@ def draw_ranges(found: Comparison) -> Page:
                 axes.plot([], [], "s", color=colour, ms=4, label=text)
             _key(page, axes)
         # As the sensor sees it: what is to its left is on the left.
-        begin = images.begin_deg - images.step_deg / 2
+        begin = images.start_deg - images.step_deg / 2
         end = begin + painted.shape[1] * images.step_deg
         extent = (end, begin, rows - 0.5, -0.5)
         axes.imshow(painted[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)

@@ -15,7 +15,7 @@ from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import plural
 
-from .recordings import Turn
+from .recordings import RecordedPoints
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
 _SAME = 0.15  # by how much single steps may differ from their mean
@@ -33,10 +33,12 @@ class RangeImages:
     rings: Ints  # (r,): as B numbers them, the highest first
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
-    begin_deg: float  # azimuth of the first
+    start_deg: float  # azimuth of the first
     # (2, 4, r, c): range, intensity, azimuth and elevation, degrees, in A and in B; NaN if unknown
     images: Floats
-    hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
+    hidden_shares: tuple[
+        float, float
+    ]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
     row: Ints  # (k,): of all cells, or of all rays that have a return
     compared: Floats  # (2, 2, k): range and intensity of these in A and in B, NaN where unknown
@@ -66,7 +68,7 @@ class _Polar:
     elevation: Floats  # (r,): medians, degrees
 
     @classmethod
-    def of(cls, turn: Turn, name: str) -> _Polar:
+    def of(cls, turn: RecordedPoints, name: str) -> _Polar:
         """Convert a sweep; LidarError if it has no rings, or they are not around its zero."""
         if turn.rings is None:
             raise LidarError(f"{name} has no rings: the range image needs a column ring or channel")
@@ -149,7 +151,7 @@ class _Polar:
 
 
 def range_images(
-    a: Turn, b: Turn, names: tuple[str, str], azimuth_deg: float | None = None
+    a: RecordedPoints, b: RecordedPoints, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
     """Put two sweeps of one sensor into the same cells.
 
@@ -197,7 +199,7 @@ def range_images(
 
 
 def paired_images(
-    a: Turn, b: Turn, names: tuple[str, str], azimuth_deg: float | None = None
+    a: RecordedPoints, b: RecordedPoints, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
     """Pair the ranges of each ray of two sweeps with the same rays; otherwise as `range_images`.
 
@@ -212,7 +214,7 @@ def paired_images(
         values[k, 1, own] = np.nan if turn.light is None else turn.light
     points = np.concatenate([a.points, b.points])[first]
     rings = np.append(a.rings, b.rings)[first]
-    every = Turn(points, rings, np.arange(len(first), dtype=np.float64))
+    every = RecordedPoints(points, rings, np.arange(len(first), dtype=np.float64))
     found = range_images(every, every, names, azimuth_deg)
     shown = np.nan_to_num(found.images[0, 1], nan=-1).astype(int)
     row = (rings[:, None] == found.rings).argmax(axis=1)

@@ -61,7 +61,7 @@ Read = tuple[AnyArray, Columns, Floats | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class RecordedPoints:
     """Points of a sweep, or of a part of a cloud."""
 
     points: Floats  # (n, 3): metres
@@ -72,14 +72,14 @@ class Turn:
     def __len__(self) -> int:
         return len(self.points)
 
-    def part(self, rows: Indices) -> Turn:
+    def part(self, rows: Indices) -> RecordedPoints:
         """Select points."""
         columns: Any = self.points, self.rings, self.light
         some: Any = (None if one is None else one[rows] for one in columns)
-        return Turn(*some)
+        return RecordedPoints(*some)
 
     @classmethod
-    def joined(cls, parts: list[Turn]) -> Turn:
+    def joined(cls, parts: list[RecordedPoints]) -> RecordedPoints:
         """Concatenate parts of one recording, which have the same columns."""
         if not parts:
             return cls(np.empty((0, 3)))
@@ -96,7 +96,7 @@ class Recording:
     count: int  # of sweeps, or of parts
     read: Callable[[int], Read]
     light: str | None = None  # the column of intensities, if it has another name than usual
-    whole: bool = False
+    is_cloud: bool = False
     points: int | None = None  # how many there are, if that is known before they are read
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
@@ -106,7 +106,7 @@ class Recording:
     firings: str = ""  # recordings with the same have the same rays; "" for unknown
     metres: Metres = _METRES  # in the units of x, y and z
 
-    def turn(self, number: int, *, in_world: bool = False) -> Turn:
+    def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
         """Read a sweep in its sensor's axes or the world's; LidarError if it cannot be."""
         with reading(self.name):
             points, columns, pose = self.read(number)
@@ -119,7 +119,7 @@ class Recording:
         # Drivers write NaN or zeros for pulses without a return.
         there = np.isfinite(places).all(axis=1) & places.any(axis=1)
         places = places[there] * self.metres
-        if in_world and not self.whole:
+        if in_world and not self.is_cloud:
             if pose is None:
                 raise LidarError(
                     f"{self.name} is in the axes of its sensor, and does not say where that was: "
@@ -131,7 +131,7 @@ class Recording:
             next((columns[name][there] for name in names if name in columns), None)
             for names in (_RINGS, lights)
         )
-        return Turn(
+        return RecordedPoints(
             places,
             None if rings is None else np.asarray(rings).astype(np.int64),
             None if light is None else np.asarray(light).astype(np.float64),
@@ -258,7 +258,7 @@ def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Rec
             columns = read_ply_columns(read_input(path))
             return _places(columns), columns, None
 
-        return Recording(name, 1, read, light, whole=True)
+        return Recording(name, 1, read, light, is_cloud=True)
     if not (beside := path.with_name(SWEEPS_FILE)).exists():
         return _of_cloud(name, cloud, None, sensor, light)
     try:
