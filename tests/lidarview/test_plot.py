@@ -121,7 +121,7 @@ def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     assert (way.name, way.moves) == ("nose", True)
     assert np.allclose(way.at(5e8), (7, 0, 1), atol=0.01)
     assert np.allclose(again.scene.solid(5e8).object_bounds[-1], [(7.5, 2, 0), (12.5, 4, 2)])
-    assert again.when == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
+    assert again.caption == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
     plot(tmp_path / "result", *SMALL)
     assert {"scene.png", "hits.png", "cloud.png"} <= names(tmp_path / "result")
 

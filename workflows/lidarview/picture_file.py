@@ -134,7 +134,7 @@ class PictureContent:
         return content, drawn
 
     @property
-    def when(self) -> str:
+    def caption(self) -> str:
         """Describe the sensors, and the time of pictures with motion: half of the survey."""
         sensors = len(self.sensors)
         actors = len(self.scene.actors)

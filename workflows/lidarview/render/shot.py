@@ -17,11 +17,11 @@ from raybeam import RayCaster
 
 from . import theme
 from .camera import Camera, fit_camera
-from .closeup import ShownPart, around_ways, floor_and_cut
+from .closeup import ShownPart, floor_and_cut, surrounding_box
 from .cutaway import cast_through, plan_cutaway
-from .light import STRIDE, alike, make_light_map, plane_tolerance
+from .light import STRIDE, make_light_map, plane_tolerance, surface_similarity
 from .stage import PlotBox
-from .surface import Surface, apart, unit
+from .surface import Surface, separate_objects, unit
 
 SIZE = (1600, 1000)  # pixels of a finished picture
 # Where the scene is: the title is above it, legend and colour bar are right of it.
@@ -31,8 +31,8 @@ SKY = -1
 GROUND = -2
 STEPS = 700  # points along a line where its visibility is tested
 # Of the scene's diagonal: between objects that touch, and to the pieces of a triangle.
-_APART = 5e-6
-_NEAR = 1e-6
+_OBJECT_GAP = 5e-6
+_PIECE_GAP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Samples:
     light: Floats32  # (n,) brightness: 1 on open ground
     weights: Floats32  # (n, 3) of the triangle's corners
 
-    def among(self, which: Ints, count: int) -> Samples:
+    def scattered(self, which: Ints, count: int) -> Samples:
         """Put the samples at `which` (n,) among `count`; the others are sky."""
         whole = Samples(
             np.full(count, SKY), np.full(count, np.inf, np.float32),
@@ -82,13 +82,13 @@ class SurfaceView:
     sensors: Floats  # (p, 3) metres, local coordinates
     paths: tuple[Floats, ...]  # of moving sensors, (k, 3) each
     actors: int  # number of actors, the last objects of the scene, which are labelled
-    when: str  # what is drawn, for a caption: how many sensors there are, and at what time
+    caption: str  # what is drawn, for a caption: how many sensors there are, and at what time
     models: str  # what the sensors are, for a caption
     stage: PlotBox
     camera: Camera
-    whole: Samples  # through the middle of each pixel
+    pixel_samples: Samples  # through the middle of each pixel
     edges: Ints  # (e,) pixels that show the edge of something
-    finer: Samples  # several of each of these in turn
+    edge_samples: Samples  # several of each of these in turn
 
     @property
     def scene(self) -> Scene:
@@ -98,7 +98,7 @@ class SurfaceView:
     @property
     def depth(self) -> Floats32:
         """Metres (height, width) from the eye to the surface in each pixel, infinite for none."""
-        return self.whole.distance.reshape(self.camera.size[::-1])
+        return self.pixel_samples.distance.reshape(self.camera.size[::-1])
 
     def paint(self, face_colours: Floats, contrast: float = 1.0) -> Floats32:
         """Colour the shot.
@@ -111,8 +111,8 @@ class SurfaceView:
         (height, width, 4) in 0 to 1: red, green and blue times opacity, and opacity. The page
         shows through the ground, and where there is nothing.
         """
-        image = self.whole.paint(face_colours, contrast)
-        finer = self.finer.paint(face_colours, contrast)
+        image = self.pixel_samples.paint(face_colours, contrast)
+        finer = self.edge_samples.paint(face_colours, contrast)
         if len(self.edges):
             image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
@@ -123,7 +123,7 @@ class SurfaceView:
         The first piece of each triangle has its number, and `owner` (k,) says whose each is.
         """
         cut = np.append(np.bincount(owner) > 1, [False, False])
-        back = _NEAR * self.stage.size
+        back = _PIECE_GAP * self.stage.size
         number = np.flatnonzero(cut[owner])
         if not len(number):
             return self
@@ -133,16 +133,18 @@ class SurfaceView:
         def find(samples: Samples) -> Samples:
             piece = samples.triangle.copy()
             weights = samples.weights.copy()
-            some = np.flatnonzero(cut[piece])
-            place = samples.position[some].astype(np.float64)
-            ahead = unit(place - self.camera.eye)
-            found = caster.cast(place - back * ahead, ahead, t_max=2 * back)
-            mine = owner[number[found.triangle]] == piece[some]
-            piece[some[mine]] = number[found.triangle[mine]]
-            weights[some] = np.stack([1 - found.u - found.v, found.u, found.v], axis=1)
+            indices = np.flatnonzero(cut[piece])
+            positions = samples.position[indices].astype(np.float64)
+            ahead = unit(positions - self.camera.eye)
+            hits = caster.cast(positions - back * ahead, ahead, t_max=2 * back)
+            is_piece = owner[number[hits.triangle]] == piece[indices]
+            piece[indices[is_piece]] = number[hits.triangle[is_piece]]
+            weights[indices] = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=1)
             return replace(samples, triangle=piece, weights=weights)
 
-        return replace(self, whole=find(self.whole), finer=find(self.finer))
+        return replace(
+            self, pixel_samples=find(self.pixel_samples), edge_samples=find(self.edge_samples)
+        )
 
     def visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
         """Pixel coordinates (n, 2) of points (n, 3), local metres, and whether they can be seen."""
@@ -153,26 +155,32 @@ class SurfaceView:
     def on_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
         """Pixel coordinates of points of the ground, and whether they are visible."""
         pixels, _ = self.camera.project(points)
-        bare = (self.whole.triangle < 0).reshape(self.depth.shape)
+        bare = (self.pixel_samples.triangle < 0).reshape(self.depth.shape)
         return pixels, self.camera.look_up(bare, pixels, False)
 
     def runs(
-        self, segments: Floats, seen: Callable[[Floats], tuple[Floats, Bools]]
+        self, segments: Floats, is_visible: Callable[[Floats], tuple[Floats, Bools]]
     ) -> list[Floats]:
-        """Split line segments (n, 2, 3) into their visible pieces; `seen` tells whether they are.
+        """Split line segments (n, 2, 3) into their visible pieces; `is_visible` tells whether they are.
 
         Returns the pixel coordinates (2, 2) of the ends of each piece.
         """
         # Steps of equal length in the picture: interpolate 1 / depth, which is linear there.
-        near, far = ((segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1))
+        start_depth, stop_depth = (
+            (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
+        )
         s = np.linspace(0, 1, STEPS)[None]
-        share = s * near[:, None] / (far[:, None] * (1 - s) + s * near[:, None])
+        share = (
+            s * start_depth[:, None] / (stop_depth[:, None] * (1 - s) + s * start_depth[:, None])
+        )
         path = segments[:, :1] + share[..., None] * (segments[:, 1:] - segments[:, :1])
-        pixels, shown = seen(path.reshape(-1, 3))
+        pixels, shown = is_visible(path.reshape(-1, 3))
         out = []
-        for line, there in zip(pixels.reshape(-1, STEPS, 2), shown.reshape(-1, STEPS), strict=True):
-            turns = np.flatnonzero(np.diff(there, prepend=False, append=False))
-            out += [line[[first, last - 1]] for first, last in turns.reshape(-1, 2)]
+        for line, visible in zip(
+            pixels.reshape(-1, STEPS, 2), shown.reshape(-1, STEPS), strict=True
+        ):
+            changes = np.flatnonzero(np.diff(visible, prepend=False, append=False))
+            out += [line[[first, last - 1]] for first, last in changes.reshape(-1, 2)]
         return out
 
 
@@ -181,9 +189,9 @@ def take_shot(
     poses: ArrayLike,
     *,
     paths: Sequence[Floats] = (),
-    around: Sequence[Floats] = (),
+    trajectories: Sequence[Floats] = (),
     actors: int = 0,
-    when: str = "",
+    caption: str = "",
     models: str = "",
     size: tuple[int, int] = SIZE,
     backend: str = "auto",
@@ -202,35 +210,37 @@ def take_shot(
         (p, 3) sensor positions, world coordinates.
     paths
         Trajectories of moving sensors, (k, 3) each, local coordinates.
-    around
+    trajectories
         Trajectories in a scene that may be much larger: only their surroundings are shown then,
         and the caption says so.
     actors
         How many of the last objects are actors.
-    when, models
+    caption, models
         Captions: the number of sensors, by default, and the time; what the sensors are.
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
     everywhere = np.concatenate([sensors, *paths])
-    when = when or plural(len(sensors), "sensor position")
-    box = around_ways(scene.bounds, around)
-    part = ShownPart.whole(scene) if box is None else ShownPart.whole(scene).cut(box)
+    caption = caption or plural(len(sensors), "sensor position")
+    box = surrounding_box(scene.bounds, trajectories)
+    part = ShownPart.from_scene(scene) if box is None else ShownPart.from_scene(scene).cut(box)
     bounds = part.scene.bounds
-    step = _APART * float(np.linalg.norm(np.ptp(bounds, 0)))
-    part = uncut = replace(part, scene=apart(part.scene, part.scene.face_object, step))
-    surface = Surface.of(part.scene, backend)
+    step = _OBJECT_GAP * float(np.linalg.norm(np.ptp(bounds, 0)))
+    part = uncut = replace(part, scene=separate_objects(part.scene, part.scene.face_object, step))
+    surface = Surface.from_scene(part.scene, backend)
     cut = None
     if box is not None and len(everywhere):
         _, cut = floor_and_cut(part.scene, surface.caster, everywhere)
     if cut is not None:
         bounds = bounds.clip(max=[np.inf, np.inf, cut])
         part = part.cut(bounds)
-        surface = Surface.of(part.scene, backend)
+        surface = Surface.from_scene(part.scene, backend)
     scene = part.scene
     if box is not None:
         wide, deep, _ = np.ptp(box, axis=0)
         top = scene.origin[2] + (box[1, 2] if cut is None else cut)
-        when += f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
+        caption += (
+            f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
+        )
     stage = _stage(bounds, everywhere, scene.origin)
     # Moving objects are on the ground, between other objects.
     camera = _camera(stage, size, 48.0 if paths or actors else 33.0)
@@ -265,7 +275,7 @@ def take_shot(
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     centres = np.asarray(grid.reshape(-1, 2) + 0.5)
     inside = np.flatnonzero(_outline(stage, camera))
-    whole = see(centres[inside]).among(inside, len(centres))
+    whole = see(centres[inside]).scattered(inside, len(centres))
     coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
     light = make_light_map(
         surface, cutaway, camera, whole.position.reshape(height, width, 3)[coarse],
@@ -287,7 +297,7 @@ def take_shot(
         sensors,
         tuple(paths),
         actors,
-        when,
+        caption,
         models,
         stage,
         camera,
@@ -299,28 +309,28 @@ def take_shot(
 
 def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
     """Choose the box to show: that of the scene, and the sensors that are near it."""
-    low, high = bounds
-    reach = 2 * max(float(np.linalg.norm(high - low)), 1e-3)
-    near = sensors[((sensors > low - reach) & (sensors < high + reach)).all(axis=1)]
-    shown = np.concatenate([bounds, near])
-    return PlotBox.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
+    lower, upper = bounds
+    reach = 2 * max(float(np.linalg.norm(upper - lower)), 1e-3)
+    close_sensors = sensors[((sensors > lower - reach) & (sensors < upper + reach)).all(axis=1)]
+    shown = np.concatenate([bounds, close_sensors])
+    return PlotBox.from_bounds(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
 
 
 def _camera(stage: PlotBox, size: tuple[int, int], elevation_deg: float) -> Camera:
     """Look along the diagonal, so that the wider side of the stage runs across the picture."""
-    wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
+    is_wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
     top = stage.corners.copy()
     top[:, 2] = stage.bounds[1, 2]
     # The scene is inside the ground's margin, and so is its top.
     top[:, :2] = np.clip(top[:, :2], stage.bounds[0, :2], stage.bounds[1, :2])
     corners = np.concatenate([stage.corners, top])
-    return fit_camera(corners, size, FRAME, -62.0 if wide else -28.0, elevation_deg)
+    return fit_camera(corners, size, FRAME, -62.0 if is_wide else -28.0, elevation_deg)
 
 
 def _outline(stage: PlotBox, camera: Camera) -> Bools:
     """Whether the stage's box can be seen through each pixel, (pixels,)."""
-    ends = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
-    flat, _ = camera.project(list(product(*ends)))
+    limits = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
+    flat, _ = camera.project(list(product(*limits)))
     image = Image.new("1", camera.size)
     for side in (0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5):
         corners = [(float(x), float(y)) for x, y in flat[list(side)]]
@@ -332,25 +342,25 @@ def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
     """Metres (n,) from the eye to the ground's rectangle along directions (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]
-        place = eye[:2] + distance[:, None] * directions[:, :2]
-    inside = ((place >= stage.ground[0]) & (place <= stage.ground[1])).all(axis=1)
+        position = eye[:2] + distance[:, None] * directions[:, :2]
+    inside = ((position >= stage.ground[0]) & (position <= stage.ground[1])).all(axis=1)
     return np.where(inside & (distance > 0), distance, np.inf)
 
 
-def _edges(whole: Samples, scene: Scene, camera: Camera) -> Bools:
+def _edges(samples: Samples, scene: Scene, camera: Camera) -> Bools:
     """Whether each pixel shows another object or surface than one beside it, (pixels,)."""
     width, height = camera.size
-    kind = np.append(scene.face_object, [GROUND, SKY])[whole.triangle]
+    kind = np.append(scene.face_object, [GROUND, SKY])[samples.triangle]
     number = np.arange(width * height).reshape(height, width)
     edge = np.zeros(width * height, np.bool_)
-    surface = whole.triangle != SKY
-    tolerance = plane_tolerance(camera, whole.position, 1)
-    for here, beside in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
-        some = surface[here] | surface[beside]
-        a = here[some]
-        b = beside[some]
-        spot = whole.position[b], whole.normal[b], tolerance[a]
-        same = alike(whole.position[a], whole.normal[a], *spot) > 0.3
-        differs = (kind[a] != kind[b]) | ~same & (kind[a] != SKY)
+    surface = samples.triangle != SKY
+    tolerance = plane_tolerance(camera, samples.position, 1)
+    for pixels, neighbours in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
+        has_surface = surface[pixels] | surface[neighbours]
+        a = pixels[has_surface]
+        b = neighbours[has_surface]
+        spot = samples.position[b], samples.normal[b], tolerance[a]
+        is_same = surface_similarity(samples.position[a], samples.normal[a], *spot) > 0.3
+        differs = (kind[a] != kind[b]) | ~is_same & (kind[a] != SKY)
         edge[a[differs]] = edge[b[differs]] = True
     return edge

@@ -46,11 +46,11 @@ def object_colours(count: int) -> Floats:
     lightness in three steps.
     """
     chosen = [to_rgb(colour) for colour in OBJECT_COLOURS[:count]]
-    more = [
+    further = [
         colorsys.hls_to_rgb((0.08 + 0.618034 * n) % 1.0, (0.42, 0.56, 0.68)[n % 3], 0.5)
         for n in range(count - len(chosen))
     ]
-    return np.array(chosen + more, dtype=np.float64).reshape(count, 3)
+    return np.array(chosen + further, dtype=np.float64).reshape(count, 3)
 
 
 def mapped(name: str, fraction: ArrayLike) -> Floats:

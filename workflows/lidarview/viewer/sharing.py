@@ -147,14 +147,16 @@ def _film(view: View, max_frames: int) -> Film:
     spans = [_scans_between(view.sweeps, *interval) for interval in intervals]
     all_points = max(_FILM_POINTS, min(len(view.points), _FRAME_POINTS * frames))
     parts = (read(_FRAME_POINTS, scans) for scans in spans)
-    film = replace(film, parts=parts, kept=_FILM_POINTS / all_points)
+    film = replace(film, parts=parts, keep_share=_FILM_POINTS / all_points)
     if moving:
         sensor = moving[0]
         halfway = sensor.at(moments[frames // 2])
         local, _ = read(_FRAME_POINTS, spans[frames // 2])
         ranges = np.linalg.norm(local - halfway, axis=1)
         range_m = float(np.median(ranges)) if len(ranges) else 20.0
-        film = replace(film, way=(sensor.times_ns, sensor.positions), range_m=range_m)
+        film = replace(
+            film, carrier_trajectory=(sensor.times_ns, sensor.positions), range_m=range_m
+        )
     return film
 
 

@@ -41,9 +41,9 @@ from ..picture_file import (
     SensorPositions,
     moving_positions,
 )
-from ..render.closeup import around_ways, floor_and_cut
+from ..render.closeup import floor_and_cut, surrounding_box
 from ..render.colouring import (
-    MOST_ENTRIES,
+    MAX_UNNAMED_LABELS,
     TURBO,
     Colouring,
     colours_of,
@@ -52,7 +52,7 @@ from ..render.colouring import (
     word_of,
 )
 from ..render.hit_density import HITS_TITLE, hit_colours
-from ..render.surface import apart
+from ..render.surface import separate_objects
 from ..render.theme import mapped, object_colours
 from .point_selection import (
     RESULT,
@@ -236,7 +236,7 @@ class View:
 
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
-        near = around_ways(
+        near = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
         box = self._bounds if near is None else near
@@ -420,7 +420,7 @@ class View:
         values = values[np.isfinite(values)]
         names = self._names(name)
         found = np.unique(values)
-        few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
+        few = len(found) <= (_MOST_NAMES if names else MAX_UNNAMED_LABELS) and name != "scan"
         if column.kind == "label" and len(found) and few:
             labels = [
                 [word_of(value, column, names), value] for value in found.astype(np.int64).tolist()
@@ -585,7 +585,7 @@ class ShownSurface:
             self.coarse, self._stands = simplified(scene, most)
         self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
-        moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
+        moved = separate_objects(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
     def coloured(
