@@ -33,8 +33,8 @@ from .shot import SurfaceView
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are small dots
-MAX_PATH_POINTS = 200  # of which the way of a sensor is drawn
-MAX_NAMES = 12  # of actors beside what they name
+MAX_PATH_POINTS = 200  # of the drawn trajectory of a sensor
+MAX_NAMES = 12  # of actors, beside them
 # pixels of a picture 1600 wide
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
@@ -51,7 +51,7 @@ MIN_AXIS = 36.0  # a shorter height axis has no room for numbers
 
 
 class Page:
-    """One picture under construction; its size is (width, height) in pixels."""
+    """A picture under construction; its size is (width, height) in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -164,14 +164,14 @@ class Page:
             )  # fmt: skip
 
     def _name_actors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Name the actors, if they are few, each above its position; paler if hidden.
+        """Name the actors, if there are not too many, above their positions; paler if hidden.
 
-        Of a robot, whose links are called ROBOT/LINK, the first has its name.
+        Of a robot, whose links are called ROBOT/LINK, the first link has its name.
         """
         boxes = shot.scene.object_bounds
         label_positions = np.empty((0, 2))
         actor_indices = np.arange(len(boxes) - shot.actors, len(boxes))
-        # Absent ones are one point.
+        # Absent actors are a single point.
         is_present = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
         actor_indices = actor_indices[is_present[actor_indices]]
         names = [robot_name(shot.scene.names[k]) for k in actor_indices]
@@ -205,7 +205,7 @@ class Page:
             self._text(axes, position, shortened(name), 6.6, ink, **style)
 
     def numbers(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
+        """Write numbers from 1 on the sensors' markers; hidden sensors have white markers."""
         pixels, is_visible = shot.visible(shot.sensors)
         for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
             x = float(pixels[k, 0])
@@ -231,7 +231,7 @@ class Page:
         )
 
     def chart(self, frame: tuple[float, float, float, float], **options: Any) -> Axes:
-        """Axes with a grid in a frame: left, bottom, width and height as fractions of the page."""
+        """Add axes with a grid in a frame: left, bottom, width and height, fractions of the page."""
         axes = self.figure.add_axes(frame)
         small = 0.6 * self.unit
         axes.set(facecolor=theme.GROUND, axisbelow=True, **options)
@@ -246,7 +246,7 @@ class Page:
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, and lines of detail under it."""
+        """Write a title at the top left, above lines of detail."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
         position = 0.03, 1 - line
         self._text(self.figure, position, text, 11, theme.INK, ha="left", weight="bold")
@@ -264,7 +264,7 @@ class Page:
         axes.set_title(text, loc="left", parse_math=False, **style)
 
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
-        """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
+        """Draw a legend of (name, colour) in the right margin; the last line counts the rest."""
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
         rows.append(("o", sensor, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
@@ -286,7 +286,7 @@ class Page:
         parent: Axes | Figure | None = None,
         **options: Any,
     ) -> None:
-        """Put a legend of handles into the right margin, or elsewhere; `size` in points."""
+        """Draw a legend of handles in the right margin, or on a parent; `size` in points."""
         style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
         legend = (parent or self.figure).legend(
@@ -306,7 +306,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
+        """Draw a colour bar of colours (n, 3) in the right margin, beside its title."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
@@ -322,7 +322,7 @@ class Page:
             label_logarithms(axes.yaxis, is_narrow)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colours; a link in its place goes.
+        """Write the page as a PNG, in its light colours; a link at the path is replaced.
 
         Raises
         ------
@@ -340,14 +340,14 @@ class Page:
         return image.getvalue()
 
     def svg(self) -> str:
-        """Return the page as an element of HTML, whose ink may follow the style around it.
+        """Return the page as an element of HTML, whose ink may follow the style of a document.
 
         The colours of `theme.STYLED` are variables of CSS, such as --picture-ink.
         """
         text = io.StringIO()
         with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
             self.figure.savefig(text, format="svg", dpi=DPI, metadata={"Date": None})
-        # Without what all elements of the document would share, and nobody reads.
+        # Comments and styles would be repeated by all elements of a document.
         svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
         svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
         svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
@@ -357,14 +357,14 @@ class Page:
 
 
 def label_logarithms(axis: Axis, is_narrow: bool) -> None:
-    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis, or powers of ten if not few."""
+    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis; powers of ten if not narrow."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Lines (n, 2, 3) of the ground: its border, and one at each tick."""
+    """Return lines (n, 2, 3) of the ground: its border, and a line at each tick."""
     (x0, y0), (x1, y1) = shot.stage.ground.tolist()
     level = shot.stage.level
     x_ticks, y_ticks = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
@@ -375,7 +375,7 @@ def _grid(shot: SurfaceView) -> Floats:
 
 
 def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
-    """For x, y and z: two ends (3,) in the scene, and the outward direction (2,) in the picture."""
+    """Return the ends (3,) of the axes x, y and z, and the outward direction (2,) in the picture."""
     corners = shot.stage.corners
     flat, _ = shot.camera.project(corners)
     middle, _ = shot.camera.project(corners.mean(axis=0)[None])
@@ -392,6 +392,6 @@ def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def robot_name(name: str) -> str:
-    """Name of the robot of a link, ROBOT/LINK; of another actor its own."""
+    """Return the robot of a link, ROBOT/LINK; the name itself for all other actors."""
     # Traffic has names of its files in brackets, with any letters.
     return name if "(" in name else name.partition("/")[0]

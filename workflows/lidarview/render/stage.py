@@ -9,24 +9,24 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 
-# Numbers of more digits than this are not read: far coordinates are labelled from an offset.
+# Longer numbers are hard to read: coordinates with more digits are labelled from an offset.
 MAX_DIGITS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """Ticks of one axis."""
+    """Ticks of an axis."""
 
-    title: str  # its name, what the labels leave out, and unit
+    title: str  # name, offset of the labels, and unit
     ticks: Floats  # (n,) local metres; round numbers in world coordinates
-    labels: tuple[str, ...]  # the world coordinates, less what the title says
+    labels: tuple[str, ...]  # world coordinates, less the offset in the title
 
 
 @dataclass(frozen=True, eq=False)
 class PlotBox:
-    """A box with round ticks on its axes, and the ground rectangle under it; local metres."""
+    """A box with round ticks on its axes, above a ground rectangle; local metres."""
 
-    bounds: Floats  # (2, 3) lowest and highest corner of what is shown
+    bounds: Floats  # (2, 3) lowest and highest corner of the shown part
     ground: Floats  # (2, 2) lowest and highest corner of the ground
     level: float  # height of the ground, a little under the lowest point
     axes: tuple[Axis, Axis, Axis]

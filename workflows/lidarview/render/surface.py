@@ -38,7 +38,7 @@ class Surface:
         return cls(scene, caster, unit(doubled), unit(at_vertices))
 
     def normals(self, triangle: Ints, u: Floats, v: Floats, towards: Floats) -> Floats:
-        """Shading normals (n, 3) at hits, on the side of the ray.
+        """Return shading normals (n, 3) at hits, on the side of the ray.
 
         Interpolated from the corners (Phong 1975), except across creases, where the face's normal
         replaces a corner's. `towards` (n, 3) are the directions of the rays.
@@ -56,7 +56,7 @@ class Surface:
 
 
 def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
-    """Move surfaces inwards a little, so that objects that touch do not show through each other.
+    """Move surfaces inwards a little, so that objects in contact do not show through.
 
     Each vertex moves against the mean of the normals around it, weighted by angle (Thürmer and
     Wüthrich, 1998), so that the sides of a box all move by `step` metres, or up to three times as
@@ -85,7 +85,7 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
 
 
 def _shared_corners(scene: Scene, objects: Integers) -> Ints:
-    """Return a number (v,) for each vertex, the same for those of one object at one place.
+    """Return a number (v,) for each vertex, shared by vertices of an object at the same position.
 
     Files such as .stl have three vertices for each triangle, which must not come apart.
     """
@@ -98,7 +98,7 @@ def _shared_corners(scene: Scene, objects: Integers) -> Ints:
 
 
 def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Scalar products (...,) of vectors (..., 3)."""
+    """Return the scalar products (...,) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
@@ -112,6 +112,6 @@ def spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
 
 
 def unit(vectors: Floats) -> Floats:
-    """Scale vectors (n, 3) to length one; those of no length stay zero."""
+    """Scale vectors (n, 3) to length 1; zero vectors stay zero."""
     length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1.0)
