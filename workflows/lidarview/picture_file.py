@@ -26,8 +26,8 @@ from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
 
 PICTURE_FILE = "pictures.npz"
 
-MODELS_MOST = 4  # sensors named in a picture
-PLACES_MOST = 1000  # positions of a moving sensor or actor
+MAX_MODELS = 4  # sensors named in a picture
+MAX_POSITIONS = 1000  # positions of a moving sensor or actor
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
@@ -49,7 +49,7 @@ class SensorPositions:
     name: str = ""  # "" for a single sensor
     model: str = ""
 
-    def at(self, time_ns: float) -> Floats:
+    def position_at(self, time_ns: float) -> Floats:
         """Return the position at a time, (3,)."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
@@ -94,7 +94,9 @@ class PictureContent:
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: PlanningPicture | None = None
     duration_ns: float = 0.0  # of the survey, by its own clock
-    own: Sequence[Column] = ()  # columns of the cloud's file that are not in the table of columns
+    extra_columns: Sequence[
+        Column
+    ] = ()  # columns of the cloud's file that are not in the table of columns
     # (objects,): share of light that each reflects, actors after the others; None if unknown.
     reflectance: Floats | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
@@ -110,7 +112,7 @@ class PictureContent:
 
         The drawn scene turns hits of the scene's triangles into `hit_counts`.
         """
-        samples = samples_each(scene.actors, PLACES_MOST)
+        samples = samples_each(scene.actors, MAX_POSITIONS)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
         sensors = sensor_positions(survey)
         drawn = Drawn.of(cut(scene), near=[sensor.positions for sensor in sensors])
@@ -124,7 +126,9 @@ class PictureContent:
             sample_rays=np.zeros((0, 2, 3), np.float32),
             planning=planning,
             duration_ns=survey.duration_ns,
-            own=[replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
+            extra_columns=[
+                replace(c, source="") for c in survey.stored_columns if c.name not in TABLE
+            ],
             reflectance=materials.reflectance[kinds.first[:-1]],
             coordinates=survey.coordinates,
             triangles=scene.triangles,
@@ -155,9 +159,9 @@ class PictureContent:
             f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
             for sensor in self.sensors
         ]
-        hidden = len(models) - MODELS_MOST
+        hidden = len(models) - MAX_MODELS
         if hidden > 0:
-            models[MODELS_MOST:] = [f"and {hidden:,} more"]
+            models[MAX_MODELS:] = [f"and {hidden:,} more"]
         return " · ".join(models)
 
     def names_of(self, column: Column) -> Sequence[str]:
@@ -179,7 +183,7 @@ class PictureContent:
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
             "sensors": [[sensor.name, sensor.model, sensor.moves] for sensor in self.sensors],
-            "own": [asdict(column) for column in self.own],
+            "own": [asdict(column) for column in self.extra_columns],
             "coordinates": self.coordinates,
             "triangles": self.triangles,
             **({"classes": self.classes} if self.classes else {}),
@@ -288,7 +292,7 @@ class PictureContent:
             sample_rays=arrays["sample_rays"],
             planning=_planning(arrays) if "path" in arrays else None,
             duration_ns=float(arrays["duration_ns"]),
-            own=[Column(**column) for column in names["own"]],
+            extra_columns=[Column(**column) for column in names["own"]],
             reflectance=arrays.get("reflectance"),
             coordinates=names["coordinates"],
             triangles=names["triangles"],
@@ -327,7 +331,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
         stop = first + steps * path.stations
         scans: Iterable[int] = range(first, stop, steps)  # the first at each station
         if path.moves:
-            scans = np.unique(np.linspace(first, stop - 1, PLACES_MOST).astype(int)).tolist()
+            scans = np.unique(np.linspace(first, stop - 1, MAX_POSITIONS).astype(int)).tolist()
         times = np.array([survey.begins_ns(scan) for scan in scans])
         positions = np.array([survey.pose(scan).position for scan in scans])
         sensors.append(
@@ -347,7 +351,7 @@ def moving_positions(
     moving = [sensor.positions for sensor in sensors if sensor.moves]
     if moving or not actors:
         return moving
-    times = np.linspace(0, duration_ns, PLACES_MOST)
+    times = np.linspace(0, duration_ns, MAX_POSITIONS)
     of_actors = [actor.trajectory.poses(0, times)[0] for actor in actors]
     return [*(sensor.positions for sensor in sensors), *of_actors]
 

@@ -125,14 +125,14 @@ def _picture_makers(
 
     @cache
     def points() -> Cloud:
-        return CloudFile(cloud, shown.own).choose(MAX_POINTS)
+        return CloudFile(cloud, shown.extra_columns).choose(MAX_POINTS)
 
     def draw_counts() -> Page:
         places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
         return draw_hits(shot(), shown.hit_counts, places, shown.sample_rays)
 
     def draw_points() -> Page:
-        file = CloudFile(cloud, shown.own)
+        file = CloudFile(cloud, shown.extra_columns)
         known = with_rgb({name: c for c in (Z, *file.table) for name in (c.name, c.in_files)})
         if colour not in known:
             there = list(dict.fromkeys(c.name for c in known.values()))

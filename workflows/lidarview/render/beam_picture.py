@@ -55,13 +55,12 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
         unit = "ms"
     directions = sensor.directions(firings).reshape(-1, 3)
     plot = _plot_angle(directions, times, unit) if looks_down else _plot_directions(directions)
-    frame = (0.075, 0.12, 0.75, 0.73)
-    aspect = "auto" if has_channels or looks_down else "equal"
-    axes = page.chart(frame, aspect=aspect, xlabel=plot.labels[0], ylabel=plot.labels[1])
+    axes = page.chart((0.075, 0.12, 0.75, 0.73), xlabel=plot.labels[0], ylabel=plot.labels[1])
+    if not (has_channels or looks_down):
+        axes.set_aspect("equal")
     norm = Normalize(0, max(float(times.max()), 1e-3))
     size = (10 if has_channels else 2) * page.unit**2
-    colours = mapped(COLOURS, norm(times))
-    axes.scatter(plot.x_values, plot.y_values, s=size, c=colours, linewidths=0)
+    axes.scatter(plot.x_values, plot.y_values, s=size, c=mapped(COLOURS, norm(times)), linewidths=0)
     page.colour_bar(mapped(COLOURS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
     page.title(sensor.name, f"{sensor.channels:,} channel{'s' * has_channels} · {words}")
     page.save(path)

@@ -148,8 +148,10 @@ def _number_colouring(
         scale = DIVERGING
     logarithmic = limits.is_logarithmic(unit)
     paint = _scale_painter(limits, divisor, logarithmic, scale)
-    ends = float(limits.lower), float(limits.upper)
-    return Colouring(paint, column.name, unit, column.meaning, ends, logarithmic, scale=scale)
+    range_limits = float(limits.lower), float(limits.upper)
+    return Colouring(
+        paint, column.name, unit, column.meaning, range_limits, logarithmic, scale=scale
+    )
 
 
 def _scale_painter(

@@ -44,7 +44,7 @@ _NOISE = 0.02  # of the distance, that a point may lie beside its surface
 
 
 class _Shape(NamedTuple):
-    """Triangles of one colour."""
+    """Triangles in a single colour."""
 
     caster: RayCaster
     normals: Floats  # (f, 3)
@@ -69,7 +69,7 @@ class _Sights(NamedTuple):
 
 @dataclass(eq=False)
 class _FilmPoints:
-    """Points that a frame shows, of this frame and of earlier ones."""
+    """Points that a frame shows, of the frame and of earlier frames."""
 
     positions: Floats = field(default_factory=lambda: np.empty((0, 3)))
     colours: Floats = field(default_factory=lambda: np.empty((0, 4)))
@@ -83,7 +83,7 @@ class _FilmPoints:
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Drop all points but chosen ones (n,)."""
+        """Keep chosen points (n,) only."""
         self.positions = self.positions[chosen]
         self.colours = self.colours[chosen]
         self.first_frame = self.first_frame[chosen]

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Floats32
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 
 from .camera import Camera
 from .cutaway import Cutaway, blocked
@@ -126,15 +126,11 @@ def make_light_map(
         * facing
     )
     # Neighbours rotate the lights differently, and are averaged: like four times as many lights.
-    row, column = np.nonzero(has_surface)
-    quarter = row % 2 + 2 * (column % 2)
+    quarter = _quarters(has_surface)
     total_light = np.full(len(origins), 1e-9)
     open_light = np.full(len(origins), 1e-9)
-    for (x, y, z), strength, rotation in zip(*_lights(sun), strict=True):
-        angles = rotation * np.arange(4)
-        cos = np.cos(angles)[quarter]
-        sin = np.sin(angles)[quarter]
-        towards = np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
+    for direction, strength, rotation in zip(*_lights(sun), strict=True):
+        towards = _rotated(direction, rotation)[quarter]
         light = strength * np.clip(dot(facing, towards), 0, None)
         lit = np.flatnonzero(light)
         free = lit[~blocked(surface, cutaway, origins[lit], towards[lit], reach)]
@@ -143,6 +139,21 @@ def make_light_map(
     openness = np.ones(has_surface.shape, np.float32)
     openness[has_surface] = open_light / total_light
     return LightMap(camera, sun, openness, position, normal)
+
+
+def _quarters(has_surface: Bools) -> Ints:
+    """Return 0 to 3 for each point of a grid (rows, columns) with a surface, by its neighbours."""
+    row, column = np.nonzero(has_surface)
+    return np.asarray(row % 2 + 2 * (column % 2))
+
+
+def _rotated(direction: Floats, rotation: float) -> Floats:
+    """Return a direction (3,) in four rotations around z, a step of `rotation` radians apart."""
+    x, y, z = direction
+    angles = rotation * np.arange(4)
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
 
 
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:

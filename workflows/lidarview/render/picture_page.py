@@ -231,7 +231,7 @@ class Page:
         )
 
     def chart(self, frame: tuple[float, float, float, float], **options: Any) -> Axes:
-        """Add axes with a grid in a frame: left, bottom, width and height, fractions of the page."""
+        """Add axes with a grid in a frame (left, bottom, width, height), fractions of the page."""
         axes = self.figure.add_axes(frame)
         small = 0.6 * self.unit
         axes.set(facecolor=theme.GROUND, axisbelow=True, **options)
@@ -375,7 +375,7 @@ def _grid(shot: SurfaceView) -> Floats:
 
 
 def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
-    """Return the ends (3,) of the axes x, y and z, and the outward direction (2,) in the picture."""
+    """Return the ends (3,) of the axes x, y and z, and the outward direction (2,) in pixels."""
     corners = shot.stage.corners
     flat, _ = shot.camera.project(corners)
     middle, _ = shot.camera.project(corners.mean(axis=0)[None])
@@ -392,6 +392,6 @@ def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def robot_name(name: str) -> str:
-    """Return the robot of a link, ROBOT/LINK; the name itself for all other actors."""
+    """Return the robot of a link, ROBOT/LINK, or the name itself of an actor without links."""
     # Traffic has names of its files in brackets, with any letters.
     return name if "(" in name else name.partition("/")[0]

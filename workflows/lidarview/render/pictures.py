@@ -95,7 +95,7 @@ def draw_hits(
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
-    """Return some of the rays (n, 2, 3) that end in the picture."""
+    """Choose rays (n, 2, 3) that end in the picture."""
     slack = 1e-3 * shot.stage.size
     lowest, highest = shot.stage.bounds
     ray_ends = sample_rays[:, 1]
@@ -159,7 +159,7 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
 
 
 def _object_colours(scene: Scene, kinds: Ints) -> Floats:
-    """Return colours (objects, 3) in 0 to 1 of a scene's objects, the same for all of a kind.
+    """Return colours (objects, 3) in 0 to 1 of a scene's objects, a colour for each kind.
 
     Floors and halls are grey, so that the objects inside stand out.
     """

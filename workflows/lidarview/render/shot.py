@@ -229,13 +229,7 @@ def take_shot(
     positions = np.concatenate([sensors, *paths])
     caption = caption or plural(len(sensors), "sensor position")
     opened = _open_scene(scene, positions, trajectories, backend)
-    if opened.box is not None:
-        width, depth, _ = np.ptp(opened.box, axis=0)
-        cut = opened.cut_height
-        top = scene.origin[2] + (opened.box[1, 2] if cut is None else cut)
-        caption += (
-            f" · drawn: {width:,.0f} × {depth:,.0f} m around what moves, below z = {top:,.0f} m"
-        )
+    caption += opened.remark
     stage = _stage(opened.bounds, positions, scene.origin)
     viewpoint = _choose_viewpoint(opened.surface, stage, positions, size, bool(paths or actors))
     camera = viewpoint.camera
@@ -274,11 +268,21 @@ class _OpenScene(NamedTuple):
     box: Floats | None  # (2, 3) around trajectories; None if all of the scene is shown
     cut_height: float | None  # None if the part is not cut open
 
+    @property
+    def remark(self) -> str:
+        """Remark on the shown part, for a caption; empty if all of the scene is shown."""
+        if self.box is None:
+            return ""
+        width, depth, _ = np.ptp(self.box, axis=0)
+        cut = self.cut_height
+        top = self.uncut.origin[2] + (self.box[1, 2] if cut is None else cut)
+        return f" · drawn: {width:,.0f} × {depth:,.0f} m around what moves, below z = {top:,.0f} m"
+
 
 def _open_scene(
     scene: Scene, positions: Floats, trajectories: Sequence[Floats], backend: str
 ) -> _OpenScene:
-    """Choose the part of a scene around trajectories, and cut it open above sensor positions."""
+    """Choose the part of a scene around trajectories, and cut the roof off above sensors."""
     box = surrounding_box(scene.bounds, trajectories)
     part = ShownPart.from_scene(scene)
     if box is not None:

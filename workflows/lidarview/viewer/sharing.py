@@ -29,7 +29,7 @@ from ..render.colouring import TURBO
 from ..render.film import Film
 from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
-from .view import MOST_POINTS, View, open_result
+from .view import MAX_POINTS, View, open_result
 
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: most frames, colours or quality}
 _FEWEST = 30  # frames of a film
@@ -46,7 +46,7 @@ _CHOSEN_FROM = 5_000_000  # points of which a page has some
 _CELLS = 300  # along the diagonal of the points, to find where they are dense
 
 
-def _show_nothing(output: str, done: int, total: int, unit: str) -> None:
+def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
     """Show no progress."""
 
 
@@ -150,7 +150,7 @@ def _film(view: View, max_frames: int) -> Film:
     film = replace(film, parts=parts, keep_share=_FILM_POINTS / all_points)
     if moving:
         sensor = moving[0]
-        halfway = sensor.at(moments[frames // 2])
+        halfway = sensor.position_at(moments[frames // 2])
         local, _ = read(_FRAME_POINTS, spans[frames // 2])
         ranges = np.linalg.norm(local - halfway, axis=1)
         range_m = float(np.median(ranges)) if len(ranges) else 20.0
@@ -229,7 +229,7 @@ def _thinned(view: View, max_points: int) -> Answer:
     legends = dict[str, Any]()
     arrays: dict[str, AnyArray] = {n: values.astype(np.float64) for n, values in columns.items()}
     for name in thin.answer("state", {}, bool)[0]["colours"]:
-        question = {"colour": name, "most": str(MOST_POINTS)}
+        question = {"colour": name, "most": str(MAX_POINTS)}
         header, points = thin.answer("points", question, bool)
         palette, shades = np.unique(points["colours"].view(np.uint32), return_inverse=True)
         kind = np.uint8 if len(palette) <= 1 << 8 else np.uint32
