@@ -110,7 +110,7 @@ def _picture_makers(
     @cache
     def shot() -> SurfaceView:
         # A moving sensor has a marker at half time, and a line for its trajectory.
-        places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        places = [w.position_at(middle)[None] if w.moves else w.positions for w in shown.sensors]
         scene = shown.scene
         return take_shot(
             scene.solid(middle),

@@ -96,7 +96,7 @@ CLOUD = "cloud.ply"
 
 @dataclass(frozen=True)
 class Downloads:
-    """Formats in which a page offers its points, and the function that writes them."""
+    """Formats in which a page offers points as files, and the function that writes a file."""
 
     formats: Sequence[str]  # endings of files, such as "las"
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
@@ -145,7 +145,7 @@ class View:
         self.show(self.points)
 
     def show(self, points: Points) -> None:
-        """Show other points."""
+        """Replace the points."""
         self.points = points
         self._finder = PointFinder(points, self.origin)
         self._colourings: dict[tuple[str, Filter], Colouring] = {}
@@ -165,7 +165,7 @@ class View:
         for number, name in enumerate(sweeps.sensors):
             of_sensor = sweeps.sensor == number
             local = sweeps.pose.positions[of_sensor] - self.origin
-            if sweeps.coordinates != "world":  # each point is in the axes of its sensor
+            if sweeps.coordinates != "world":  # each point is in the frame of its sensor
                 local = np.zeros_like(local)
             moves = len(np.unique(local, axis=0)) > len(local) / 2 > 1
             sensors.append(SensorPositions(sweeps.begins_ns[of_sensor], local, moves, name))
@@ -206,8 +206,8 @@ class View:
     def _extent(self) -> tuple[Floats, Floats, Floats]:
         """Return the local origin, the box (2, 3) of the view, and points (k, 3) to be in sight.
 
-        These are corners of the scene, sensors, and both ends of the planning. The corners of the
-        box would be farther apart: around an object the box is mostly empty.
+        These points are corners of the scene, sensors, and both ends of the planning. The corners
+        of the box would be farther apart: around an object the box is mostly empty.
         """
         if self.pictured is None:
             origin, box = _cloud_extent(self.points)
@@ -229,7 +229,7 @@ class View:
             "state": lambda *_: self._state(),
             "points": self._points,
             "point": lambda arguments, _: self._point(int(arguments["row"])),
-            "column": lambda asked, _: self._column(asked["name"]),
+            "column": lambda arguments, _: self._column(arguments["name"]),
             "surface": lambda arguments, _: self._scene(arguments["colour"]),
             "range": lambda arguments, _: self._range(int(arguments["sweep"])),
             "export": self._export,
@@ -237,7 +237,7 @@ class View:
         return answers[question](arguments, abandoned)
 
     def _state(self) -> Answer:
-        """Tell all but points and surfaces."""
+        """Return all of the view but points and surfaces."""
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
@@ -291,7 +291,7 @@ class View:
         return header, arrays
 
     def _actor_arrays(self) -> dict[str, AnyArray]:
-        """Meshes, with their poses if they deform, and where and in which pose each actor is."""
+        """Return meshes, with their poses if animated, and the trajectories of actors."""
         meshes, shapes = shapes_of(self.actors)
         arrays: dict[str, AnyArray] = {"actor_mesh": shapes.astype(np.int32)}  # no int64 in pages
         for k, mesh in enumerate(meshes):
@@ -317,12 +317,12 @@ class View:
 
     @property
     def rays_shown(self) -> Floats32:
-        """Not too many rays, (n, 2, 3)."""
+        """Rays (n, 2, 3), at most about `MAX_RAYS`."""
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
     def planned(self) -> dict[str, Any] | None:
-        """The planned path and its obstacles, if there is one."""
+        """Planned path and its obstacles; None without a path."""
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
             return None
@@ -330,7 +330,7 @@ class View:
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
-        """{object: class} of some points."""
+        """Return {object: class}, from a sample of the points."""
         if not {"object", "class"} <= self.columns.keys():
             return {}
         rows, _ = self._finder.find(_SAMPLE)
@@ -338,7 +338,7 @@ class View:
         return dict(zip(*columns, strict=True))
 
     def _export(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Write the points for a filter and ranges of scans to a file; of many files, a ZIP."""
+        """Write the points for a filter and ranges of scans to a file; several files to a ZIP."""
         ending = arguments["format"]
         if self.downloads is None or ending not in self._export_formats:
             raise KeyError(ending)
@@ -369,7 +369,7 @@ class View:
 
     @property
     def _export_formats(self) -> Sequence[str]:
-        """Formats of a download; none of a sample that is held of a run under way."""
+        """Formats of a download; none for a sample of a run under way."""
         if self.downloads is None or isinstance(self.points, HeldPoints):
             return ()
         return self.downloads.formats
@@ -380,32 +380,33 @@ class View:
         return point_filter, read_scans(arguments["scans"]) if "scans" in arguments else None
 
     def _points(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Points for a filter, ranges of scans and a camera, and their colours."""
+        """Return points for a filter, ranges of scans and a camera, with their colours."""
         finder = self._finder
         version = self.version
-        point_filter, scans = self._read_selection(arguments)
+        selection = self._read_selection(arguments)
         name = arguments["colour"]
         column = self._coloured[name]
         eye = Eye.read(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
-        rows, count = finder.find(max_points, point_filter, scans, eye, abandoned)
-        colouring = self._colouring(finder, name, point_filter, abandoned)
+        rows, count = finder.find(max_points, *selection, eye, abandoned)
+        colouring = self._colouring(finder, name, selection[0], abandoned)
         values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
-        legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
         arrays: dict[str, AnyArray] = {
             "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
             "colours": colours,
             "rows": rows.astype(np.uint32),
         }
-        shown = legend if len(finder.points) else None
-        return {"version": version, "count": count, "legend": shown}, arrays
+        legend: Legend | None = None
+        if len(finder.points):
+            legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
+        return {"version": version, "count": count, "legend": legend}, arrays
 
     def _colouring(
         self, finder: PointFinder, name: str, point_filter: Filter, abandoned: Callable[[], bool]
     ) -> Colouring:
-        """Colour scale for all points that a filter keeps, whatever scans are shown."""
+        """Return the colour scale of all points that a filter keeps, of any scan."""
         colourings = self._colourings
         colouring = colourings.get((name, point_filter))
         if colouring is None:
@@ -420,7 +421,7 @@ class View:
         return colouring
 
     def _column(self, name: str) -> Answer:
-        """Tell what a column can be filtered by: its limits, or its labels."""
+        """Return the limits of a column, or its labels, for filters."""
         column = self.columns[name]
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         values = values[np.isfinite(values)]
@@ -439,7 +440,7 @@ class View:
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
 
     def _point(self, row: int) -> Answer:
-        """Tell the position of a point, world coordinates, and all its columns in words."""
+        """Return the position of a point, world coordinates, and all its columns in words."""
         points = self.points
         if not 0 <= row < len(points):
             raise KeyError(row)
@@ -453,6 +454,7 @@ class View:
         return {"place": position, "columns": shown}, {}
 
     def _in_words(self, column: Column, value: Any) -> str:
+        """Return a value of a column in words, with its unit."""
         names = self._names(column.name)
         if column == OBJECT and value < 0:
             return NO_SURFACE
@@ -464,7 +466,7 @@ class View:
         return f"{number} {column.unit}".rstrip()
 
     def _scene(self, colour: str) -> Answer:
-        """Triangles of the scene in their colours; where its floor is, and where to cut it open."""
+        """Return triangles of the scene in their colours, and the heights of floor and cut."""
         pictured = self.pictured
         if pictured is None:
             raise KeyError("surface")
@@ -478,7 +480,7 @@ class View:
             counts = counts if self.hits is None else self.hits()
             counts = counts[: len(pictured.scene.faces)]
             rows, _ = self._finder.find(_HITS_SAMPLE)
-            if "object" in self.columns:  # some points on static objects, local
+            if "object" in self.columns:  # points on static objects only
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             hit_points = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
@@ -487,7 +489,7 @@ class View:
 
     @cached_property
     def _look_around(self) -> dict[str, float | None]:
-        """Height of the floor; and where to cut a building if the sensors stand in one."""
+        """Height of the floor, and of the cut that opens a building around the sensors."""
         surface = self._surface
         pictured = self.pictured
         poses = [sensor.positions for sensor in self.sensors if len(sensor.positions)]
@@ -499,7 +501,7 @@ class View:
         return {"floor": floor, "roof_cut": cut}
 
     def _range(self, sweep: int) -> Answer:
-        """Range image of a sweep: rows are channels from above, columns go from left to right."""
+        """Return the range image of a sweep, rows from above, columns from left to right."""
         sweeps = self.sweeps
         finder = self._finder
         if sweeps is None or not 0 <= sweep < len(sweeps):
@@ -526,56 +528,59 @@ class View:
 def range_image(
     points: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
 ) -> Bytes:
-    """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
+    """Return a range image of points in the sensor frame, RGBA (rows, columns, 4).
 
-    Rows are channels, the highest above, or steps of elevation if the sensor has few or very
-    many. Columns are steps of azimuth from left to right. A sensor that looks down has one row,
-    of angles across its way. Empty pixels are transparent.
+    Of several points in a pixel the nearest is shown. Rows are channels, the highest above, or
+    steps of elevation if the sensor has few or very many channels. Columns are steps of azimuth
+    from left to right. A sensor that looks down has a single row, of angles across its trajectory.
+    Empty pixels are transparent.
     """
     downwards = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
     azimuth = np.arctan2(points[:, 1], -points[:, 2] if downwards else points[:, 0])
-    left_azimuth = float(azimuth.max())
-    right_azimuth = float(azimuth.min())
-    if left_azimuth - right_azimuth > _MAX_FIELD_RAD:
-        left_azimuth = math.pi
-        right_azimuth = -math.pi
+    left = float(azimuth.max())
+    right = float(azimuth.min())
+    if left - right > _MAX_FIELD_RAD:
+        left = math.pi
+        right = -math.pi
+    field = left - right
     if downwards:
-        count = 1
-        line = np.zeros(len(points), np.int64)
-    elif (
-        channels is not None
-        and _MIN_CHANNELS <= (count := int(channels.max()) + 1) <= _MAX_CHANNELS
-    ):
-        line = count - 1 - channels
+        row_count = 1
+        row = np.zeros(len(points), np.int64)
     else:
-        elevation = np.arcsin(points[:, 2] / np.maximum(ranges, 1e-9))
-        span = float(np.ptp(elevation)) or 1.0
-        count = _IMAGE_ROWS
-        line = ((elevation.max() - elevation) * ((count - 1) / span)).astype(np.int64)
-    fullest = azimuth[line == np.bincount(line).argmax()]
-    spacing = float(np.ptp(fullest)) / len(
-        fullest
-    )  # between two points; columns are wider than that
-    width = int(
-        np.clip(
-            _COLUMN_SHARE * (left_azimuth - right_azimuth) / max(spacing, 1e-9), 32, _IMAGE_WIDTH
-        )
-    )
-    across = ((left_azimuth - azimuth) * (width / max(left_azimuth - right_azimuth, 1e-9))).astype(
-        np.int64
-    )
-    image = np.zeros((count, width, 4), np.uint8)
+        row, row_count = _image_rows(points, ranges, channels)
+    fullest = azimuth[row == np.bincount(row).argmax()]
+    spacing = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider
+    width = int(np.clip(_COLUMN_SHARE * field / max(spacing, 1e-9), 32, _IMAGE_WIDTH))
+    column = ((left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
+    image = np.zeros((row_count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
+    image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]
+    return image
+
+
+def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
+    """Return the rows (n,) of points in a range image, and the number of rows."""
+    if channels is not None:
+        count = int(channels.max()) + 1
+        if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
+            return count - 1 - channels, count
+    elevation = np.arcsin(points[:, 2] / np.maximum(ranges, 1e-9))
+    span = float(np.ptp(elevation)) or 1.0
+    row = ((elevation.max() - elevation) * ((_IMAGE_ROWS - 1) / span)).astype(np.int64)
+    return row, _IMAGE_ROWS
+
+
+def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
+    """Return the colours (n, 4) of ranges (n,) between limits."""
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
     colours = np.full((len(ranges), 4), 255, np.uint8)
     colours[:, :3] = as_bytes(mapped("viridis_r", shade))
-    image[line[order], np.minimum(across, width - 1)[order]] = colours[order]
-    return image
+    return colours
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats]:
-    """Origin in whole metres near the points, and their box without a few outliers."""
+    """Return an origin in whole metres close to the points, and their box without outliers."""
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
         return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
@@ -585,11 +590,11 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats]:
 
 
 class ShownSurface:
-    """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
+    """A scene's triangles in chosen colours, simplified to a maximum number.
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
-    triangle that vanishes go to one beside it. `reflectance` is the share of the light that each
-    object reflects, (objects,), if it is known.
+    triangle that vanishes go to a neighbour. `reflectance` is the share of the light that each
+    object reflects, (objects,), if known.
     """
 
     def __init__(
@@ -597,10 +602,10 @@ class ShownSurface:
     ) -> None:
         self.coarse = scene
         self._reflectance = reflectance
-        # (f,): which triangle stands for each of the scene; -1 where nothing is left.
-        self._stands = np.arange(len(scene.faces))
+        # (f,): shown triangle that replaces each triangle of the scene; -1 if none does.
+        self._replacements = np.arange(len(scene.faces))
         if len(scene.faces) > max_triangles:
-            self.coarse, self._stands = simplified(scene, max_triangles)
+            self.coarse, self._replacements = simplified(scene, max_triangles)
         self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
@@ -609,23 +614,15 @@ class ShownSurface:
     def coloured(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and their legend.
+        """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and a legend.
 
-        `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        some of the hit points, (n, 3). There are no colours for "grey": the page has its own.
+        `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
+        a sample of the hit points, (n, 3). There are no colours for "grey", which the page defines.
         """
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
         if by == "hits":
-            is_shown = self._stands >= 0
-            hits = np.bincount(self._stands[is_shown], hit_counts[is_shown], len(self.corners))
-            max_pieces = len(self.corners) + MAX_PIECES
-            made = hit_colours(self.coarse, self.corners, hits.astype(float), points, max_pieces)
-            arrays["corners"], owner, colours, (lower, upper) = made
-            arrays |= {"objects": self._objects[owner], "colours": as_bytes(colours)}
-            named = (lower, (lower * upper) ** 0.5, upper)
-            marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in named]
-            return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
+            return self._coloured_by_hits(hit_counts, points)
         if by == "object":
             colouring = colours_of(self._objects, OBJECT, self.coarse.names)
             colours = colouring.paint(self._objects)
@@ -641,9 +638,28 @@ class ShownSurface:
         corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
         return arrays | {"colours": corners}, legend
 
+    def _coloured_by_hits(
+        self, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
+        """Return the arrays and the legend of `coloured` by hits (f,) of the scene's triangles."""
+        is_shown = self._replacements >= 0
+        hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
+        max_pieces = len(self.corners) + MAX_PIECES
+        corners, owner, colours, (lower, upper) = hit_colours(
+            self.coarse, self.corners, hits.astype(float), points, max_pieces
+        )
+        arrays: dict[str, AnyArray] = {
+            "corners": corners,
+            "objects": self._objects[owner],
+            "colours": as_bytes(colours),
+        }
+        densities = (lower, (lower * upper) ** 0.5, upper)
+        marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in densities]
+        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
+
 
 def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
-    """List the ways to colour a scene, with or without known reflectance, and its own colours."""
+    """List the colourings of a scene, with reflectance and its own colours if there are any."""
     scene_colours = ("colour",) if scene.coloured else ()
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
@@ -652,7 +668,7 @@ def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
 
 
 def legend_of(colouring: Colouring) -> Legend:
-    """Legend of colours: a scale with numbers, or labels with their values."""
+    """Return the legend of colours: a scale with numbers, or labels with their values."""
     if colouring.limits is None:
         labels = [
             [name, as_bytes(colour).tolist(), value]
@@ -675,13 +691,13 @@ def legend_of(colouring: Colouring) -> Legend:
 
 
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
-    """Legend of a scale of colours (n, 3), with evenly spread marks."""
+    """Return the legend of a scale of colours (n, 3), with evenly spread marks."""
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
 
 
 @contextmanager
 def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
-    """Serve the page of a result while the body runs; see `announced`."""
+    """Serve the page of a result while the body runs, and announce its address."""
     shows = f"shows {plural(len(view.points), 'point')}"
     shows += "" if cell_display() else "; Ctrl-C ends it"
     with (
@@ -692,15 +708,15 @@ def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterat
 
 
 def wait_for_interrupt(stopped: Event | None = None) -> None:
-    """Keep a page open until Ctrl-C, or until its user has stopped it."""
+    """Keep a page open until Ctrl-C, or until its user stops the page."""
     stopped = stopped or Event()
     with suppress(KeyboardInterrupt):
-        while not stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+        while not stopped.wait(0.2):  # Ctrl-C does not end an unlimited wait everywhere
             pass
 
 
 def show_view(view: View, *, port: int, browser: bool = True) -> None:
-    """Show a view until Ctrl-C; see `result_page`."""
+    """Show a view in the browser until Ctrl-C."""
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     with result_page(view, port=port, browser=browser):
@@ -710,8 +726,8 @@ def show_view(view: View, *, port: int, browser: bool = True) -> None:
 def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
     """Open results of a place as a view, with the scene, sensors and actors of the first result.
 
-    The view can be played if the sweeps of all results begin at the same times. LidarError as
-    of `open_result`, or if points are in the axes of their sensors.
+    The view can be played if the sweeps of all results start at the same times. LidarError if a
+    result has no cloud, a damaged cloud, or points in the frames of the sensors.
     """
     first, *further = views = [open_result(path, downloads) for path in paths]
     if not further:
