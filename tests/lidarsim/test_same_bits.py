@@ -162,7 +162,6 @@ def hashed(**environment):
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_narrower_instructions_give_the_same_bytes(tmp_path):
     """Those of NumPy, of compiled loops, and of Embree; each by itself, to name what differs."""
     expected = hashed()
