@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lidarpool import LidarError, Noise, fit
-from lidarpool.compare.fit import Repeats, smooth_rays, surfaces
+from lidarpool.compare.fit import SweepStack, find_surfaces, select_smooth_rays
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.angle_noise import angle_errors
@@ -64,14 +64,14 @@ def compared(
 
     LidarError if a half cannot be fitted.
     """
-    Repeats.read(recording)  # refuses a sensor that moves, which halves may not show
+    SweepStack.read(recording)  # refuses a sensor that moves, which halves may not show
     found = fit(half(recording, 0), model=model, white=white)
-    other = Repeats.read(half(recording, 1))
-    rays = smooth_rays(other, other.sigma, 0.002)
+    other = SweepStack.read(half(recording, 1))
+    rays = select_smooth_rays(other, other.rough_sigma, 0.002)
     with warnings.catch_warnings(action="ignore"):  # of cells without a return
         middle = np.nanmedian(other.ranges, axis=0)
-    turn, *_ = surfaces(other, middle, other.sigma)
-    energy = np.maximum(rays.light / (white or recording.white or 100), 1 / 400)
+    azimuth_slope = find_surfaces(other, middle, other.rough_sigma).azimuth_slope
+    energy = np.maximum(rays.intensity / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
     fitted = found.model.datasheet().noise
     sheet = Noise()
@@ -80,12 +80,12 @@ def compared(
             sheet = read_model(model).datasheet().noise
     cell = rays.row, rays.column
     recorded = other.ranges[:, *cell].astype(float)
-    recorded -= turn[cell] * np.nan_to_num(other.aside[:, *cell])
+    recorded -= azimuth_slope[cell] * np.nan_to_num(other.azimuth_offsets[:, *cell])
     sweeps = len(recorded)
     ranges = {"recorded": recorded, "data sheet": simulated(sheet, rays, energy, sweeps),
               "fitted": simulated(fitted, rays, energy, sweeps)}  # fmt: skip
-    light = other.light[:, *cell].astype(float)
-    steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.light, 1)
+    light = other.intensities[:, *cell].astype(float)
+    steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.intensity, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
     lost = {name: float(np.isnan(one).mean()) for name, one in ranges.items()}
     lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps

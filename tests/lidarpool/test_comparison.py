@@ -225,7 +225,7 @@ def test_what_has_no_range_image_says_why():
 
 
 def test_of_many_points_and_cells_some_are_compared(monkeypatch):
-    monkeypatch.setattr(comparison, "MOST_VALUES", 2000)
+    monkeypatch.setattr(comparison, "MAX_VALUES", 2000)
     rng = np.random.default_rng(5)
     found = compare(cloud(RANGES + rng.normal(0, 0.02, RANGES.shape)), cloud()).figures
     assert found["range_image"]["residual"]["cells"] == 2000

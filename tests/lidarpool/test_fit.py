@@ -428,10 +428,10 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
         frames.append(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
     (tmp_path / "room.pcap").write_bytes(b"".join(frames))
     opened = open_recording(tmp_path / "room.pcap")
-    turn = opened.turn(1)
-    assert opened.count >= 3 and opened.white == 100 and set(turn.light) == {50.0}
-    assert len(np.unique(turn.rings)) == 16
-    assert np.linalg.norm(turn.points, axis=1) == pytest.approx(5, abs=0.05)
+    sweep = opened.read_points(1)
+    assert opened.count >= 3 and opened.white == 100 and set(sweep.intensities) == {50.0}
+    assert len(np.unique(sweep.rings)) == 16
+    assert np.linalg.norm(sweep.points, axis=1) == pytest.approx(5, abs=0.05)
     frame = bytearray(frames[-1])
     frame[16 + 29] = 7  # the end of the sender's address
     (tmp_path / "room.pcap").write_bytes(b"".join([*frames, frame]))

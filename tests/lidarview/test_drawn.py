@@ -105,7 +105,7 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
         block("hut", (4, 4, 3), (-10, 10, 1.5)),
         block("other hut", (4, 4, 3), (100, 10, 1.5)),
     ])  # fmt: skip
-    cut = ShownPart.whole(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
+    cut = ShownPart.from_scene(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
     part = cut.scene
     shares = cut.shares
     there = {scene.names[k] for k in np.unique(part.face_object)}

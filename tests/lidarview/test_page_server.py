@@ -17,7 +17,7 @@ import pytest
 from tests.pages import ask
 
 from lidarview.viewer.point_selection import Abandoned
-from lidarview.viewer.server import SLOW_AT_ONCE, SLOW_WAITING, announced, page_server
+from lidarview.viewer.server import MAX_SLOW, MAX_WAITING, announced, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
 STRANGER = """
@@ -203,22 +203,22 @@ def unread(page, count, question):
 )
 def test_others_are_answered_while_slow_questions_wait(large, question):
     page, source = large
-    with unread(page, SLOW_AT_ONCE + SLOW_WAITING + 4, question):
-        while source.now < SLOW_AT_ONCE:
+    with unread(page, MAX_SLOW + MAX_WAITING + 4, question):
+        while source.now < MAX_SLOW:
             time.sleep(0.01)
         for _ in range(5):
             started = time.monotonic()
             assert ask(page.url, "state")["points"] == 20_000_000
             assert time.monotonic() - started < READY_S / 2
         assert said(page, "GET", question)[0] == 503
-        assert source.most == SLOW_AT_ONCE
+        assert source.most == MAX_SLOW
 
 
 def test_a_search_is_answered_while_nobody_reads_large_answers(large, monkeypatch):
     page, source = large
     monkeypatch.setattr("lidarview.viewer.server.STALL_S", 600.0)
-    with unread(page, SLOW_AT_ONCE + SLOW_WAITING, "points?most=20000000"):
-        while source.now < SLOW_AT_ONCE:
+    with unread(page, MAX_SLOW + MAX_WAITING, "points?most=20000000"):
+        while source.now < MAX_SLOW:
             time.sleep(0.01)
         source.ready.set()
         ask(page.url, "points", most=9, filter="z,0,1")  # within the time that `ask` waits
@@ -228,7 +228,7 @@ def test_an_answer_that_is_not_read_ends(large, monkeypatch):
     page, source = large
     source.ready.set()
     monkeypatch.setattr("lidarview.viewer.server.STALL_S", 0.5)
-    with unread(page, 2 * SLOW_AT_ONCE, "points?most=20000000"):
+    with unread(page, 2 * MAX_SLOW, "points?most=20000000"):
         time.sleep(0.2)
         started = time.monotonic()
         assert ask(page.url, "state")["points"] == 20_000_000

@@ -356,7 +356,7 @@ def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
     view = open_result(result_in(tmp_path / "one", spun), formats)
     with pytest.raises(KeyError):
         told(view, "export", format="exe")
-    monkeypatch.setattr("lidarview.viewer.view.MOST_POINTS", 3)
+    monkeypatch.setattr("lidarview.viewer.view.MAX_POINTS", 3)
     assert "20 points are more than 3" in told(view, "export", format="ply")[0]["error"]
     held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})), downloads=formats)
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
@@ -475,7 +475,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
 def test_many_triangles_become_few_that_keep_shape_and_hits():
     scene = Scene.seed()
-    surface = ShownSurface(scene, most=5000)
+    surface = ShownSurface(scene, max_triangles=5000)
     corners = surface.corners.reshape(-1, 3)
     assert 500 < len(surface.corners) <= 5000
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
@@ -573,7 +573,7 @@ EYE = along_y()
 
 def test_a_camera_sees_what_is_before_it():
     places = np.array([[0, 5, 0], [9, 5, 0], [-11, 5, 0], [0, 5, 4], [0, 5, -6], [0, -5, 0.0]])
-    at, inside = EYE.seen(places)
+    at, inside = EYE.project(places)
     assert inside.tolist() == [True, True, False, True, False, False]
     assert at[:2] == pytest.approx(np.array([[0, 0], [0.9, 0]]))
     assert at[3, 1] == pytest.approx(0.8)  # up
@@ -605,7 +605,7 @@ def test_a_filter_keeps_what_is_within_all_limits():
 @pytest.fixture
 def file(tmp_path, monkeypatch):
     """Return a file of 100,000 points along y, from 1 to 100 metres, in blocks of 1,000."""
-    monkeypatch.setattr(points, "BLOCK", 1000)
+    monkeypatch.setattr(points, "BLOCK_ROWS", 1000)
     rows = np.zeros(100_000, row_type(np.dtype(np.float32), (SCAN, TABLE["intensity"])))
     random = np.random.default_rng(0)
     rows["y"] = np.linspace(1, 100, 100_000)

@@ -119,9 +119,9 @@ def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     again = PictureContent.load(make(tmp_path / "result", shown) / PICTURE_FILE)
     (way,) = again.sensors
     assert (way.name, way.moves) == ("nose", True)
-    assert np.allclose(way.at(5e8), (7, 0, 1), atol=0.01)
+    assert np.allclose(way.position_at(5e8), (7, 0, 1), atol=0.01)
     assert np.allclose(again.scene.solid(5e8).object_bounds[-1], [(7.5, 2, 0), (12.5, 4, 2)])
-    assert again.when == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
+    assert again.caption == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
     plot(tmp_path / "result", *SMALL)
     assert {"scene.png", "hits.png", "cloud.png"} <= names(tmp_path / "result")
 
@@ -156,7 +156,7 @@ def test_a_damaged_file_is_refused(damage, said, result):
 
 def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
     wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
-    shown = replace(unplanned, own=[replace(wet, source="")])
+    shown = replace(unplanned, extra_columns=[replace(wet, source="")])
     result = make(tmp_path / "result", shown)
     positions = shown.scene.vertices
     zeros = np.zeros(len(positions), np.int32)

@@ -99,7 +99,7 @@ def test_new_points_are_bright_and_old_ones_darker_unless_they_are_where_an_acto
 def test_actors_are_where_they_are_at_the_time_of_a_frame():
     way = Track([0, 1], [[-8, 0, 0], [8, 0, 0.0]])
     none = ([], RED)
-    frames = seen([none, none], [Actor(box("Van", (4, 4, 4)), way)], way=None)
+    frames = seen([none, none], [Actor(box("Van", (4, 4, 4)), way)], carrier_trajectory=None)
     warm = [frame[..., 0] - frame[..., 2] > 10 for frame in frames]
     assert all(mask.sum() > 30 for mask in warm) and not (warm[0] & warm[1]).all()
     absent = Track([5, 6], [[-8, 0, 0], [8, 0, 0.0]], start_s=0.0, beyond="absent")
@@ -110,7 +110,7 @@ def test_actors_are_where_they_are_at_the_time_of_a_frame():
 
 def test_the_camera_follows_a_carrier_whose_way_is_red():
     way = np.array([0, 1e9]), np.array([[0, -20, 2], [0, 20, 2.0]])
-    frames = seen([([], RED)] * 3, (), way=way, range_m=8.0)
+    frames = seen([([], RED)] * 3, (), carrier_trajectory=way, range_m=8.0)
     dot = rgb("#ff4d5e") * 255
     for frame in frames:  # in the middle, below
         row, column = (np.abs(frame - dot).sum(axis=2) < 60).nonzero()

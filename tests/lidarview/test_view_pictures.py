@@ -105,7 +105,7 @@ def test_objects_that_touch_do_not_stipple(pixels):
     x, y = np.meshgrid(*np.linspace(low[:2] + 0.2, high[:2] - 0.2, 40).T)
     top = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2])])
     column, row = shot.camera.project(top)[0].astype(int).T
-    owner = scene.face_object[shot.whole.triangle.reshape(400, 640)[row, column]]
+    owner = scene.face_object[shot.pixel_samples.triangle.reshape(400, 640)[row, column]]
     assert len(np.unique(owner)) == 1
 
 

@@ -26,8 +26,8 @@ from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
 
 PICTURE_FILE = "pictures.npz"
 
-MODELS_MOST = 4  # sensors named in a picture
-PLACES_MOST = 1000  # positions of a moving sensor or actor
+MAX_MODELS = 4  # sensors named in a picture
+MAX_POSITIONS = 1000  # positions of a moving sensor or actor
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
@@ -45,11 +45,11 @@ class SensorPositions:
 
     times_ns: Floats  # (k,), ascending, nanoseconds since the survey's start
     positions: Floats  # (k, 3), metres, local coordinates
-    moves: bool = False  # from each position to the next; else it stands until the next time
+    moves: bool = False  # continuously; else the sensor stays at each position until the next time
     name: str = ""  # "" for a single sensor
     model: str = ""
 
-    def at(self, time_ns: float) -> Floats:
+    def position_at(self, time_ns: float) -> Floats:
         """Return the position at a time, (3,)."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
@@ -59,12 +59,12 @@ class SensorPositions:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPath:
-    """The best path of a search in the plane, as pictures show it."""
+    """The best path of a search in the plane, for pictures."""
 
     corners: Floats  # (w, 2), from start to target, metres, local coordinates
     length_m: float
     shortest_m: float  # length of the shortest path; inf if discs cut off the target
-    clearance_m: float  # least distance to a disc; negative within one, inf without discs
+    clearance_m: float  # smallest distance to a disc; negative within a disc, inf without discs
     trials: Sequence[Floats] = ()  # (w, 2) each: corners of each trial's path between the ends
 
     @property
@@ -75,7 +75,7 @@ class PlannedPath:
 
 @dataclass(frozen=True, eq=False)
 class PlanningPicture:
-    """A search for a path in the plane, as pictures show it; metres, local coordinates."""
+    """A search for a path in the plane, for pictures; metres, local coordinates."""
 
     start: tuple[float, float]
     target: tuple[float, float]
@@ -88,16 +88,18 @@ class PlanningPicture:
 class PictureContent:
     """Content of a result's pictures, except the points."""
 
-    scene: Scene  # its actors have a thousand places at most, and poses for pictures
+    scene: Scene  # actors have a thousand positions at most, and poses for pictures
     sensors: Sequence[SensorPositions]
-    hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
+    hit_counts: AnyArray  # (f,): of each triangle, triangles of actors last
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: PlanningPicture | None = None
     duration_ns: float = 0.0  # of the survey, by its own clock
-    own: Sequence[Column] = ()  # columns of the cloud's file that are not in the table of columns
-    # (objects,): share of light that each reflects, actors after the others; None if unknown.
+    extra_columns: Sequence[
+        Column
+    ] = ()  # columns of the cloud's file that are not in the table of columns
+    # (objects,): share of light that each object reflects, actors last; None if unknown.
     reflectance: Floats | None = None
-    coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
+    coordinates: str = "world"  # of the cloud's points; or "sensor", which does not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
@@ -106,11 +108,11 @@ class PictureContent:
     def before_casting(
         cls, scene: Scene, survey: Survey, planning: PlanningPicture | None = None
     ) -> tuple[PictureContent, SimplifiedScene]:
-        """Return the content that is known before rays are cast, and the scene as it is drawn.
+        """Return the content that is known before rays are cast, and the drawn scene.
 
         The drawn scene turns hits of the scene's triangles into `hit_counts`.
         """
-        samples = samples_per_actor(scene.actors, PLACES_MOST)
+        samples = samples_per_actor(scene.actors, MAX_POSITIONS)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
         sensors = sensor_positions(survey)
         positions = [sensor.positions for sensor in sensors]
@@ -125,7 +127,9 @@ class PictureContent:
             sample_rays=np.zeros((0, 2, 3), np.float32),
             planning=planning,
             duration_ns=survey.duration_ns,
-            own=[replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
+            extra_columns=[
+                replace(c, source="") for c in survey.stored_columns if c.name not in TABLE
+            ],
             reflectance=materials.reflectance[kinds.first[:-1]],
             coordinates=survey.coordinates,
             triangles=scene.triangles,
@@ -135,8 +139,8 @@ class PictureContent:
         return content, drawn
 
     @property
-    def when(self) -> str:
-        """Describe the sensors, and the time of pictures with motion: half of the survey."""
+    def caption(self) -> str:
+        """Number of sensors, and the time of pictures with motion: half of the survey."""
         sensors = len(self.sensors)
         actors = len(self.scene.actors)
         if any(sensor.moves for sensor in self.sensors):
@@ -151,18 +155,18 @@ class PictureContent:
 
     @property
     def models(self) -> str:
-        """Models of the sensors, with their names if they have any."""
+        """Models of the sensors, with the names of named sensors."""
         models = [
             f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
             for sensor in self.sensors
         ]
-        hidden = len(models) - MODELS_MOST
+        hidden = len(models) - MAX_MODELS
         if hidden > 0:
-            models[MODELS_MOST:] = [f"and {hidden:,} more"]
+            models[MAX_MODELS:] = [f"and {hidden:,} more"]
         return " · ".join(models)
 
     def names_of(self, column: Column) -> Sequence[str]:
-        """Names of the values 0, 1, 2, … of a column, if any."""
+        """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
         if column.name == "sensor":
             return [sensor.name for sensor in self.sensors]
         if column == TABLE["cause"]:
@@ -180,7 +184,7 @@ class PictureContent:
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
             "sensors": [[sensor.name, sensor.model, sensor.moves] for sensor in self.sensors],
-            "own": [asdict(column) for column in self.own],
+            "own": [asdict(column) for column in self.extra_columns],
             "coordinates": self.coordinates,
             "triangles": self.triangles,
             **({"classes": self.classes} if self.classes else {}),
@@ -202,6 +206,12 @@ class PictureContent:
             arrays["reflectance"] = self.reflectance
         if self.scene.colours is not None:
             arrays["colours"] = self.scene.colours.means()
+        arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
+        path.write_bytes(packed(arrays))
+
+    def _track_arrays(self) -> dict[str, Any]:
+        """Return the positions of sensors and the trajectories of actors, {name in the file: …}."""
+        arrays: dict[str, Any] = {}
         for number, sensor in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = sensor.times_ns
             arrays[f"sensor{number}"] = sensor.positions
@@ -213,6 +223,11 @@ class PictureContent:
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
             if actor.mesh.animation is not None:
                 arrays[f"actor{number}_offset"] = actor.offset_s
+        return arrays
+
+    def _mesh_arrays(self) -> dict[str, Any]:
+        """Return the meshes of actors and their animations, {name in the file: array}."""
+        arrays: dict[str, Any] = {}
         meshes, arrays["actor_mesh"] = distinct_meshes(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
@@ -227,16 +242,22 @@ class PictureContent:
                     animation.speed_m_s or 0,
                     animation.repeat,
                 ]
-        if (planning := self.planning) is not None and (best := planning.best) is not None:
-            arrays |= {
-                "ends": [planning.start, planning.target],
-                "centres": planning.centres,
-                "radii": planning.radii,
-                "path": best.corners,
-                "waypoints": np.array(best.trials),
-            }
-            arrays |= {name: getattr(best, field) for name, field in _PATH_LENGTHS.items()}
-        path.write_bytes(packed(arrays))
+        return arrays
+
+    def _planning_arrays(self) -> dict[str, Any]:
+        """Return the search and its best path, {name in the file: array}; empty without a path."""
+        planning = self.planning
+        if planning is None or planning.best is None:
+            return {}
+        best = planning.best
+        return {
+            "ends": [planning.start, planning.target],
+            "centres": planning.centres,
+            "radii": planning.radii,
+            "path": best.corners,
+            "waypoints": np.array(best.trials),
+            **{name: getattr(best, field) for name, field in _PATH_LENGTHS.items()},
+        }
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
@@ -249,6 +270,7 @@ class PictureContent:
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
+        """Build the content from the arrays of a file; ValueError for another format."""
         if (version := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"it is of format {version}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
@@ -263,7 +285,7 @@ class PictureContent:
             times, positions, rotations = (arrays[f"actor{number}_{part}"] for part in _TRACK)
             beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
             track = Track(times, positions, rotations, start_s=0.0, beyond=beyond)
-            offset_s = float(arrays.get(f"actor{number}_offset", 0))  # without poses, there is none
+            offset_s = float(arrays.get(f"actor{number}_offset", 0))  # animated actors have one
             mesh = replace(meshes[mesh_of_actor[number]], name=name)
             actors.append(Actor(mesh, track, offset_s))
         scene = Scene(
@@ -289,7 +311,7 @@ class PictureContent:
             sample_rays=arrays["sample_rays"],
             planning=_planning(arrays) if "path" in arrays else None,
             duration_ns=float(arrays["duration_ns"]),
-            own=[Column(**column) for column in names["own"]],
+            extra_columns=[Column(**column) for column in names["own"]],
             reflectance=arrays.get("reflectance"),
             coordinates=names["coordinates"],
             triangles=names["triangles"],
@@ -328,7 +350,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
         stop = first + steps * path.stations
         scans: Iterable[int] = range(first, stop, steps)  # the first at each station
         if path.moves:
-            scans = np.unique(np.linspace(first, stop - 1, PLACES_MOST).astype(int)).tolist()
+            scans = np.unique(np.linspace(first, stop - 1, MAX_POSITIONS).astype(int)).tolist()
         times = np.array([survey.begins_ns(scan) for scan in scans])
         positions = np.array([survey.pose(scan).position for scan in scans])
         sensors.append(
@@ -341,16 +363,16 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
 def moving_positions(
     sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Return the positions (k, 3) of all that a picture of a survey with motion has to show.
+    """Return the positions (k, 3) that a picture of a survey with motion has to show.
 
-    They are the positions of moving sensors, else of actors and sensors; none without motion.
+    These are the positions of moving sensors, else of actors and sensors; empty without motion.
     """
     moving = [sensor.positions for sensor in sensors if sensor.moves]
     if moving or not actors:
         return moving
-    times = np.linspace(0, duration_ns, PLACES_MOST)
-    of_actors = [actor.trajectory.poses(0, times)[0] for actor in actors]
-    return [*(sensor.positions for sensor in sensors), *of_actors]
+    times = np.linspace(0, duration_ns, MAX_POSITIONS)
+    actor_positions = [actor.trajectory.poses(0, times)[0] for actor in actors]
+    return [*(sensor.positions for sensor in sensors), *actor_positions]
 
 
 def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm, Normalize
 from pydantic import Field
 
 from lidarsim._version import __version__
-from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.validation import checked
@@ -30,44 +30,51 @@ from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
 from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
-from .recordings import Recording, Turn, open_recording
+from .recordings import RecordedPoints, Recording, open_recording
 
-MOST_POINTS = 10_000_000  # of each cloud in memory
-MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
+MAX_POINTS = 10_000_000  # of each cloud in memory
+MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
+CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
 
-# Points (n, 3) of a cloud, and their distances (n,) to the other.
-Above = tuple[Floats, Floats]
-WIDTH = 1600
+WIDTH = 1600  # of charts, pixels
 # of charts, as shares of the width
 LEFT = 0.075
 RIGHT = 0.845
-MOST_DOTS = 120_000
-A = "#4477aa"
-B = "#ee7733"
+MAX_DOTS = 120_000
+# colours of A and B
+A_COLOUR = "#4477aa"
+B_COLOUR = "#ee7733"
 # no colours of residuals
 ONLY_A = theme.rgb("#2ca25f")
 ONLY_B = theme.rgb("#101418")
-NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
-LACKS = ("only A has a return", "only B has a return", "no return")
-RANGES = "viridis"
-DIFFERENCES = "RdBu_r"
-FAR = "plasma"
-SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
-CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
-CLOSEST_M = 0.001  # end of the scale of distances
+NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
+GAP_LABELS = ("only A has a return", "only B has a return", "no return")
+# colour maps
+RANGE_COLOURS = "viridis"
+RESIDUAL_COLOURS = "RdBu_r"
+DISTANCE_COLOURS = "plasma"
+RESIDUAL_SCALE = 6.0  # end of the scale, in median absolute deviations: about four sigma
+MIN_DISTANCE_M = 0.001  # end of the scale of distances
+
+
+class MeasuredPoints(NamedTuple):
+    """Points of a cloud, and their distances to the compared cloud."""
+
+    points: Floats  # (n, 3), metres
+    distances: Floats  # (n,), metres
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """What `compare` has found; printed as a table."""
+    """Result of `compare`; printed as a table."""
 
     figures: dict[str, Any]  # as in compare.json; lengths in metres, None for unknown
-    images: RangeImages | None  # of the first pair of sweeps that has them
-    residuals: Floats  # of all cells with a return in both, or of a choice
-    distances: tuple[Floats, Floats]  # of A's points to B, and of B's to A
-    lights: tuple[Floats, Floats]  # intensities of A and B that are compared
-    above: Sequence[Above]  # of A and of B: of one pair of sweeps, or of all
+    images: RangeImages | None  # of the first pair of sweeps that has range images
+    residuals: Floats  # (k,): of all cells with a return in both, or of a choice, metres
+    distances: tuple[Floats, Floats]  # of A's points to B, and of B's to A, metres
+    intensities: tuple[Floats, Floats]  # of A and B that are compared
+    measured_points: Sequence[MeasuredPoints]  # of A and of B: of one pair of sweeps, or of all
 
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")
@@ -76,25 +83,25 @@ class Comparison:
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and pictures, and return their paths.
 
-        LidarError if the folder, which is made, cannot be written to.
+        LidarError if the folder, which is created, cannot be written to.
         """
-        place = Path(folder)
+        path = Path(folder)
         with (
-            result_folder(place),
-            explained(f"The comparison cannot be written to {place}", "make room"),
-            staging(place) as staged,
+            result_folder(path),
+            explained(f"The comparison cannot be written to {path}", "make room"),
+            staging(path) as staged,
         ):
-            drawn = {"distances": draw_distances(self), "above": draw_above(self)}
+            pages = {"distances": draw_distances(self), "above": draw_above(self)}
             if self.images is not None:
-                drawn = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | drawn
-            images = {name: page.svg() for name, page in drawn.items()}
+                pages = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | pages
+            pictures = {name: page.svg() for name, page in pages.items()}
             text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
-            page = rendered("comparison.html", report=self.figures, pictures=images)
-            files = {"compare.json": text.encode(), "compare.html": page.encode()}
-            files |= {f"compare-{name}.png": drawing.png() for name, drawing in drawn.items()}
+            report = rendered("comparison.html", report=self.figures, pictures=pictures)
+            files = {"compare.json": text.encode(), "compare.html": report.encode()}
+            files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
             for name, content in files.items():
                 (staged / name).write_bytes(content)
-            return [(staged / name).replace(place / name) for name in files]
+            return [(staged / name).replace(path / name) for name in files]
 
 
 @checked
@@ -112,13 +119,14 @@ def compare(
     unit_b: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
-    most_points: Annotated[int, Field(ge=1000)] = MOST_POINTS,
+    most_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
 ) -> Comparison:
     """Compare two clouds or recordings of the same place; B is the reference.
 
     Recordings of one sensor are compared sweep by sweep in the sensor's axes: the range image,
-    returns that only one of them has, intensities, and distances to nearest neighbours. A cloud
-    without rings or sweeps has distances alone, in the world's axes. Nothing is aligned before.
+    returns that only A or B has, intensities, and distances to nearest neighbours. A cloud without
+    rings or sweeps has distances alone, in the world frame. Clouds are compared as they are,
+    without alignment.
 
     Parameters
     ----------
@@ -128,7 +136,7 @@ def compare(
     sweeps
         Only these pairs of sweeps, from 0.
     match
-        Which sweeps belong together: those of the same number, or of the same time.
+        Whether sweeps of the same number or of the same time belong together.
     sensor_a, sensor_b
         Of a recording of several: name of the sensor, or topic of a bag.
     intensity_a, intensity_b
@@ -139,61 +147,69 @@ def compare(
     azimuth_deg
         Width of a cell; by default the step from pulse to pulse, the coarser one.
     distances_m
-        Distances within which a point is found by the other cloud, for precision and recall.
+        Distances within which a point counts as present in the compared cloud, for precision and
+        recall.
     most_points
         Points of each cloud in memory; of more, a share is chosen evenly.
 
     Raises
     ------
     LidarError
-        If one cannot be read, is empty, or they have nothing that can be compared.
+        If A or B cannot be read or is empty, or A and B share no quantity to compare.
     """
-    if not distances_m or any(not 0 < one < np.inf for one in distances_m):
+    if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
-    recordings = (
-        open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a),
-        open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b),
-    )
-    found = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg)
-    first, second = recordings
-    if not first.whole and not second.whole:
-        pairs = _pairs(first, second, match, found.notes)
-        for number in sweeps or ():
-            if not 0 <= number < len(pairs):
-                raise LidarError(
-                    f"there is no sweep {number}: {plural(len(pairs), 'pair')} of sweeps, from 0."
-                )
+    first = open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a)
+    second = open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b)
+    comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
+    if not first.is_cloud and not second.is_cloud:
+        pairs = _pair_sweeps(first, second, match, comparing.notes)
         if sweeps:
-            pairs = [pairs[number] for number in sorted({*sweeps})]
-        budget = MOST_VALUES // len(pairs)
-        for i, j in pairs:
-            found.add(first.turn(i), second.turn(j), budget)
-        return found.result(len(pairs))
-    one = first if first.whole else second
+            pairs = _choose_pairs(pairs, sweeps)
+        budget = MAX_VALUES // len(pairs)
+        for number_a, number_b in pairs:
+            comparing.add(first.read_points(number_a), second.read_points(number_b), budget)
+        return comparing.result(len(pairs))
+    cloud = first if first.is_cloud else second
     if sweeps or match == "time":
-        raise LidarError(f"{one.name} has no sweeps: leave out --sweep and --match.")
-    if not first.whole or not second.whole:
-        found.notes.append(f"{one.name} has no sweeps: all points of both are compared at once")
-    found.add(found.cloud(first, most_points), found.cloud(second, most_points), MOST_VALUES)
-    return found.result(0)
+        raise LidarError(f"{cloud.name} has no sweeps: leave out --sweep and --match.")
+    if not first.is_cloud or not second.is_cloud:
+        comparing.notes.append(
+            f"{cloud.name} has no sweeps: all points of both are compared at once"
+        )
+    points_a = comparing.read_cloud(first, most_points)
+    points_b = comparing.read_cloud(second, most_points)
+    comparing.add(points_a, points_b, MAX_VALUES)
+    return comparing.result(0)
 
 
-def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tuple[int, int]]:
-    """Numbers of the sweeps that belong together; a note if some are alone."""
+def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the pairs at indices `sweeps`, in order; LidarError for an index out of range."""
+    for number in sweeps:
+        if not 0 <= number < len(pairs):
+            raise LidarError(
+                f"there is no sweep {number}: {plural(len(pairs), 'pair')} of sweeps, from 0."
+            )
+    return [pairs[number] for number in sorted({*sweeps})]
+
+
+def _pair_sweeps(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tuple[int, int]]:
+    """Return the numbers of sweeps of A and B that belong together.
+
+    Appends a note if sweeps are left over. LidarError if no sweeps belong together.
+    """
     pairs = [(number, number) for number in range(min(a.count, b.count))]
     if match == "time":
-        times = []
-        for one in (a, b):
-            if one.times is None:
-                raise LidarError(f"{one.name} has no times of sweeps: leave out --match time.")
-            times.append(np.fromiter(one.times(), np.float64))
-        of_a, of_b = times
+        times_a = _sweep_times(a)
+        times_b = _sweep_times(b)
         if pairs:
-            order = np.argsort(of_a)
-            near = order[np.searchsorted((of_a[order][1:] + of_a[order][:-1]) / 2, of_b)]
-            period = np.median(np.diff(of_b)) if len(of_b) > 1 else 1e8
-            close = np.flatnonzero(np.abs(of_a[near] - of_b) <= period / 2)
-            pairs = [(int(near[j]), int(j)) for j in close]
+            order = np.argsort(times_a)
+            sorted_times = times_a[order]
+            middles = (sorted_times[1:] + sorted_times[:-1]) / 2
+            nearest_a = order[np.searchsorted(middles, times_b)]
+            period = np.median(np.diff(times_b)) if len(times_b) > 1 else 1e8
+            close = np.flatnonzero(np.abs(times_a[nearest_a] - times_b) <= period / 2)
+            pairs = [(int(nearest_a[number]), int(number)) for number in close]
     if not pairs:
         raise LidarError(
             f"{a.name} with {plural(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
@@ -207,201 +223,271 @@ def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tup
     return pairs
 
 
+def _sweep_times(recording: Recording) -> Floats:
+    """Return the start of each sweep, ns; LidarError if the recording has no times."""
+    if recording.times is None:
+        raise LidarError(f"{recording.name} has no times of sweeps: leave out --match time.")
+    return np.fromiter(recording.times(), np.float64)
+
+
+class _CellPairs(NamedTuple):
+    """Cells with a return in both sweeps, (k,) each."""
+
+    residual: Floats  # metres
+    ring: Ints
+    intensity_a: Floats
+    intensity_b: Floats
+
+
+class _NearestPairs(NamedTuple):
+    """Points of a cloud, each with its nearest neighbour in the compared cloud, (n,) each."""
+
+    distance: Floats  # metres
+    intensity: Floats  # of the point
+    nearest_intensity: Floats
+
+
 @dataclass(eq=False)
 class _Comparing:
-    """What has been compared so far."""
+    """Running totals of a comparison, pair of sweeps by pair of sweeps."""
 
     recordings: tuple[Recording, Recording]
-    within: tuple[float, ...]
+    distances_m: tuple[float, ...]
     azimuth_deg: float | None
 
     def __post_init__(self) -> None:
-        self.notes = [text for one in self.recordings for text in one.notes]
-        self.points = np.zeros(2, np.int64)
+        self.notes = [note for recording in self.recordings for note in recording.notes]
+        self.point_counts = np.zeros(2, np.int64)
         self.images: RangeImages | None = None
-        self.above: list[Above] = []
-        # Of cells with a return in both: residual, ring, intensities of A and B.
-        self.cells: list[tuple[AnyArray, ...]] = []
-        # Of points of A, and of B: distance to the other, own intensity, that of the nearest.
-        self.pairs: tuple[list[Any], list[Any]] = ([], [])
-        # {ring: its elevation, and how many of its cells are of each of `CELLS`}
+        self.measured_points: list[MeasuredPoints] = []
+        self.cells: list[_CellPairs] = []
+        self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])  # from A, from B
+        # {ring: its elevation, and the number of its cells in each state of `CELLS`}
         self.rings: dict[int, tuple[float, Ints]] = {}
 
     def note(self, text: str) -> None:
-        """Say something once."""
+        """Add a note, unless the same note was added before."""
         if text not in self.notes:
             self.notes.append(text)
 
-    def cloud(self, one: Recording, most: int) -> Turn:
-        """Read all points in the world's axes, or about so many, chosen evenly."""
-        share = 1.0 if one.points is None else min(1.0, most / max(one.points, 1))
+    def read_cloud(self, recording: Recording, max_points: int) -> RecordedPoints:
+        """Read points in the world frame: all, or about `max_points`, chosen evenly."""
+        count = recording.point_count
+        share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
-        for number in range(one.count):
-            part = one.turn(number, in_world=True)
+        for number in range(recording.count):
+            part = recording.read_points(number, in_world=True)
             parts.append(part.part(even_indices(len(part), round(share * len(part)))))
         if share == 1 or not parts:
-            return Turn.joined(parts)
+            return RecordedPoints.joined(parts)
         self.note(
-            f"{one.name} has {one.points:,} points, of which {100 * share:.3g} % are compared, "
+            f"{recording.name} has {count:,} points, of which {100 * share:.3g} % are compared, "
             "chosen evenly: distances to it are too long"
         )
-        return replace(Turn.joined(parts), rings=None)
+        return replace(RecordedPoints.joined(parts), rings=None)
 
-    def add(self, a: Turn, b: Turn, budget: int) -> None:
-        """Compare two sweeps or clouds, of each at most so many cells and points."""
-        self.points += len(a), len(b)
+    def add(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare two sweeps or clouds, at most `budget` cells and points of each."""
+        self.point_counts += len(a), len(b)
         if max(len(a), len(b)) > budget:
             self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
         if not len(a) or not len(b):
             self.note("pairs of which one has no points are left out")
             return
         self._add_images(a, b, budget)
-        for found, turn, other in zip(self.pairs, (a, b), (b, a), strict=True):
-            some = turn.part(even_indices(len(turn), budget))
-            distance, index = nearest(some.points, other.points)
-            if len(self.above) < 2:
-                self.above.append((some.points, distance))
-            if some.light is None or other.light is None:
-                found.append((distance, *np.full((2, len(distance)), np.nan)))
+        for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
+            chosen = cloud.part(even_indices(len(cloud), budget))
+            distance, index = nearest(chosen.points, reference.points)
+            if len(self.measured_points) < 2:
+                self.measured_points.append(MeasuredPoints(chosen.points, distance))
+            intensity = chosen.intensities
+            if intensity is None or reference.intensities is None:
+                pairs.append(_NearestPairs(distance, *np.full((2, len(distance)), np.nan)))
             else:
-                found.append((distance, some.light, other.light[index]))
+                pairs.append(_NearestPairs(distance, intensity, reference.intensities[index]))
 
-    def _add_images(self, a: Turn, b: Turn, budget: int) -> None:
+    def _add_images(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare the range images of two sweeps; add a note instead if there are none."""
         first, second = self.recordings
-        same = first.firings and first.firings == second.firings
-        make = paired_images if same else range_images
+        same_rays = first.firing_key and first.firing_key == second.firing_key
+        make_images = paired_images if same_rays else range_images
         try:
-            images = make(a, b, (first.name, second.name), self.azimuth_deg)
+            images = make_images(a, b, (first.name, second.name), self.azimuth_deg)
         except LidarError as error:
             self.note(f"no range image: {error}")
             return
-        for text in images.notes:
-            self.note(text)
+        for note in images.notes:
+            self.note(note)
         self.images = self.images or images
-        row = images.row
-        values = images.compared
-        in_a, in_b = np.isfinite(values[:, 0])
-        neither, _ = np.nonzero(~images.there[0] & ~images.there[1])
-        states = [neither, row[~in_a & in_b], row[in_a & ~in_b], row[in_a & in_b]]
-        counts = np.stack([np.bincount(s, minlength=len(images.rings)) for s in states], axis=1)
+        in_a, in_b = np.isfinite(images.compared[:, 0])
+        self._count_cells(images, in_a, in_b)
+        in_both = np.flatnonzero(in_a & in_b)
+        in_both = in_both[even_indices(len(in_both), budget)]
+        (range_a, intensity_a), (range_b, intensity_b) = images.compared[..., in_both]
+        ring = images.rings[images.rows[in_both]]
+        self.cells.append(_CellPairs(range_a - range_b, ring, intensity_a, intensity_b))
+
+    def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
+        """Add the cells of each ring to its states; `in_a` and `in_b` (k,) mark returns."""
+        rows = images.rows
+        returned_a, returned_b = images.returned
+        rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
+        rows_of_states = (
+            rows_of_neither,
+            rows[~in_a & in_b],
+            rows[in_a & ~in_b],
+            rows[in_a & in_b],
+        )
+        counts = np.stack(
+            [np.bincount(state, minlength=len(images.rings)) for state in rows_of_states], axis=1
+        )
         for ring, elevation, count in zip(
             images.rings.tolist(), images.elevation_deg.tolist(), counts, strict=True
         ):
-            _, earlier = self.rings.get(ring, (0.0, np.zeros(4, np.int64)))
-            self.rings[ring] = elevation, earlier + count
-        where = np.flatnonzero(in_a & in_b)
-        where = where[even_indices(len(where), budget)]
-        (range_a, *of_a), (range_b, *of_b) = values[..., where]
-        self.cells.append((range_a - range_b, images.rings[row[where]], *of_a, *of_b))
+            _, total = self.rings.get(ring, (0.0, np.zeros(4, np.int64)))
+            self.rings[ring] = elevation, total + count
 
-    def result(self, pairs: int) -> Comparison:
-        """Return all figures, of so many pairs of sweeps; 0 of whole clouds."""
-        for one, points in zip(self.recordings, self.points.tolist(), strict=True):
-            if not points:
-                raise LidarError(f"{one.name} has no points: there is nothing to compare.")
-        if not self.above:
+    def result(self, pair_count: int) -> Comparison:
+        """Return all figures of a number of pairs of sweeps; 0 for clouds without sweeps."""
+        counts = self.point_counts.tolist()
+        for recording, count in zip(self.recordings, counts, strict=True):
+            if not count:
+                raise LidarError(f"{recording.name} has no points: there is nothing to compare.")
+        if not self.measured_points:
             raise LidarError("No pair of sweeps has points in both: choose others.")
-        (to_b, *of_points), (to_a, *_) = (
-            tuple(map(np.concatenate, zip(*found, strict=True))) for found in self.pairs
+        from_a, from_b = (
+            _NearestPairs(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in self.nearest
         )
         residuals = np.empty(0)
-        image = None
-        of = "nearest points"
-        mine, theirs = (light[to_b <= self.within[0]] for light in of_points)
+        image_figures = None
+        paired_by = "nearest points"
+        is_close = from_a.distance <= self.distances_m[0]
+        intensity_a = from_a.intensity[is_close]
+        intensity_b = from_a.nearest_intensity[is_close]
         if self.images is not None:
-            cells = tuple(map(np.concatenate, zip(*self.cells, strict=True)))
-            residuals, rings, mine, theirs = cells
-            image = self._of_images(residuals, rings)
-            of = self.images.paired_by
-        known = np.isfinite(mine) & np.isfinite(theirs)
-        lights = mine[known], theirs[known]
-        correlation = rank_correlation(*lights)
-        light = {"rank_correlation": correlation, "pairs": len(lights[0]), "of": of}
+            cells = _CellPairs(*map(np.concatenate, zip(*self.cells, strict=True)))
+            residuals = cells.residual
+            intensity_a = cells.intensity_a
+            intensity_b = cells.intensity_b
+            image_figures = self._image_figures(cells)
+            paired_by = self.images.paired_by
+        is_known = np.isfinite(intensity_a) & np.isfinite(intensity_b)
+        intensities = intensity_a[is_known], intensity_b[is_known]
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
-            **{
-                key: {"name": one.name, "sweeps": None if one.whole else one.count, "points": count}
-                for key, one, count in zip("ab", self.recordings, self.points.tolist(), strict=True)
-            },
-            "pairs": pairs,
+            **self._source_figures(),
+            "pairs": pair_count,
             "notes": self.notes,
-            "range_image": image,
-            "intensity": None if correlation is None else light,
-            "distances": {
-                "a_to_b": _distances(to_b),
-                "b_to_a": _distances(to_a),
-                "chamfer_m": float(to_b.mean() + to_a.mean()),
-                "f_scores": [
-                    {"distance_m": one}
-                    | _scores(float(np.mean(to_b <= one)), float(np.mean(to_a <= one)))
-                    for one in self.within
-                ],
-            },
+            "range_image": image_figures,
+            "intensity": _intensity_figures(*intensities, paired_by),
+            "distances": self._distance_figures(from_a.distance, from_b.distance),
         }
-        return Comparison(figures, self.images, residuals, (to_b, to_a), lights, self.above)
+        distances = from_a.distance, from_b.distance
+        return Comparison(
+            figures, self.images, residuals, distances, intensities, self.measured_points
+        )
 
-    def _of_images(self, residuals: Floats, rings: Ints) -> dict[str, Any]:
+    def _source_figures(self) -> dict[str, Any]:
+        """Return the name and the sizes of A and B."""
+        counts = self.point_counts.tolist()
+        return {
+            key: {
+                "name": recording.name,
+                "sweeps": None if recording.is_cloud else recording.count,
+                "points": count,
+            }
+            for key, recording, count in zip("ab", self.recordings, counts, strict=True)
+        }
+
+    def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
+        """Return figures of the distances of A's points to B, and of B's to A, metres."""
+        f_scores = []
+        for distance in self.distances_m:
+            scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
+            f_scores.append({"distance_m": distance} | scores)
+        return {
+            "a_to_b": _distance_quantiles(to_b),
+            "b_to_a": _distance_quantiles(to_a),
+            "chamfer_m": float(to_b.mean() + to_a.mean()),
+            "f_scores": f_scores,
+        }
+
+    def _image_figures(self, cells: _CellPairs) -> dict[str, Any]:
+        """Return figures of the range images and of each ring, the highest first."""
         images = self.images
         assert images is not None
-        gaps = not any(one.thinned for one in self.recordings)
+        has_gaps = not any(recording.thinned for recording in self.recordings)
+        rings = sorted(self.rings.items(), key=lambda item: -item[1][0])
+        all_counts = sum(count for _, count in self.rings.values())
         return {
             "paired_by": images.paired_by,
             "columns": images.ranges[0].shape[1],
             "azimuth_step_deg": images.step_deg,
-            "hidden_points": dict(zip("ab", images.hidden, strict=True)),
-            "residual": _residuals(residuals),
-            "no_return": _no_return(sum(n for _, n in self.rings.values())) if gaps else None,
+            "hidden_points": dict(zip("ab", images.hidden_shares, strict=True)),
+            "residual": _residual_figures(cells.residual),
+            "no_return": _no_return_figures(all_counts) if has_gaps else None,
             "rings": [
                 {
                     "ring": ring,
                     "elevation_deg": elevation,
-                    **_residuals(residuals[rings == ring]),
-                    "no_return": _no_return(count) if gaps else None,
+                    **_residual_figures(cells.residual[cells.ring == ring]),
+                    "no_return": _no_return_figures(count) if has_gaps else None,
                 }
-                for ring, (elevation, count) in sorted(
-                    self.rings.items(), key=lambda item: -item[1][0]
-                )
+                for ring, (elevation, count) in rings
             ],
         }
 
 
-def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
-    """Distances (n,) of points to the nearest of others, metres, and the numbers of these."""
+def nearest(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
+    """Return distances (n,) to the nearest points of a reference, metres, and indices (n,)."""
     core = load_open3d().core
-    origin = others.mean(axis=0)  # far from zero, squares would lose their digits
-    tree = core.nns.NearestNeighborSearch(core.Tensor(others - origin))
+    origin = reference.mean(axis=0)  # far from zero, squares would lose their digits
+    tree = core.nns.NearestNeighborSearch(core.Tensor(reference - origin))
     tree.knn_index()
     index, square = tree.knn_search(core.Tensor(points - origin), 1)
     return np.sqrt(square.numpy()[:, 0]), index.numpy()[:, 0]
 
 
-def _residuals(values: Floats) -> dict[str, Any]:
-    """Figures of residuals A - B; None where there are none."""
+def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
+    """Return figures of pairs of intensities (n,); None without a rank correlation."""
+    correlation = rank_correlation(a, b)
+    if correlation is None:
+        return None
+    return {"rank_correlation": correlation, "pairs": len(a), "of": paired_by}
+
+
+def _residual_figures(values: Floats) -> dict[str, Any]:
+    """Return figures of residuals A - B (n,), metres; None for each figure without residuals."""
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
-    low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
+    p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
     mad = np.median(np.abs(values - median))
     rmse = np.sqrt(np.mean(values**2))
-    figures = map(float, (values.mean(), rmse, median, mad, low, high))
+    figures = map(float, (values.mean(), rmse, median, mad, p05, p95))
     return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
 
 
-def _no_return(counts: Any) -> dict[str, Any]:
-    """Figures of cells without a return in A, with those in B as the truth."""
-    both, of_a, of_b, _ = counts.tolist()
-    precision = both / (both + of_a) if both + of_a else None
-    recall = both / (both + of_b) if both + of_b else None
+def _no_return_figures(counts: Any) -> dict[str, Any]:
+    """Return figures of cells without a return in A, with cells of B as the truth.
+
+    `counts` (4,) are the cells of each state of `CELLS`.
+    """
+    in_both, in_a_only, in_b_only, _ = counts.tolist()
+    precision = in_both / (in_both + in_a_only) if in_both + in_a_only else None
+    recall = in_both / (in_both + in_b_only) if in_both + in_b_only else None
     return dict(zip(CELLS, counts.tolist(), strict=True)) | _scores(precision, recall)
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
+    """Return precision, recall and their harmonic mean; None where undefined."""
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
     return {"precision": precision, "recall": recall, "f1": f1}
 
 
-def _distances(values: Floats) -> dict[str, Any]:
+def _distance_quantiles(values: Floats) -> dict[str, Any]:
+    """Return the mean and quantiles of distances (n,), metres."""
     shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
     quantiles = np.quantile(values, list(shares.values())).tolist()
     return {
@@ -411,192 +497,292 @@ def _distances(values: Floats) -> dict[str, Any]:
     }
 
 
-def draw_ranges(found: Comparison) -> Page:
-    """Draw the range images of both, and their residuals, below each other."""
-    images = found.images
+class _ImageLayout(NamedTuple):
+    """Heights, in pixels, of a page with three range images in a column."""
+
+    image_height: int
+    page_height: int
+    top: int = 150
+    gap: int = 62
+    bottom: int = 90
+
+    @classmethod
+    def for_rows(cls, rows: int) -> _ImageLayout:
+        """Lay out images of a number of rings."""
+        image_height = int(np.clip(2.2 * rows, 90, 300))
+        defaults = cls._field_defaults
+        gaps = defaults["top"] + 2 * defaults["gap"] + defaults["bottom"]
+        return cls(image_height, 3 * image_height + gaps)
+
+    def image_bottom(self, number: int) -> float:
+        """Return the lower edge of an image, from 0, as a share of the page."""
+        pixels = self.page_height - self.top - (number + 1) * self.image_height - number * self.gap
+        return pixels / self.page_height
+
+
+def draw_ranges(comparison: Comparison) -> Page:
+    """Draw the range images of A and B, and their residuals, in a column."""
+    images = comparison.images
     assert images is not None
-    rows = len(images.rings)
-    high = int(np.clip(2.2 * rows, 90, 300))  # pixels of an image
-    top = 150
-    gap = 62
-    below = 90
-    height = top + 3 * high + 2 * gap + below
-    page = Page((WIDTH, height))
-    page.title(
-        "Range images",
-        f"{plural(rows, 'ring')}, {plural(images.ranges[0].shape[1], 'column')} of "
-        f"{images.step_deg:.4g}°",
-    )
-    both = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
-    low, most = np.quantile(both, (0.01, 0.98)) if len(both) else (0.0, 1.0)
-    norm = LogNorm(max(float(low), 0.01), max(float(most), float(low) * 1.01, 0.02))
-    (in_a, in_b), residual = images.there, images.ranges[0] - images.ranges[1]
-    scale = Normalize(-_limit(found), _limit(found))
-    for k, words in enumerate(("A", "B", "A − B")):
-        bottom = (height - top - (k + 1) * high - k * gap) / height
-        axes = page.chart((LEFT, bottom, RIGHT - LEFT, high / height), ylabel="elevation, °")
-        if k < 2:
-            painted = theme.mapped(RANGES, norm(np.nan_to_num(images.ranges[k], nan=low)).filled(0))
-            painted[~images.there[k]] = NONE
+    row_count, column_count = images.ranges[0].shape
+    layout = _ImageLayout.for_rows(row_count)
+    page = Page((WIDTH, layout.page_height))
+    size = f"{plural(row_count, 'ring')}, {plural(column_count, 'column')}"
+    page.title("Range images", f"{size} of {images.step_deg:.4g}°")
+    range_scale = _range_scale(images)
+    limit = _residual_limit(comparison)
+    residual_scale = Normalize(-limit, limit)
+    share = layout.image_height / layout.page_height
+    for number, words in enumerate(("A", "B", "A − B")):
+        frame = (LEFT, layout.image_bottom(number), RIGHT - LEFT, share)
+        axes = page.chart(frame, ylabel="elevation, °")
+        if number < 2:
+            colours = _range_colours(images, number, range_scale)
         else:
-            painted = theme.mapped(DIFFERENCES, scale(1000 * np.nan_to_num(residual)).data)
-            painted[~in_a & ~in_b] = NONE
-            painted[in_a & ~in_b] = ONLY_A
-            painted[~in_a & in_b] = ONLY_B
+            colours = _residual_colours(images, residual_scale)
             axes.set_xlabel("azimuth, °")
-            for text, colour in zip(LACKS, (ONLY_A, ONLY_B, NONE), strict=True):
-                axes.plot([], [], "s", color=colour, ms=4, label=text)
-            _key(page, axes)
-        # As the sensor sees it: what is to its left is on the left.
-        begin = images.begin_deg - images.step_deg / 2
-        end = begin + painted.shape[1] * images.step_deg
-        extent = (end, begin, rows - 0.5, -0.5)
-        axes.imshow(painted[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
-        some = np.unique(np.linspace(0, rows - 1, min(rows, 5)).round().astype(int))
-        axes.set_yticks(some, [f"{images.elevation_deg[row]:.1f}" for row in some])
-        axes.grid(False)
+            _draw_gap_legend(page, axes)
+        _show_image(axes, images, colours)
         page.heading(axes, words)
-    share = high / height
-    bottom = (height - top - 2 * high - gap) / height
     ramp = np.linspace(0, 1, 256)
-    frame = (0.862, bottom, 0.014, 2 * share + gap / height)
-    page.colour_bar(theme.mapped(RANGES, ramp), norm, "range, m", frame)
-    frame = (0.862, below / height, 0.014, share)
-    page.colour_bar(theme.mapped(DIFFERENCES, ramp), scale, "A − B, mm", frame)
+    frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
+    page.colour_bar(theme.mapped(RANGE_COLOURS, ramp), range_scale, "range, m", frame)
+    frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
+    page.colour_bar(theme.mapped(RESIDUAL_COLOURS, ramp), residual_scale, "A − B, mm", frame)
     return page
 
 
-def draw_rings(found: Comparison) -> Page:
+def _range_scale(images: RangeImages) -> LogNorm:
+    """Return the scale of colours of ranges, metres."""
+    ranges = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
+    min_m, max_m = np.quantile(ranges, (0.01, 0.98)) if len(ranges) else (0.0, 1.0)
+    return LogNorm(max(float(min_m), 0.01), max(float(max_m), float(min_m) * 1.01, 0.02))
+
+
+def _range_colours(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
+    """Return the colours (r, c, …) of the ranges of A (0) or B (1)."""
+    ranges = np.nan_to_num(images.ranges[index], nan=scale.vmin)
+    colours = theme.mapped(RANGE_COLOURS, scale(ranges).filled(0))
+    colours[~images.returned[index]] = NO_RETURN
+    return colours
+
+
+def _residual_colours(images: RangeImages, scale: Normalize) -> AnyArray:
+    """Return the colours (r, c, …) of the residuals, and of cells without a return."""
+    residual = images.ranges[0] - images.ranges[1]
+    in_a, in_b = images.returned
+    colours = theme.mapped(RESIDUAL_COLOURS, scale(1000 * np.nan_to_num(residual)).data)
+    colours[~in_a & ~in_b] = NO_RETURN
+    colours[in_a & ~in_b] = ONLY_A
+    colours[~in_a & in_b] = ONLY_B
+    return colours
+
+
+def _draw_gap_legend(page: Page, axes: Axes) -> None:
+    """Draw a legend of the colours of cells without a return."""
+    for text, colour in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
+        axes.plot([], [], "s", color=colour, ms=4, label=text)
+    _draw_legend(page, axes)
+
+
+def _show_image(axes: Axes, images: RangeImages, colours: AnyArray) -> None:
+    """Show colours (r, c, …) as the sensor sees the cells: its left is on the left."""
+    row_count, column_count = colours.shape[:2]
+    start_deg = images.start_deg - images.step_deg / 2
+    stop_deg = start_deg + column_count * images.step_deg
+    extent = (stop_deg, start_deg, row_count - 0.5, -0.5)
+    axes.imshow(colours[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
+    rows = np.unique(np.linspace(0, row_count - 1, min(row_count, 5)).round().astype(int))
+    axes.set_yticks(rows, [f"{images.elevation_deg[row]:.1f}" for row in rows])
+    axes.grid(False)
+
+
+def draw_rings(comparison: Comparison) -> Page:
     """Draw residuals and lost returns of each ring, and a histogram of all residuals."""
-    image = found.figures["range_image"]
-    rows = [row for row in image["rings"] if row["cells"]]
-    height = 760
-    page = Page((WIDTH, height))
+    image = comparison.figures["range_image"]
+    rings = [ring for ring in image["rings"] if ring["cells"]]
+    page = Page((WIDTH, 760))
     page.title("Residuals by ring", f"A − B in {image['residual']['cells']:,} {image['paired_by']}")
-    elevation = np.array([row["elevation_deg"] for row in rows])
-    lows, middles, highs, means = (
-        1000 * np.array([row[name] for row in rows])
+    has_gaps = image["no_return"] is not None
+    width = 0.24 if has_gaps else 0.4
+    gap = 0.075 if has_gaps else 0.1
+    second_x = LEFT + width + gap
+    third_x = second_x + (width + gap)
+    frames = [(x, 0.13, width, 0.64) for x in (LEFT, second_x, third_x)]
+    limit = _residual_limit(comparison)
+    axes = page.chart(frames[0], xlabel="A − B, mm", ylabel="elevation, °")
+    _draw_ring_residuals(page, axes, rings, limit)
+    if has_gaps:
+        axes = page.chart(frames[1], xlabel="cells without a return, %")
+        _draw_ring_gaps(page, axes, rings)
+    frame = frames[2] if has_gaps else frames[1]
+    axes = page.chart(
+        frame, xlabel="A − B, mm; more in the outer bins", ylabel="cells", yscale="log"
+    )
+    _draw_residual_histogram(axes, comparison.residuals, limit)
+    return page
+
+
+def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> None:
+    """Draw the histogram of residuals (k,) in metres, up to a limit in millimetres."""
+    bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimetres
+    outer = np.floor(limit / bin_mm) + 0.5
+    edges = np.arange(-outer, outer + 1) * bin_mm
+    values = np.clip(1000 * residuals, edges[0], edges[-1])
+    axes.hist(values, bins=edges.tolist(), color=A_COLOUR)
+
+
+def _marker_size(page: Page, rings: Sequence[Any]) -> float:
+    """Return the size of the markers of rings, points."""
+    return 3.4 * page.unit if len(rings) < 40 else 2 * page.unit
+
+
+def _draw_ring_residuals(
+    page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]], limit: float
+) -> None:
+    """Draw the spread, median and mean of the residuals of each ring, up to a limit in mm."""
+    elevation = np.array([ring["elevation_deg"] for ring in rings])
+    p05, median, p95, mean = (
+        1000 * np.array([ring[name] for ring in rings])
         for name in ("p05_m", "median_m", "p95_m", "bias_m")
     )
-    lost = image["no_return"] is not None
-    wide, apart = (0.24, 0.075) if lost else (0.4, 0.1)
-    axes = page.chart((LEFT, 0.13, wide, 0.64), xlabel="A − B, mm", ylabel="elevation, °")
-    thick = float(np.clip(150 / max(len(rows), 1), 0.7, 4)) * page.unit
-    axes.hlines(elevation, lows, highs, color=theme.UNSEEN, lw=thick, label="5 to 95 %")
+    line_width = float(np.clip(150 / max(len(rings), 1), 0.7, 4)) * page.unit
+    axes.hlines(elevation, p05, p95, color=theme.UNSEEN, lw=line_width, label="5 to 95 %")
     axes.axvline(0, color=theme.MUTED, lw=0.7 * page.unit)
-    size = 3.4 * page.unit if len(rows) < 40 else 2 * page.unit
-    axes.plot(middles, elevation, "o", color=A, ms=size, mew=0, label="median")
-    axes.plot(means, elevation, "|", color=theme.SENSOR, ms=2 * size, mew=0.8 * page.unit,
-              label="mean")  # fmt: skip
-    limit = _limit(found)
+    size = _marker_size(page, rings)
+    axes.plot(median, elevation, "o", color=A_COLOUR, ms=size, mew=0, label="median")
+    mean_style = {"color": theme.SENSOR, "ms": 2 * size, "mew": 0.8 * page.unit}
+    axes.plot(mean, elevation, "|", label="mean", **mean_style)
     axes.set_xlim(-limit, limit)
-    _key(page, axes)
-    left = LEFT + wide + apart
-    if lost:
-        axes = page.chart((left, 0.13, wide, 0.64), xlabel="cells without a return, %")
-        counts = np.array([[row["no_return"][name] for name in CELLS] for row in rows])
-        for colour, which, words in ((A, 1, "A"), (B, 2, "B")):
-            share = 100 * (counts[:, 0] + counts[:, which]) / counts.sum(axis=1)
-            axes.plot(share, elevation, "o-", color=colour, ms=size, mew=0, lw=0.6 * page.unit,
-                      label=words)  # fmt: skip
-        axes.set_xlim(left=min(0, axes.get_xlim()[0]))
-        _key(page, axes)
-        left += wide + apart
-    axes = page.chart((left, 0.13, wide, 0.64), xlabel="A − B, mm; more in the outer bins",
-                      ylabel="cells", yscale="log")  # fmt: skip
-    width = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimetres
-    half = np.floor(limit / width) + 0.5
-    edges = np.arange(-half, half + 1) * width
-    values = np.clip(1000 * found.residuals, edges[0], edges[-1])
-    axes.hist(values, bins=edges.tolist(), color=A)
-    return page
+    _draw_legend(page, axes)
 
 
-def draw_distances(found: Comparison) -> Page:
+def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the share of cells without a return of each ring, in A and in B."""
+    elevation = np.array([ring["elevation_deg"] for ring in rings])
+    counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
+    style = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
+    for colour, state, label in ((A_COLOUR, 1, "A"), (B_COLOUR, 2, "B")):
+        share = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)
+        axes.plot(share, elevation, "o-", color=colour, label=label, **style)
+    axes.set_xlim(left=min(0, axes.get_xlim()[0]))
+    _draw_legend(page, axes)
+
+
+def draw_distances(comparison: Comparison) -> Page:
     """Draw cumulative distances in both directions, and intensities of A and B if known."""
-    height = 760
-    page = Page((WIDTH, height))
-    far = found.figures["distances"]
+    page = Page((WIDTH, 760))
+    distances = comparison.figures["distances"]
     page.title(
         "Distances to the nearest neighbour",
-        f"medians: A to B {millimetres(far['a_to_b']['median_m'])}, B to A "
-        f"{millimetres(far['b_to_a']['median_m'])}",
+        f"medians: A to B {millimetres(distances['a_to_b']['median_m'])}, B to A "
+        f"{millimetres(distances['b_to_a']['median_m'])}",
     )
-    wide = 0.4 if found.figures["intensity"] else 0.77
-    axes = page.chart((LEFT, 0.13, wide, 0.64), xlabel="distance, m", ylabel="points within, %",
-                      xscale="log", ylim=(0, 101))  # fmt: skip
+    intensity = comparison.figures["intensity"]
+    axes = page.chart(
+        (LEFT, 0.13, 0.4 if intensity else 0.77, 0.64),
+        xlabel="distance, m",
+        ylabel="points within, %",
+        xscale="log",
+        ylim=(0, 101),
+    )
     shares = np.linspace(0, 1, 1001)
-    for values, colour, words in zip(found.distances, (A, B), ("A to B", "B to A"), strict=True):
-        reach = np.quantile(values, shares).clip(CLOSEST_M)
-        axes.plot(reach, 100 * shares, color=colour, lw=1.4 * page.unit, label=words)
-    most = max(float(np.quantile(values, 0.999)) for values in found.distances)
-    axes.set_xlim(CLOSEST_M, max(2 * most, 0.01))
+    labels = ("A to B", "B to A")
+    for values, colour, label in zip(
+        comparison.distances, (A_COLOUR, B_COLOUR), labels, strict=True
+    ):
+        quantiles = np.quantile(values, shares).clip(MIN_DISTANCE_M)
+        axes.plot(quantiles, 100 * shares, color=colour, lw=1.4 * page.unit, label=label)
+    max_m = max(float(np.quantile(values, 0.999)) for values in comparison.distances)
+    axes.set_xlim(MIN_DISTANCE_M, max(2 * max_m, 0.01))
     axes.xaxis.set_major_formatter("{x:g}")
-    for one in far["f_scores"]:
-        axes.axvline(one["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
-    _key(page, axes)
-    if found.figures["intensity"]:
-        light = found.figures["intensity"]
-        axes = page.chart((LEFT + 0.5, 0.13, 0.4, 0.64), xlabel="intensity in B",
-                          ylabel="intensity in A")  # fmt: skip
-        mine, theirs = found.lights
-        axes.hist2d(theirs, mine, (_bins(theirs), _bins(mine)), norm=LogNorm(), cmap="viridis",
-                    rasterized=True)  # fmt: skip
-        axes.grid(False)
-        told = f"rank correlation {light['rank_correlation']:.3f}"
-        page.heading(axes, f"{told} of {light['pairs']:,} {light['of']}")
+    for score in distances["f_scores"]:
+        axes.axvline(score["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
+    _draw_legend(page, axes)
+    if intensity:
+        _draw_intensities(page, comparison)
     return page
 
 
-def draw_above(found: Comparison) -> Page:
-    """Draw both clouds from above, coloured by the distance to the other."""
+def _draw_intensities(page: Page, comparison: Comparison) -> None:
+    """Draw the histogram of pairs of intensities, on the right."""
+    figures = comparison.figures["intensity"]
+    frame = (LEFT + 0.5, 0.13, 0.4, 0.64)
+    axes = page.chart(frame, xlabel="intensity in B", ylabel="intensity in A")
+    intensity_a, intensity_b = comparison.intensities
+    bins = _intensity_bins(intensity_b), _intensity_bins(intensity_a)
+    axes.hist2d(intensity_b, intensity_a, bins, norm=LogNorm(), cmap="viridis", rasterized=True)
+    axes.grid(False)
+    correlation = f"rank correlation {figures['rank_correlation']:.3f}"
+    page.heading(axes, f"{correlation} of {figures['pairs']:,} {figures['of']}")
+
+
+def draw_above(comparison: Comparison) -> Page:
+    """Draw both clouds from above, coloured by the distance between the clouds."""
     height = 830
     page = Page((WIDTH, height))
     page.title("From above", "the nearest neighbour in the other cloud; the farthest on top")
-    above = found.above
-    low = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in above], axis=0)
-    high = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in above], axis=0)
-    side = 1.06 * max(float((high - low).max()), 1e-3) / 2
-    wide = 0.36
-    tall = 0.36 * WIDTH / height
-    everything = np.concatenate([distances for _, distances in above])
-    most = max(float(np.quantile(everything, 0.99)), 10 * CLOSEST_M)
-    least = max(CLOSEST_M, min(float(np.quantile(everything, 0.05)), most / 10))
-    norm = LogNorm(least, most)
-    for k, (points, distances) in enumerate(above):
-        axes = page.chart((LEFT + k * (wide + 0.045), 0.12, wide, tall), xlabel="x, m",
-                          ylabel="" if k else "y, m")  # fmt: skip
-        some = even_indices(len(points), MOST_DOTS)
-        some = some[np.argsort(distances[some])]
-        axes.scatter(
-            points[some, 0], points[some, 1], c=np.maximum(distances[some], least),
-            cmap=FAR, norm=norm, s=(1.6 if len(some) > 40_000 else 3) * page.unit**2, lw=0,
-            rasterized=True,
-        )  # fmt: skip
-        middle = (low + high) / 2
-        axes.set(xlim=middle[0] + np.array([-side, side]), ylim=middle[1] + np.array([-side, side]))
-        page.heading(axes, ("A, distance to B", "B, distance to A")[k])
-    page.colour_bar(theme.mapped(FAR, np.linspace(0, 1, 256)), norm, "distance, m",
-                    (0.875, 0.12, 0.014, tall))  # fmt: skip
+    measured = comparison.measured_points
+    lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in measured], axis=0)
+    upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in measured], axis=0)
+    half_side = 1.06 * max(float((upper - lower).max()), 1e-3) / 2
+    width = 0.36
+    chart_height = 0.36 * WIDTH / height
+    scale = _distance_scale(np.concatenate([distances for _, distances in measured]))
+    middle = (lower + upper) / 2
+    for number, cloud in enumerate(measured):
+        frame = (LEFT + number * (width + 0.045), 0.12, width, chart_height)
+        axes = page.chart(frame, xlabel="x, m", ylabel="" if number else "y, m")
+        _scatter_points(page, axes, cloud, scale)
+        span = np.array([-half_side, half_side])
+        axes.set(xlim=middle[0] + span, ylim=middle[1] + span)
+        page.heading(axes, ("A, distance to B", "B, distance to A")[number])
+    ramp = theme.mapped(DISTANCE_COLOURS, np.linspace(0, 1, 256))
+    page.colour_bar(ramp, scale, "distance, m", (0.875, 0.12, 0.014, chart_height))
     return page
 
 
-def _limit(found: Comparison) -> float:
-    """End of the scale of residuals, millimetres."""
-    told = found.figures["range_image"]["residual"]
-    return max(1000 * (abs(told["median_m"]) + SCALE * told["mad_m"]), 0.1) if told["cells"] else 1
+def _distance_scale(distances: Floats) -> LogNorm:
+    """Return the scale of colours of distances (n,), metres."""
+    max_m = max(float(np.quantile(distances, 0.99)), 10 * MIN_DISTANCE_M)
+    min_m = max(MIN_DISTANCE_M, min(float(np.quantile(distances, 0.05)), max_m / 10))
+    return LogNorm(min_m, max_m)
 
 
-def _bins(values: AnyArray) -> AnyArray:
-    """Edges of bins of intensities, between whole numbers if they are such."""
-    most = max(float(np.quantile(values, 0.995)), 1e-12)
-    if most <= 300 and (values == np.round(values)).all():
-        return np.arange(-0.5, most + 1)
-    return np.linspace(0, most, 121)
+def _scatter_points(page: Page, axes: Axes, cloud: MeasuredPoints, scale: LogNorm) -> None:
+    """Draw points of a cloud from above, coloured by distance, the most distant on top."""
+    rows = even_indices(len(cloud.points), MAX_DOTS)
+    rows = rows[np.argsort(cloud.distances[rows])]
+    axes.scatter(
+        cloud.points[rows, 0],
+        cloud.points[rows, 1],
+        c=np.maximum(cloud.distances[rows], scale.vmin or 0.0),
+        cmap=DISTANCE_COLOURS,
+        norm=scale,
+        s=(1.6 if len(rows) > 40_000 else 3) * page.unit**2,
+        lw=0,
+        rasterized=True,
+    )
 
 
-def _key(page: Page, axes: Axes) -> None:
-    """Put a legend of what has a label above axes, at their right end."""
+def _residual_limit(comparison: Comparison) -> float:
+    """Return the end of the scale of residuals, millimetres."""
+    residual = comparison.figures["range_image"]["residual"]
+    if not residual["cells"]:
+        return 1
+    return max(1000 * (abs(residual["median_m"]) + RESIDUAL_SCALE * residual["mad_m"]), 0.1)
+
+
+def _intensity_bins(values: AnyArray) -> AnyArray:
+    """Return the edges of bins of intensities (n,), between whole numbers if all are whole."""
+    upper = max(float(np.quantile(values, 0.995)), 1e-12)
+    if upper <= 300 and (values == np.round(values)).all():
+        return np.arange(-0.5, upper + 1)
+    return np.linspace(0, upper, 121)
+
+
+def _draw_legend(page: Page, axes: Axes) -> None:
+    """Draw a legend of all labels above axes, at their right end."""
     handles, _ = axes.get_legend_handles_labels()
     style = {"ncols": len(handles), "columnspacing": 1.2, "borderaxespad": 0.3}
     page.key(handles, 6.8, axes, loc="lower right", bbox_to_anchor=(1, 1), **style)

@@ -1,19 +1,23 @@
-"""Fits a sensor to a recording of a unit: a sensor file and its page; intervals are of 95 %."""
+"""Fits the performance of a sensor to a recording; writes a sensor file and its page.
+
+All intervals are confidence intervals of 95 %.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import yaml
+from matplotlib.axes import Axes
 from pydantic import Field
 
 from lidarsim._version import __version__
-from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.base.arrays import Bools, Floats, Floats32, Indices, Ints
 from lidarsim.base.errors import LidarError, explained, prefixed
 from lidarsim.base.extras import need
 from lidarsim.base.sampling import even_indices
@@ -33,128 +37,144 @@ from lidarview.render.picture_page import Page, label_logarithms
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
 from ..report.page.rendering import rendered
-from .range_image import range_images
-from .recordings import Recording, open_recording
+from .range_image import RangeImages, range_images
+from .recordings import RecordedPoints, Recording, open_recording
 
-# {curve, or column of channels: (label of x, label of y, factor)}, three a row
+
+class _Chart(NamedTuple):
+    """Labels of a chart, and the factor from a figure to the unit of the y axis."""
+
+    x_label: str
+    y_label: str
+    factor: float
+
+
+# {curve, or column of channels: chart}, three charts a row
 _CHARTS = {
-    "noise_by_range": ("range, m", "noise, mm", 1000),
-    "noise_by_light": ("intensity, or energy", "noise, mm", 1000),
-    "noise_by_tilt": ("incidence, °", "noise with that of directions, mm", 1000),
-    "returned_by_light": ("intensity, or energy", "pulses that return, %", 100),
-    "lost_by_range": ("range of the scene, m", "pulses lost, %", 100),
-    "light_by_range": ("range, m", "mean intensity", 1),
-    "noise_m": ("elevation, °", "noise, mm", 1000),
-    "bias_m": ("elevation, °", "bias, mm", 1000),
-    "uneven_deg": ("elevation, °", "spread of azimuths, 0.001°", 1000),
+    "noise_by_range": _Chart("range, m", "noise, mm", 1000),
+    "noise_by_light": _Chart("intensity, or energy", "noise, mm", 1000),
+    "noise_by_tilt": _Chart("incidence, °", "noise with that of directions, mm", 1000),
+    "returned_by_light": _Chart("intensity, or energy", "pulses that return, %", 100),
+    "lost_by_range": _Chart("range of the scene, m", "pulses lost, %", 100),
+    "light_by_range": _Chart("range, m", "mean intensity", 1),
+    "noise_m": _Chart("elevation, °", "noise, mm", 1000),
+    "bias_m": _Chart("elevation, °", "bias, mm", 1000),
+    "uneven_deg": _Chart("elevation, °", "spread of azimuths, 0.001°", 1000),
 }
-_RANGES = ("range_m", "range_per_m", "range_at_threshold_m")  # noise of ranges
-# rays that a figure or a point of a curve needs; points of a curve
-_FEW = 30
-_POINTS = 14
-_AIM = 0.002  # scatter of directions that does not make outliers before it is known, radians
-_LEAST_M = 0.001  # error of the mean range of a ray, however often it is measured
-_HEAD_M = 0.1  # how far from zero the beams of a head may meet
-_NEAREST_M = 0.1  # nearer points are of the sensor's cover, or of what lies on it
-_FLAT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
-_DARKEST = 1 / 400  # reflectance of what is reported as 0
-MOST_VALUES = 1 << 24  # returns in memory; of more sweeps than these make, some are read
-_REPEATED = 0.8  # least share of a ray's returns that belong to one surface
-_STILL_M = 0.02  # shift of a sensor, metres, from which on it moves
-_STILL_RAD = 0.003  # the same of its yaw
-_CHANGED_M = 0.1  # median change of ranges, from sweep to sweep, of a place that changes
-# growth of changes over many sweeps from which on ranges drift
-_DRIFT = 1.5
-_DRIFT_M = 0.002
-_CALM = 0.8  # share of the changes, the smallest ones, that tell the scatter
-_AGREEING = 0.5  # least share of the rays that a motion changes and explains
-# pairs of sweeps for the motion; distance at which yaw counts, metres
-_PAIRS = 8
-_YAW_M = 10.0
-# noise of ranges, and motion, for which rays are weighted, metres
-_ROUGH_M = 0.02
-_SHIFT_M = 0.5
-_AROUND = 5  # rays on either side whose scatter counts
-_SELDOM = 0.3  # a cell that returns in fewer sweeps tells no gap
-_CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
+_CURVE_POINTS = 14  # points of a curve at most
+_RANGE_NOISE_FIELDS = ("range_m", "range_per_m", "range_at_threshold_m")
+_MIN_RAYS = 30  # rays that a figure or a point of a curve needs
+MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly
+_CONFIDENCE = 0.95  # probability of intervals
+_CONFIDENCE_SIGMAS = 1.959964  # half of the interval of a normal distribution
+
+# Range images of sweeps
+_MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
+_MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not one of its beams
+_NEIGHBOUR_RAYS = 5  # rays on either side whose scatter counts
+_MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
+_MAX_LOG_CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
+
+# Surfaces
+_MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
+_MAX_BEAM_ORIGIN_M = 0.1  # how far from zero the beams of a head may meet
+_MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
+_FLAT_TANGENT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
 # by how much a surface may leave its plane within four columns
-_KINK_M = 0.01
-_KINK = 0.001
-_SIGMAS = 6.0  # a return beyond these is of something that moves
-_STEEPEST = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
-# how far surfaces may be from the scene's, and share of these
-_BESIDE_M = 0.3
-_BESIDE = 0.5
-_FOREIGN = 0.1  # share of a sweep's points in rings of no other sweep, of another sensor
-_OTHER_DEG = 2.0  # a ring that is farther from all beams of a model is not one of them
-# probability of intervals, and its quantile
-_CERTAIN = 0.95
-_Z = 1.959964
-_STEP = 1e-3  # of logarithms, for derivatives
-# Chances of a variance above which a ray is left out: certainly, and at most.
-_REJECTED = 1e-4
-_TRIMMED = 0.1
-# rings of a patch of rays; patches of a turn
+_MAX_KINK_M = 0.01
+_MAX_KINK_PER_M = 0.001
+# how far surfaces may be from the scene's, and the share of rays that must be nearer
+_SCENE_TOLERANCE_M = 0.3
+_MIN_SCENE_SHARE = 0.5
+
+# Sensors that move
+_MIN_SHIFT_M = 0.02  # shift from which on a sensor moves
+_MIN_YAW_RAD = 0.003  # yaw from which on a sensor moves
+_MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static scene
+# growth of changes over many sweeps from which on ranges drift
+_DRIFT_FACTOR = 1.5
+_DRIFT_M = 0.002
+_CALM_SHARE = 0.8  # share of the changes, the smallest ones, of which the scatter is the mean
+_MIN_EXPLAINED_SHARE = 0.5  # of the rays that a motion changes
+_SWEEP_PAIRS = 8  # pairs of sweeps whose motion is fitted
+_YAW_ARM_M = 10.0  # distance at which yaw is expressed in metres
+# noise of ranges, and motion, for which rays are weighted, metres
+_ASSUMED_NOISE_M = 0.02
+_ASSUMED_SHIFT_M = 0.5
+
+# Noise of ranges and directions
+_INITIAL_AIM_RAD = 0.002  # scatter of directions before its estimate, for the choice of outliers
+_MAX_SIGMAS = 6.0  # a return beyond is of something that moves
+_MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
+_MIN_REFLECTANCE = 1 / 400  # reflectance of what is reported as 0
+# chances of a variance above which a ray is left out: outliers only, and the upper tail
+_OUTLIER_CHANCE = 1e-4
+_TAIL_CHANCE = 0.1
+# rings of a patch of rays; patches of a revolution
 _PATCH_ROWS = 4
 _PATCHES = 36
-_FRONTAL = 1.0  # tangent of incidence: below, noise is hardly that of directions
-# least number, and share, of such rays
-_FRONTAL_RAYS = 100
-_FRONTAL_SHARE = 0.05
-_KNOWN = 0.75  # half of the interval of a figure of noise, over its value, at most
-_WRONG = 0.03  # relative error of the variances of steep or far rays
-_OUTLIER = 3.0  # quotient of a variance and the expected one that counts at most
-# least quotient of ranges, and tangent of incidence, that tell noise
-_SPAN = 2.0
-_TILT = 0.3
-# rays with losses that a threshold needs; that of a ring's bias
-_WEAK_RAYS = 30
-_RING_RAYS = 20
+_FRONTAL_TANGENT = 1.0  # tangent of incidence: below, noise is hardly that of directions
+_MIN_FRONTAL_RAYS = 100
+_MIN_FRONTAL_SHARE = 0.05
+_MAX_HALF_INTERVAL = 0.75  # half of the interval of a figure of noise, over its value
+_VARIANCE_ERROR = 0.03  # relative error of the variances of steep or distant rays
+_MAX_VARIANCE_RATIO = 3.0  # quotient of a variance and the expected variance that counts at most
+# quotient of ranges, and tangent of incidence, that determine noise by range and by direction
+_MIN_RANGE_RATIO = 2.0
+_MIN_TILT_TANGENT = 0.3
+
+# Lost pulses and false alarms
+_MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
+_LOG_STEP = 1e-3  # of logarithms, for derivatives
 # Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
 # gaps between leaves, leaves return once.
 _SKY_RINGS = 7
 _SKY_DEG = 36.0
-_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
-_PLANES = 8
-_PLANE_M = 0.05
-_PLANE_RAYS = 300
-_PLANE_POINTS = 20_000
-_EVEN = 0.4
-_GAP = 0.1
-# beyond, points are not of their planes
-_FAR_SIGMAS = 4.0
-_NEAR_SIGMAS = 2.0
+_MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
+
+# Bias of rings on planes
+_MIN_RANGE_ERROR_M = 0.001  # error of a ray's mean range, however often the range is measured
+_MAX_PLANES = 8
+_PLANE_TOLERANCE_M = 0.05
+_MIN_PLANE_RAYS = 300
+_MAX_PLANE_POINTS = 20_000
+_MIN_RING_RAYS = 20  # rays of a ring on a plane that its bias needs
+_MAX_MEDIAN_OFFSET = 0.4  # of points from their plane, over the tolerance
+_MAX_DIRECTION_GAP = 0.1  # distance of neighbouring directions of one piece of a plane
+_OUTLIER_SIGMAS = 4.0  # beyond, points are not of their planes
+_STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error of the planes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """What `fit` has found; printed as a table."""
+    """Result of `fit`; printed as a table."""
 
     figures: dict[str, Any]  # all that the page shows; lengths in metres
-    model: SensorModel  # the sensor with what was fitted
+    model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:
         return rendered("fit.txt", report=self.figures).rstrip("\n")
 
     @checked
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file and its page, a .html beside it, and return their paths.
+        """Write the sensor file and a .html page beside the file; return both paths.
 
         LidarError if the file is no .yaml, or cannot be written.
         """
-        place = Path(file)
-        if place.suffix not in MODEL_FILES:
-            raise LidarError(f"{place} is no sensor file: give a name such as mine.yaml.")
-        told = self.model.model_dump(mode="json", exclude_defaults=True)
+        model_path = Path(file)
+        if model_path.suffix not in MODEL_FILES:
+            raise LidarError(f"{model_path} is no sensor file: give a name such as mine.yaml.")
+        model = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
-        text += yaml.safe_dump(told, sort_keys=False, allow_unicode=True, default_flow_style=None)
-        drawn = {"fit": _drawn(self.figures).svg()}
-        page = rendered("fit.html", report=self.figures, pictures=drawn)
-        written = {place: text, place.with_suffix(".html"): page}
-        with explained(f"{place} cannot be written", "choose a folder that exists and has room"):
-            for path, content in written.items():
+        text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
+        pictures = {"fit": _draw_charts(self.figures).svg()}
+        page = rendered("fit.html", report=self.figures, pictures=pictures)
+        contents = {model_path: text, model_path.with_suffix(".html"): page}
+        advice = "choose a folder that exists and has room"
+        with explained(f"{model_path} cannot be written", advice):
+            for path, content in contents.items():
                 Storage.at(path.parent, durable=False).write(path.name, content.encode())
-        return [*written]
+        return [*contents]
 
 
 @checked
@@ -168,17 +188,18 @@ def fit(
     intensity: str | None = None,
     white: Annotated[float, Field(gt=0)] | None = None,
 ) -> Fit:
-    """Fit the performance of a sensor to sweeps of a unit that stands.
+    """Fit the performance of a sensor to sweeps of a static unit.
 
     Parameters
     ----------
     recording
         Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
     model
-        The sensor, by name or file; what the recording does not tell keeps its figures. By default
+        The sensor, by name or file; figures that the recording does not determine stay. By default
         a sensor with the recorded beams.
     scene, pose
-        The place as a scene, and the sensor's pose in it; by default surfaces are the recording's.
+        The recorded place as a scene, and the sensor's pose in the scene; by default surfaces are
+        those of the recording.
     sensor, intensity
         Of several, name of the sensor or topic of a bag; column, if not ``intensity``.
     white
@@ -187,367 +208,555 @@ def fit(
     Raises
     ------
     LidarError
-        If it cannot be read, has no sweeps or rings, is of several sensors or of one that moves,
-        or scipy is missing.
+        If the recording cannot be read, has no sweeps or rings, is of several sensors or of a
+        sensor that moves, or scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
-    repeats = Repeats.read(recording)
-    sigma = repeats.sigma.copy()
-    count = len(repeats.ranges)
+    stack = SweepStack.read(recording)
     curves = {}
     expected = None
     if scene is not None:
-        expected = _cast(repeats, scene if isinstance(scene, Scene) else Scene.load(scene), pose)
-        off = np.abs(_median(repeats.ranges, 0) - expected)
-        if not (off < _BESIDE_M).sum() > _BESIDE * np.isfinite(off).sum():
-            told = f"less than half of {recording.name} is within {_BESIDE_M} m of the scene"
-            raise LidarError(f"{told}: give the sensor's --pose in it, or no scene.")
-        smooth = surfaces(repeats, expected, 0 * sigma).smooth & (repeats.trials > 0)
-        returned = np.isfinite(repeats.ranges).sum(axis=0)
-        lost = 1 - returned[smooth] / repeats.trials[smooth]
-        curves["lost_by_range"] = _curve(expected[smooth], lost)
-    found = dict[str, Estimate]()
-    for _ in range(2):  # the first finds what the second leaves out
-        rays = smooth_rays(repeats, sigma, 0.0 if found else _AIM, expected)
-        if len(rays.row) < _FEW:
-            told = f"{recording.name} has {len(rays.row)} rays on smooth surfaces, not {_FEW}"
-            raise LidarError(f"{told}: record walls or a floor, in the sensor's axes.")
-        known = np.isfinite(rays.light).all()
-        energy = rays.light if known and recording.energies else None
-        if known and (white := white or recording.white):
-            energy = np.maximum(rays.light / white, _DARKEST) * (10 / rays.distance) ** 2
-        if count > 1:
-            found, sigma[rays.row, rays.column] = fit_performance(repeats, rays, energy)
-    aim = np.radians(found["angle_deg"].value) if "angle_deg" in found else 0.0
-    tilted = np.where(rays.freedom > 0, rays.variance, np.nan)
-    own = tilted - (aim * rays.slope) ** 2
-    light = rays.light if energy is None else energy
-    curves["noise_by_range"] = _curve(rays.distance, own, 0.5)
-    curves["noise_by_light"] = _curve(light, own, 0.5)
-    curves["noise_by_tilt"] = _curve(np.degrees(np.arctan(rays.slope / rays.distance)), tilted, 0.5)
-    curves["returned_by_light"] = _curve(light, rays.returns / rays.trials) if count > 1 else []
-    curves["light_by_range"] = _curve(rays.distance, rays.light)
-    base = read_model(model) if model else _recorded(repeats)
+        scene = scene if isinstance(scene, Scene) else Scene.load(scene)
+        expected = _scene_ranges(stack, scene, pose)
+        _check_pose(stack, expected, recording.name)
+        curves["lost_by_range"] = _lost_by_range(stack, expected)
+    measured = _measure_rays(stack, recording, white, expected)
+    curves |= _noise_curves(measured, stack.sweep_count)
+    base = read_model(model) if model else _recorded_sensor(stack)
     name = Path(recording.name).name
-    source = f"fitted by lidarpool {__version__} to {name}, {plural(repeats.sweeps, 'sweep')}"
-    fitted = _with(base, found, source) if found else base
-    notes = list(repeats.notes)
-    off = np.abs(repeats.elevation_deg[:, None] - (base.beams.elevation_deg or np.inf))
-    if not base.needs_calibration and off.min(axis=1).max() > _OTHER_DEG:
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
+    estimates = measured.estimates
+    notes = list(stack.notes)
+    if not _has_rings(base, stack):
         notes.append(f"the recorded rings are not those of {base.name}: check --model")
     figures = {
-        "versions": {"lidarpool": __version__}, "name": name, "model": base.name,
-        "sweeps": repeats.sweeps, "rays": len(rays.row),
-        "frontal": meet_frontally(rays),
-        "intensity": bool(known), "energy": energy is not None,
-        "figures": {key: one._asdict() for key, one in found.items()}, "notes": notes,
-        "channels": _channels(repeats, rays, own, sigma, expected), "curves": curves,
-    }  # fmt: skip
-    return Fit(figures, fitted)
+        "versions": {"lidarpool": __version__},
+        "name": name,
+        "model": base.name,
+        "sweeps": stack.sweep_count,
+        "rays": len(measured.rays.row),
+        "frontal": has_frontal_rays(measured.rays),
+        "intensity": bool(np.isfinite(measured.rays.intensity).all()),
+        "energy": measured.energy is not None,
+        "figures": {key: estimate._asdict() for key, estimate in estimates.items()},
+        "notes": notes,
+        "channels": _channel_figures(stack, measured, expected),
+        "curves": curves,
+    }
+    return Fit(figures, _with_performance(base, estimates, source) if estimates else base)
 
 
-def _with(base: SensorModel, known: Mapping[str, Estimate], source: str) -> SensorModel:
-    """Return a sensor with what was fitted in its performance; the rest stays."""
-    found = {name: float(f"{one.value:.4g}") for name, one in known.items()}
-    old = base.performance or Performance()
-    stated = old.model_dump(exclude_defaults=True, exclude={"precision", *_RANGES})
-    if far := found.get("detection_range_m"):
-        stated["detection"] = {"range_m": far, "reflectance": 0.1, "probability": 0.5}
-    names = *_RANGES, "angle_deg", "dropout", *["false_alarms"] * ("detection" in stated)
-    stated |= {name: found[name] for name in names if name in found}
-    own = {"performance": stated, "sources": {**base.sources, "performance": source}}
-    return SensorModel.model_validate(base.model_dump() | own)
+def _scene_ranges(stack: SweepStack, scene: Scene, pose: Any) -> Floats:
+    """Return the ranges of a scene in the cells, (r, c), metres; NaN where no ray hits."""
+    rays = stack.directions.reshape(-1, 3)
+    sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
+    ranges = Scanner(scene, sensor).ranges([pose], number=0).reshape(stack.rough_sigma.shape)
+    return np.where(np.isfinite(ranges), ranges, np.nan).astype(np.float64)
 
 
-def _recorded(repeats: Repeats) -> SensorModel:
+def _check_pose(stack: SweepStack, expected: Floats, name: str) -> None:
+    """Raise LidarError unless half of the ranges are near the scene's ranges (r, c)."""
+    difference = np.abs(_median(stack.ranges, 0) - expected)
+    near_scene = (difference < _SCENE_TOLERANCE_M).sum()
+    if not near_scene > _MIN_SCENE_SHARE * np.isfinite(difference).sum():
+        message = f"less than half of {name} is within {_SCENE_TOLERANCE_M} m of the scene"
+        raise LidarError(f"{message}: give the sensor's --pose in it, or no scene.")
+
+
+def _lost_by_range(stack: SweepStack, expected: Floats) -> list[dict[str, float]]:
+    """Compute the curve of the share of lost pulses by the range of the scene, (r, c)."""
+    plane = find_surfaces(stack, expected, 0 * stack.rough_sigma)
+    cells = plane.smooth & (stack.trials > 0)
+    returned = np.isfinite(stack.ranges).sum(axis=0)
+    lost = 1 - returned[cells] / stack.trials[cells]
+    return _curve(expected[cells], lost)
+
+
+class _MeasuredRays(NamedTuple):
+    """Rays on smooth surfaces, and the performance that was fitted to their returns."""
+
+    rays: SmoothRays
+    energy: Floats | None  # (k,): of the returns; None if unknown
+    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
+    sigma: Floats  # (r, c): standard deviation of ranges, metres
+
+
+def _measure_rays(
+    stack: SweepStack, recording: Recording, white: float | None, expected: Floats | None
+) -> _MeasuredRays:
+    """Choose rays on smooth surfaces and fit the performance of the sensor to their returns.
+
+    `white` is the intensity of a white surface, and `expected` are the scene's ranges (r, c).
+    LidarError if too few rays meet smooth surfaces.
+    """
+    white = white or recording.white
+    sigma = stack.rough_sigma.copy()
+    estimates: dict[str, Estimate] = {}
+    for _ in range(2):  # the first pass finds the noise beyond which the second leaves returns out
+        aim_rad = 0.0 if estimates else _INITIAL_AIM_RAD
+        rays = select_smooth_rays(stack, sigma, aim_rad, expected)
+        if len(rays.row) < _MIN_RAYS:
+            message = f"{recording.name} has {len(rays.row)} rays on smooth surfaces"
+            raise LidarError(
+                f"{message}, not {_MIN_RAYS}: record walls or a floor, in the sensor's axes."
+            )
+        energy = _pulse_energies(rays, white, recording.energies)
+        if stack.sweep_count > 1:
+            estimates, sigma[rays.row, rays.column] = fit_performance(stack, rays, energy)
+    return _MeasuredRays(rays, energy, estimates, sigma)
+
+
+def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
+    """Return the energies of the returns of rays (k,), or None if they are unknown.
+
+    The energy is 1 for a white surface at 10 m, or the intensity if intensities `are_energies`.
+    """
+    if not np.isfinite(rays.intensity).all():
+        return None
+    if white:
+        reflectance = np.maximum(rays.intensity / white, _MIN_REFLECTANCE)
+        return np.asarray(reflectance * (10 / rays.distance) ** 2)
+    return rays.intensity if are_energies else None
+
+
+def _noise_curves(measured: _MeasuredRays, sweep_count: int) -> dict[str, list[dict[str, float]]]:
+    """Compute the curves of noise, returns and intensity: {name in `_CHARTS`: points}."""
+    rays = measured.rays
+    light = rays.intensity if measured.energy is None else measured.energy
+    variance = np.where(rays.freedom > 0, rays.variance, np.nan)
+    range_variance = _range_variances(measured)
+    incidence_deg = np.degrees(np.arctan(rays.slope / rays.distance))
+    returned = _curve(light, rays.returns / rays.trials) if sweep_count > 1 else []
+    return {
+        "noise_by_range": _curve(rays.distance, range_variance, 0.5),
+        "noise_by_light": _curve(light, range_variance, 0.5),
+        "noise_by_tilt": _curve(incidence_deg, variance, 0.5),
+        "returned_by_light": returned,
+        "light_by_range": _curve(rays.distance, rays.intensity),
+    }
+
+
+def _range_variances(measured: _MeasuredRays) -> Floats:
+    """Return variances (k,) of ranges without noise of directions, m²; NaN of single returns."""
+    rays = measured.rays
+    estimate = measured.estimates.get("angle_deg")
+    aim_rad = 0.0 if estimate is None else np.radians(estimate.value)
+    variance = np.where(rays.freedom > 0, rays.variance, np.nan)
+    return np.asarray(variance - (aim_rad * rays.slope) ** 2)
+
+
+def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
+    """Check that each recorded ring is near a beam of a model, unless that needs a calibration."""
+    offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
+    is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
+    return model.needs_calibration or is_near
+
+
+def _with_performance(
+    base: SensorModel, estimates: Mapping[str, Estimate], source: str
+) -> SensorModel:
+    """Return a sensor with estimates in its performance; figures without an estimate stay."""
+    values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
+    performance = base.performance or Performance()
+    stated = performance.model_dump(
+        exclude_defaults=True, exclude={"precision", *_RANGE_NOISE_FIELDS}
+    )
+    if range_m := values.get("detection_range_m"):
+        stated["detection"] = {"range_m": range_m, "reflectance": 0.1, "probability": 0.5}
+    names = [*_RANGE_NOISE_FIELDS, "angle_deg", "dropout"]
+    if "detection" in stated:
+        names.append("false_alarms")
+    stated |= {name: values[name] for name in names if name in values}
+    changes = {"performance": stated, "sources": {**base.sources, "performance": source}}
+    return SensorModel.model_validate(base.model_dump() | changes)
+
+
+def _recorded_sensor(stack: SweepStack) -> SensorModel:
     """Return a sensor with the beams of a recording."""
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "medians of the recorded points"},
-        firings_per_turn=repeats.ranges.shape[2],
-        range_m=(0.0, float(np.ceil(1.1 * np.nanmax(repeats.ranges)))),
-        beams={"elevation_deg": np.sort(repeats.elevation_deg).round(3).tolist()},
+        firings_per_turn=stack.ranges.shape[2],
+        range_m=(0.0, float(np.ceil(1.1 * np.nanmax(stack.ranges)))),
+        beams={"elevation_deg": np.sort(stack.elevation_deg).round(3).tolist()},
     )
 
 
-def _cast(repeats: Repeats, scene: Scene, pose: Any) -> Floats:
-    """Ranges of a scene in the cells, (r, c); NaN where it has nothing."""
-    ways = repeats.directions.reshape(-1, 3)
-    sensor = ListedSensor(head=Spin(len(ways), 360), rays=ways, shot_ns=np.zeros(len(ways)))
-    found = Scanner(scene, sensor).ranges([pose], number=0).reshape(repeats.sigma.shape)
-    return np.where(np.isfinite(found), found, np.nan).astype(np.float64)
-
-
 class Estimate(NamedTuple):
-    """A figure with its interval."""
+    """A figure with its confidence interval."""
 
     value: float
     low: float
     high: float
 
     @classmethod
-    def of(cls, value: Any, variance: Any) -> Estimate:
-        """Make one of a normally distributed estimate."""
-        return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -_Z, _Z)))
+    def from_variance(cls, value: Any, variance: Any) -> Estimate:
+        """Build the estimate of a normally distributed value."""
+        half = _CONFIDENCE_SIGMAS
+        return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -half, half)))
 
     @classmethod
-    def mean(cls, values: Floats) -> Estimate:
-        """Make one of the mean of values (n,)."""
-        return cls.of(values.mean(), values.var() / len(values))
+    def from_values(cls, values: Floats) -> Estimate:
+        """Estimate the mean of values (n,)."""
+        return cls.from_variance(values.mean(), values.var() / len(values))
 
     @classmethod
-    def share(cls, parts: Floats, wholes: Ints) -> Estimate:
-        """Estimate the sum of parts (n,) over that of wholes (n,), such as pulses lost of pulses.
+    def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
+        """Estimate the quotient of the sums of parts (n,) and totals (n,), such as lost pulses.
 
         The interval is that of Clopper and Pearson for as many independent pulses as explain the
-        scatter of the n shares; it is not empty if the share is 0.
+        scatter of the n shares; the interval is not empty if the share is 0.
         """
         from scipy.stats import beta
 
-        total = float(wholes.sum())
+        total = float(totals.sum())
         share = float(parts.sum()) / total
-        square = float(((parts - share * wholes) ** 2).sum()) / total**2
+        square = float(((parts - share * totals) ** 2).sum()) / total**2
         binomial = share * (1 - share) / total
         count = total * binomial / square if square > binomial > 0 else total
-        tail = (1 - _CERTAIN) / 2
-        low = beta.ppf(tail, share * count, (1 - share) * count + 1) if share > 0 else 0.0
-        high = beta.isf(tail, share * count + 1, (1 - share) * count) if share < 1 else 1.0
-        return cls(share, float(low), float(high))
+        tail = (1 - _CONFIDENCE) / 2
+        lower = beta.ppf(tail, share * count, (1 - share) * count + 1) if share > 0 else 0.0
+        upper = beta.isf(tail, share * count + 1, (1 - share) * count) if share < 1 else 1.0
+        return cls(share, float(lower), float(upper))
 
-    def known_within(self, share: float) -> bool:
-        """Whether the half of the interval is at most this share of the value."""
+    def is_within(self, share: float) -> bool:
+        """Return True if half of the interval is at most a share of the value."""
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of a power, times a scale; what is below 0 counts as 0."""
-        value, *ends = (round(float(scale * max(one, 0.0) ** exponent), 9) for one in self)
-        return Estimate(value, min(ends), max(ends))
+        """Return the estimate of a power times a scale; negative numbers count as 0."""
+        value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
+        return Estimate(value, min(limits), max(limits))
 
 
 @dataclass(frozen=True, eq=False)
-class Repeats:
-    """Returns in the same cells of a sensor, the highest ring first; NaN without a return."""
+class SweepStack:
+    """Returns of all sweeps in the same cells, the highest ring first; NaN without a return."""
 
     rings: Ints  # (r,): numbers
     elevation_deg: Floats  # (r,)
     directions: Floats  # (r, c, 3): unit vectors
     ranges: Floats32  # (s, r, c): metres
-    light: Floats32  # (s, r, c): intensities
-    aside: Floats32  # (s, r, c): azimuths beside those of the directions, radians
-    sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, metres
+    intensities: Floats32  # (s, r, c)
+    azimuth_offsets: Floats32  # (s, r, c): from the azimuths of the directions, radians
+    rough_sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, metres
     trials: Ints  # (r, c): sweeps that cover the cell; the others have a gap there
     notes: tuple[str, ...]
 
     @property
-    def sweeps(self) -> int:
+    def sweep_count(self) -> int:
         """Number of sweeps."""
         return len(self.ranges)
 
     @classmethod
-    def read(cls, recording: Recording) -> Repeats:
-        """Put the sweeps of a recording into the same cells, one after the other.
+    def read(cls, recording: Recording) -> SweepStack:
+        """Read the sweeps of a recording into the same cells.
 
-        LidarError if it has no sweeps with points and rings, or they are of several sensors.
+        LidarError if the recording has no sweeps with points and rings, or is of several sensors
+        or of a sensor that moves.
         """
         name = recording.name
         notes = list(recording.notes)
         if recording.thinned:
             raise LidarError(f"{notes[0]}.")
-        if recording.whole or not recording.count:
+        if recording.is_cloud or not recording.count:
             raise LidarError(f"{name} has no sweeps: give a recording of sweeps.")
-        own = max((recording.turn(k) for k in range(min(3, recording.count))), key=len)
-        if not len(own):
-            raise LidarError(f"{name} has no points: there is nothing to fit.")
-        with prefixed(name):
-            cells = range_images(own, own, ("a sweep", "a sweep"))
-        shape = len(cells.rings), round(360 / cells.step_deg)
-        numbers = even_indices(recording.count, max(MOST_VALUES // (shape[0] * shape[1]), 2))
-        if len(numbers) < recording.count:
-            notes.append(f"{len(numbers):,} of {recording.count:,} sweeps are used, evenly chosen")
-        values = np.full((4, len(numbers), *shape), np.nan, np.float32)
-        rings = cells.rings
-        elevation = cells.elevation_deg
-        for k, number in enumerate(numbers.tolist()):
-            if not len(turn := recording.turn(number)):
-                continue
-            with prefixed(name):
-                found = range_images(turn, own, (f"sweep {number}", "another"), cells.step_deg)
-                returned = np.isfinite(found.images[0, 0])
-                # Rings of false alarms alone may have no return in the first sweeps.
-                foreign = returned[~np.isin(found.rings, cells.rings)].sum()
-                other = foreign > _FOREIGN * returned.sum()
-                if other or found.hidden[0] > cells.hidden[0] + 0.25:
-                    raise LidarError(f"sweep {number} is of another sensor, or another mode.")
-            unseen = ~np.isin(found.rings, rings)
-            rings = np.append(rings, found.rings[unseen])
-            elevation = np.append(elevation, found.elevation_deg[unseen])
-            blank = np.full((4, len(numbers), unseen.sum(), shape[1]), np.nan, np.float32)
-            values = np.concatenate([values, blank], axis=2) if unseen.any() else values
-            _, rows, there = np.intersect1d(found.rings, rings, return_indices=True)
-            columns = round(found.begin_deg / found.step_deg) + np.arange(found.images.shape[-1])
-            values[:, k, there[:, None], columns % shape[1]] = found.images[0][:, rows]
-        order = np.argsort(-elevation, kind="stable")
-        rings = rings[order]
-        elevation = elevation[order]
-        values = values[:, np.isfinite(values[0]).any(axis=(1, 2))][:, :, order]
+        cells = _CommonCells.read(recording)
+        if len(cells.numbers) < recording.count:
+            notes.append(
+                f"{len(cells.numbers):,} of {recording.count:,} sweeps are used, evenly chosen"
+            )
+        for index in range(len(cells.numbers)):
+            cells.read_sweep(recording, index)
+        elevation_deg, values = cells.sorted_by_elevation()
         covered = covered_cells(np.isfinite(values[0]))
-        if (gaps := 1 - covered[:, np.isfinite(values[0]).any(axis=0)].mean()) > 0.5 / covered.size:
+        has_return = np.isfinite(values[0]).any(axis=0)
+        if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
                 f"{100 * gaps:.2g} % of the sweeps are gaps, of lost packets or sweeps cut short, "
                 "and count as no lost pulses"
             )
-        level = elevation[:, None]
-        first = np.radians(cells.step_deg * np.arange(shape[1]))
-        aside = (np.radians(values[2]) - first + np.pi) % (2 * np.pi) - np.pi
-        risen = np.radians(values[3] - level)
-        mean, rise = (
-            np.nansum(one, axis=0) / np.maximum(np.isfinite(one).sum(axis=0), 1)
-            for one in (aside, risen)
+        directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
+        stack = cls(
+            rings=cells.sorted_rings(),
+            elevation_deg=elevation_deg,
+            directions=directions,
+            ranges=values[0],
+            intensities=values[1],
+            azimuth_offsets=azimuth_offsets,
+            rough_sigma=rough_scatter(values[0]),
+            trials=covered.sum(axis=0),
+            notes=tuple(notes),
         )
-        turned = first + mean
-        up = np.radians(level) + rise
-        ways = [np.cos(up) * np.cos(turned), np.cos(up) * np.sin(turned), np.sin(up)]
-        sigma = rough_scatter(values[0])
-        repeats = cls(
-            rings, elevation, np.stack(ways, axis=-1),
-            values[0], values[1], aside - mean, sigma,
-            covered.sum(axis=0), tuple(notes),
-        )  # fmt: skip
-        times = None if recording.times is None else np.array([*recording.times()])[numbers]
-        check_stands(repeats, name, None if times is None else float(np.median(np.diff(times))))
-        return repeats
+        period_ns = None
+        if recording.times is not None:
+            times = np.array([*recording.times()])[cells.numbers]
+            period_ns = float(np.median(np.diff(times)))
+        check_static(stack, name, period_ns)
+        return stack
+
+
+@dataclass(eq=False)
+class _CommonCells:
+    """Cells of a sensor that are filled sweep by sweep; a ring is added with its first return."""
+
+    numbers: Ints  # (s,): sweeps of the recording that are read
+    reference: RecordedPoints  # the sweep whose rings and steps of azimuth define the cells
+    images: RangeImages  # of the reference
+    rings: Ints  # (r,)
+    elevation_deg: Floats  # (r,)
+    values: Floats32  # (4, s, r, c): range, intensity, azimuth and elevation in degrees
+
+    @classmethod
+    def read(cls, recording: Recording) -> _CommonCells:
+        """Define the cells by the largest of the first three sweeps, without any returns yet."""
+        sweeps = (recording.read_points(k) for k in range(min(3, recording.count)))
+        reference = max(sweeps, key=len)
+        if not len(reference):
+            raise LidarError(f"{recording.name} has no points: there is nothing to fit.")
+        with prefixed(recording.name):
+            images = range_images(reference, reference, ("a sweep", "a sweep"))
+        shape = len(images.rings), round(360 / images.step_deg)
+        max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)
+        numbers = even_indices(recording.count, max_sweeps)
+        values = np.full((4, len(numbers), *shape), np.nan, np.float32)
+        return cls(numbers, reference, images, images.rings, images.elevation_deg, values)
+
+    @property
+    def step_deg(self) -> float:
+        """Width of a column, degrees."""
+        return self.images.step_deg
+
+    def read_sweep(self, recording: Recording, index: int) -> None:
+        """Read the sweep `numbers[index]` into the cells; LidarError if of another sensor."""
+        number = int(self.numbers[index])
+        points = recording.read_points(number)
+        if not len(points):
+            return
+        with prefixed(recording.name):
+            names = (f"sweep {number}", "another")
+            sweep = range_images(points, self.reference, names, self.step_deg)
+            returned = np.isfinite(sweep.images[0, 0])
+            # Rings of false alarms alone may have no return in the first sweeps.
+            foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
+            is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
+            if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
+                raise LidarError(f"sweep {number} is of another sensor, or another mode.")
+        self._add_rings(sweep)
+        _, sweep_rows, rows = np.intersect1d(sweep.rings, self.rings, return_indices=True)
+        first_column = round(sweep.start_deg / sweep.step_deg)
+        columns = first_column + np.arange(sweep.images.shape[-1])
+        columns %= self.values.shape[-1]
+        self.values[:, index, rows[:, None], columns] = sweep.images[0][:, sweep_rows]
+
+    def _add_rings(self, sweep: RangeImages) -> None:
+        """Append rows for the rings of a sweep that no earlier sweep had."""
+        is_new = ~np.isin(sweep.rings, self.rings)
+        if not is_new.any():
+            return
+        _, sweep_count, _, column_count = self.values.shape
+        self.rings = np.append(self.rings, sweep.rings[is_new])
+        self.elevation_deg = np.append(self.elevation_deg, sweep.elevation_deg[is_new])
+        blank = np.full((4, sweep_count, is_new.sum(), column_count), np.nan, np.float32)
+        self.values = np.concatenate([self.values, blank], axis=2)
+
+    def _order(self) -> Ints:
+        """Order of the rows by elevation, the highest first."""
+        return np.argsort(-self.elevation_deg, kind="stable")
+
+    def sorted_rings(self) -> Ints:
+        """Return the rings, the highest first."""
+        return np.asarray(self.rings[self._order()])
+
+    def sorted_by_elevation(self) -> tuple[Floats, Floats32]:
+        """Return elevations (r,) and values (4, s, r, c), the highest ring first.
+
+        Sweeps without points are left out.
+        """
+        order = self._order()
+        has_points = np.isfinite(self.values[0]).any(axis=(1, 2))
+        return self.elevation_deg[order], self.values[:, has_points][:, :, order]
+
+
+def _mean_directions(
+    values: Floats32, elevation_deg: Floats, step_deg: float
+) -> tuple[Floats, Floats32]:
+    """Return the mean directions of cells (r, c, 3), and offsets of azimuths (s, r, c), radians.
+
+    `values` (4, s, r, c) are those of `_CommonCells`, `elevation_deg` (r,) those of the rings.
+    """
+    grid_azimuth = np.radians(step_deg * np.arange(values.shape[-1]))
+    grid_elevation = elevation_deg[:, None]
+    azimuth_offset = (np.radians(values[2]) - grid_azimuth + np.pi) % (2 * np.pi) - np.pi
+    elevation_offset = np.radians(values[3] - grid_elevation)
+    mean_azimuth, mean_elevation = (
+        np.nansum(offset, axis=0) / np.maximum(np.isfinite(offset).sum(axis=0), 1)
+        for offset in (azimuth_offset, elevation_offset)
+    )
+    azimuth = grid_azimuth + mean_azimuth
+    elevation = np.radians(grid_elevation) + mean_elevation
+    directions = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
+    return np.stack(directions, axis=-1), azimuth_offset - mean_azimuth
 
 
 def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
-    """Return medians over what is there, float64; of nothing NaN."""
+    """Return medians of the finite values along axes, float64; NaN without finite values."""
     with warnings.catch_warnings(action="ignore"):
         return np.nanmedian(values, axis=axis).astype(np.float64)
 
 
 def rough_scatter(ranges: Floats32) -> Floats:
-    """Scatter of ranges (s, r, c) of the rays around each, metres: that of the ring at least.
+    """Estimate the scatter (r, c) of ranges (s, r, c) from neighbouring rays, metres.
 
-    Surfaces that are weak or steep scatter more than others of a ring.
+    The scatter is at least that of the ring. Surfaces that are weak or steep scatter more than
+    others of a ring.
     """
     changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
     ring = _median(changes, (0, 2))[:, None]
     ray = _median(changes, 0)
-    reach = range(-_AROUND, _AROUND + 1)
-    around = _median(np.stack([np.roll(ray, by, axis=1) for by in reach]), 0)
-    ring = np.where(np.isnan(ring), _KINK_M, np.maximum(ring, 1e-4))
-    return np.fmax(around, ring)
+    shifts = range(-_NEIGHBOUR_RAYS, _NEIGHBOUR_RAYS + 1)
+    neighbourhood = _median(np.stack([np.roll(ray, shift, axis=1) for shift in shifts]), 0)
+    ring = np.where(np.isnan(ring), _MAX_KINK_M, np.maximum(ring, 1e-4))
+    return np.fmax(neighbourhood, ring)
 
 
 class Surfaces(NamedTuple):
     """Surfaces of a range image, (r, c) each."""
 
-    turn: Floats  # change of the range with the azimuth, metres in a radian
-    slope: Floats  # change of the range with the direction where it changes most, likewise
+    azimuth_slope: Floats  # change of the range with the azimuth, metres in a radian
+    slope: Floats  # change of the range with the direction of steepest change, metres in a radian
     smooth: Bools  # whether the neighbours lie in one plane with the cell
     normal: Floats  # (r, c, 3): normal of the plane, over its product with the ray's direction
 
 
-def surfaces(repeats: Repeats, distance: Floats, blur: Floats) -> Surfaces:
-    """Find slopes and edges of a range image (r, c), whose ranges have errors of `blur` metres."""
-    points = distance[..., None] * repeats.directions
-    rows = np.arange(len(distance))
+class _Neighbours(NamedTuple):
+    """Points (r, c, 3) of the cells beside each cell of a range image."""
+
+    next_1: Floats
+    previous_1: Floats
+    next_2: Floats  # two columns away
+    previous_2: Floats
+    above: Floats
+    below: Floats
+
+    @classmethod
+    def from_points(cls, points: Floats) -> _Neighbours:
+        """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
+        rows = np.arange(len(points))
+        columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
+        rings = (points[np.clip(rows + shift, 0, rows[-1])] for shift in (-1, 1))
+        return cls(*columns, *rings)
+
+    def normals(self) -> Floats:
+        """Return the normals (r, c, 3) of surfaces, of any length."""
+        rise = self.above - self.below if len(self.above) > 2 else np.array([0, 0, 1.0])
+        run = 2 * (self.next_2 - self.previous_2) + self.next_1 - self.previous_1
+        return np.cross(run, rise)
+
+    def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
+        """Mark points (r, c, 3) whose neighbours lie in their plane, within tolerances (r, c)."""
+        means_1 = (self.next_1 + self.previous_1) / 2
+        means_2 = (self.next_2 + self.previous_2) / 2
+        coplanar = np.ones(points.shape[:2], bool)
+        pairs = ((means_1, 1), (means_2, 2), (self.above, 2), (self.below, 2))
+        for neighbours, columns in pairs:
+            offset = np.abs(((neighbours - points) * normal).sum(axis=-1))
+            coplanar &= offset < columns * tolerance_m
+        return coplanar
+
+
+def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
+    """Find slopes and edges of a range image (r, c) with known errors of its ranges (r, c)."""
+    points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
-        beams = points - _meeting(points)
+        beams = points - _beam_origins(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
-        ways = beams / length
-        ahead, back, far, rear = (np.roll(points, by, axis=1) for by in (-1, 1, -2, 2))
-        above, below = (points[np.clip(rows + by, 0, rows[-1])] for by in (-1, 1))
-        rise = above - below if len(rows) > 2 else np.array([0, 0, 1.0])
-        normal = np.cross(2 * (far - rear) + ahead - back, rise)
+        directions = beams / length
+        neighbours = _Neighbours.from_points(points)
+        normal = neighbours.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
-        normal /= (normal * ways).sum(axis=-1, keepdims=True)
-        change = length * (ways - normal)
+        normal /= (normal * directions).sum(axis=-1, keepdims=True)
+        change = length * (directions - normal)
         slope = np.linalg.norm(change, axis=-1)
-        allowed = _KINK_M + _KINK * distance + 5 * blur
-        smooth = (slope < _STEEPEST * distance) & (distance > _NEAREST_M)
-        near = (ahead + back) / 2
-        wide = (far + rear) / 2
-        for beside, times in ((near, 1), (wide, 2), (above, 2), (below, 2)):
-            smooth &= np.abs(((beside - points) * normal).sum(axis=-1)) < times * allowed
-    turn = change[..., 1] * ways[..., 0] - change[..., 0] * ways[..., 1]
-    return Surfaces(turn, slope, smooth, normal)
+        tolerance_m = _MAX_KINK_M + _MAX_KINK_PER_M * distance + 5 * error_m
+        smooth = (slope < _MAX_TANGENT * distance) & (distance > _MIN_RANGE_M)
+        smooth &= neighbours.are_coplanar(points, normal, tolerance_m)
+    azimuth_slope = change[..., 1] * directions[..., 0] - change[..., 0] * directions[..., 1]
+    return Surfaces(azimuth_slope, slope, smooth, normal)
+
+
+def _beam_origins(points: Floats) -> Floats:
+    """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), metres.
+
+    Beams of a row meet on the axis, near zero.
+    """
+    with warnings.catch_warnings(action="ignore"):
+        distance = np.hypot(points[..., 0], points[..., 1])
+        height = points[..., 2]
+        mean_distance = np.nanmean(distance, axis=1)
+        offset = distance - np.nanmean(distance, axis=1, keepdims=True)
+        tangent = np.nansum(offset * height, axis=1) / np.nansum(offset**2, axis=1)
+        origin = np.nanmean(height, axis=1) - tangent * mean_distance
+    plausible = np.abs(origin) < _MAX_BEAM_ORIGIN_M  # also false of NaN
+    return np.where(plausible, origin, 0)[:, None, None] * np.array([0, 0, 1.0])
 
 
 def covered_cells(returned: Bools) -> Bools:
-    """Tell the cells (s, r, c) that sweeps cover from gaps: lost packets, and sweeps cut short.
+    """Return a mask of the cells (s, r, c) that sweeps cover, without gaps.
 
-    `returned` (s, r, c) are the cells with a return. A run of cells without any, in all rings or in
-    one, is a gap if pulses that are lost independently would hardly ever make such a run.
+    Lost packets and sweeps cut short make gaps. `returned` (s, r, c) are the cells with a return.
+    A run of cells without any, in all rings or in one ring, is a gap if pulses that are lost
+    independently would hardly ever make such a run.
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
-    chance = np.where(share > _SELDOM, np.log1p(-share), 0.0)
+    log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)
     # Columns without a return in any ring are gaps also where few sweeps return at all.
-    sparse = np.log1p(-returned.sum(axis=0) / (len(returned) + 1))
-    columns = _long_runs(np.asarray(~returned.any(axis=1)), sparse.sum(axis=0))
-    rings = _long_runs(~returned, chance)
+    sparse_log_chance = np.log1p(-returned.sum(axis=0) / (len(returned) + 1)).sum(axis=0)
+    columns = _improbable_runs(np.asarray(~returned.any(axis=1)), sparse_log_chance)
+    rings = _improbable_runs(~returned, log_chance)
     return ~(columns[:, None] | rings)
 
 
-def _long_runs(empty: Bools, chance: Floats) -> Bools:
-    """Mark the runs along the last axis, which is a turn, that are too long for chance.
+def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
+    """Mark runs of empty cells along the last axis, a revolution, that are too long for chance.
 
-    `chance` are the logarithms of the chances that a cell is empty.
+    `log_chance` are the logarithms of the chances that a cell is empty.
     """
     count = empty.shape[-1]
     edge = np.zeros((*empty.shape[:-1], 1), bool)
     twice = np.concatenate([edge, empty, empty, edge], axis=-1)
-    first, last = (np.flatnonzero(np.diff(twice.ravel().astype(np.int8)) == by) for by in (1, -1))
+    changes = np.diff(twice.ravel().astype(np.int8))
+    starts = np.flatnonzero(changes == 1)
+    stops = np.flatnonzero(changes == -1)
     weights = np.zeros(twice.shape)
-    weights[..., 1:-1] = np.concatenate([chance, chance], axis=-1)
+    weights[..., 1:-1] = np.concatenate([log_chance, log_chance], axis=-1)
     total = np.cumsum(weights.ravel())
-    gaps = total[last] - total[first] < _CHANCE
+    gaps = total[stops] - total[starts] < _MAX_LOG_CHANCE
     marks = np.zeros(twice.size, np.int64)
-    marks[first[gaps] + 1] += 1
-    marks[last[gaps] + 1] -= 1
+    marks[starts[gaps] + 1] += 1
+    marks[stops[gaps] + 1] -= 1
     inside = np.cumsum(marks).reshape(twice.shape) > 0
     return np.asarray(inside[..., 1 : count + 1] | inside[..., count + 1 : -1])
 
 
-def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
-    """Refuse sweeps of a sensor that moves, or of a place that does.
+def check_static(stack: SweepStack, name: str, period_ns: float | None) -> None:
+    """Raise LidarError if the sensor or the recorded scene moves.
 
-    One rigid motion, a shift and a yaw, has to explain the ranges of most of the rays that it
-    changes. `period_ns` is the time from sweep to sweep, if it is known.
+    One rigid motion, a shift and a yaw, has to explain the ranges of most of the rays that the
+    motion changes. `period_ns` is the time from sweep to sweep, if known.
     """
-    if (count := repeats.sweeps) < 2:
+    if stack.sweep_count < 2:
         return
-    starts = even_indices(count - 1, _PAIRS).tolist()
-    steps = [sensor_motion(repeats, k, k + 1) for k in starts]
-    overall = [sensor_motion(repeats, 0, k) for k in {count // 2, count - 1}]
-    moving = [step for step in steps if step.moves]
-    if len(moving) > len(steps) / 2 or all(motion.moves for motion in overall):
-        motion = moving if len(moving) > len(steps) / 2 else [overall[-1]]
-        sweeps = 1 if len(moving) > len(steps) / 2 else count - 1
-        shift_m = float(np.median([one.shift_m for one in motion])) / sweeps
-        yaw_deg = float(np.degrees(np.median([one.yaw_rad for one in motion]))) / sweeps
-        speeds = [f"{shift_m:.2g} m", f"{yaw_deg:.2g}°"]
-        if period_ns:
-            speeds[0] += f" ({1e9 * shift_m / period_ns:.2g} m/s)"
-        told = " and ".join(
-            speed for speed, some in zip(speeds, (shift_m > 0, yaw_deg > 0), strict=True) if some
-        )
-        raise LidarError(
-            f"{name} is of a sensor that moves, by {told} from sweep to sweep: give sweeps of a "
-            "sensor that stands, or one sweep for the bias of its rings."
-        )
-    lag = count // 2
-    step_m = range_scatter(repeats, 1)
-    drift_m = range_scatter(repeats, lag)
-    if drift_m > _DRIFT * step_m + _DRIFT_M:
-        raise LidarError(
-            f"{name} has ranges that drift: smooth surfaces change by {step_m:.2g} m from sweep to "
-            f"sweep, but by {drift_m:.2g} m in {lag} sweeps, so the sensor or the place moves, "
-            "or the sensor warms up: give sweeps of a warm sensor that stands."
-        )
-    changes = np.abs(np.diff(repeats.ranges, axis=0))
-    if (change := _median(changes, (0, 1, 2))) > _CHANGED_M:
+    _check_motion(stack, name, period_ns)
+    _check_drift(stack, name)
+    changes = np.abs(np.diff(stack.ranges, axis=0))
+    if (change := _median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
             f"{name} has ranges that change by {change:.2g} m from sweep to sweep, in the median, "
             "and no motion of the sensor explains that: give points in metres, of a place that "
@@ -555,184 +764,298 @@ def check_stands(repeats: Repeats, name: str, period_ns: float | None) -> None:
         )
 
 
+def _check_motion(stack: SweepStack, name: str, period_ns: float | None) -> None:
+    """Raise LidarError if a sensor moves from sweep to sweep, or over the recording."""
+    count = stack.sweep_count
+    starts = even_indices(count - 1, _SWEEP_PAIRS).tolist()
+    steps = [sensor_motion(stack, k, k + 1) for k in starts]
+    overall = [sensor_motion(stack, 0, k) for k in {count // 2, count - 1}]
+    motions = [step for step in steps if step.moves]
+    sweeps = 1
+    if len(motions) <= len(steps) / 2:
+        if not all(motion.moves for motion in overall):
+            return
+        motions = [overall[-1]]
+        sweeps = count - 1
+    shift_m = float(np.median([motion.shift_m for motion in motions])) / sweeps
+    yaw_deg = float(np.degrees(np.median([motion.yaw_rad for motion in motions]))) / sweeps
+    speeds = []
+    if shift_m > 0:
+        speed = f" ({1e9 * shift_m / period_ns:.2g} m/s)" if period_ns else ""
+        speeds.append(f"{shift_m:.2g} m{speed}")
+    if yaw_deg > 0:
+        speeds.append(f"{yaw_deg:.2g}°")
+    raise LidarError(
+        f"{name} is of a sensor that moves, by {' and '.join(speeds)} from sweep to sweep: give "
+        "sweeps of a sensor that stands, or one sweep for the bias of its rings."
+    )
+
+
+def _check_drift(stack: SweepStack, name: str) -> None:
+    """Raise LidarError if ranges change more over many sweeps than from sweep to sweep."""
+    lag = stack.sweep_count // 2
+    step_m = range_scatter(stack, 1)
+    drift_m = range_scatter(stack, lag)
+    if drift_m > _DRIFT_FACTOR * step_m + _DRIFT_M:
+        raise LidarError(
+            f"{name} has ranges that drift: smooth surfaces change by {step_m:.2g} m from sweep to "
+            f"sweep, but by {drift_m:.2g} m in {lag} sweeps, so the sensor or the place moves, "
+            "or the sensor warms up: give sweeps of a warm sensor that stands."
+        )
+
+
 class SensorMotion(NamedTuple):
-    """Motion of a sensor from a sweep to another; 0 where none can be told from noise."""
+    """Motion of a sensor between two sweeps; 0 where noise may explain the changes."""
 
     shift_m: float
     yaw_rad: float
 
     @property
     def moves(self) -> bool:
-        """Whether the sensor moves."""
-        return self.shift_m > _STILL_M or self.yaw_rad > _STILL_RAD
+        """True if the sensor moves."""
+        return self.shift_m > _MIN_SHIFT_M or self.yaw_rad > _MIN_YAW_RAD
 
 
 class RangeChanges(NamedTuple):
-    """Changes of the ranges of smooth surfaces from a sweep to another."""
+    """Changes of the ranges of smooth surfaces between two sweeps."""
 
     plane: Surfaces  # of the first sweep
     chosen: Bools  # (r, c): rays that meet smooth surfaces, not steeply, in both sweeps
     change: Floats  # (r, c): metres, without that of shifted azimuths
 
 
-def range_changes(repeats: Repeats, first: int, second: int) -> RangeChanges:
+def range_changes(stack: SweepStack, first: int, second: int) -> RangeChanges:
     """Compare the ranges of two sweeps where the first meets smooth surfaces."""
-    distance = repeats.ranges[first].astype(np.float64)
-    # Changes of ranges from sweep to sweep tell no noise if the sensor moves.
-    plane = surfaces(repeats, distance, np.full_like(distance, _ROUGH_M))
+    distance = stack.ranges[first].astype(np.float64)
+    # Changes of ranges from sweep to sweep are no noise if the sensor moves.
+    plane = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
     with np.errstate(invalid="ignore"):
-        turned = repeats.aside[second] - repeats.aside[first]
-        change = repeats.ranges[second] - distance - plane.turn * turned
-        chosen = plane.smooth & np.isfinite(change) & (plane.slope < _FLAT * distance)
+        azimuth_change = stack.azimuth_offsets[second] - stack.azimuth_offsets[first]
+        change = stack.ranges[second] - distance - plane.azimuth_slope * azimuth_change
+        chosen = plane.smooth & np.isfinite(change) & (plane.slope < _FLAT_TANGENT * distance)
     return RangeChanges(plane, chosen, change)
 
 
-def range_scatter(repeats: Repeats, lag: int) -> float:
+def range_scatter(stack: SweepStack, lag: int) -> float:
     """Return the typical change of the range of a smooth surface in `lag` sweeps, metres.
 
-    It is a mean without the largest changes: ranges may be rounded to more than their noise.
+    The result is a mean without the largest changes: ranges may be rounded to more than their
+    noise.
     """
     scatter = []
-    for first in even_indices(repeats.sweeps - lag, _PAIRS).tolist():
-        changes = range_changes(repeats, first, first + lag)
+    for first in even_indices(stack.sweep_count - lag, _SWEEP_PAIRS).tolist():
+        changes = range_changes(stack, first, first + lag)
         sizes = np.sort(np.abs(changes.change[changes.chosen]))
-        if len(sizes) >= _FEW:
-            scatter.append(sizes[: round(_CALM * len(sizes))].mean())
+        if len(sizes) >= _MIN_RAYS:
+            scatter.append(sizes[: round(_CALM_SHARE * len(sizes))].mean())
     return float(np.median(scatter)) if scatter else 0.0
 
 
-def sensor_motion(repeats: Repeats, first: int, second: int) -> SensorMotion:
+def sensor_motion(stack: SweepStack, first: int, second: int) -> SensorMotion:
     """Fit the shift and the yaw of the sensor between two sweeps to the changes of ranges.
 
     A plane n · x = c is nearer by n · s / (n · d) in the direction d after a shift s.
     """
-    distance = repeats.ranges[first].astype(np.float64)
-    plane, chosen, change = range_changes(repeats, first, second)
-    if chosen.sum() < _FEW:
+    plane, chosen, changes = range_changes(stack, first, second)
+    if chosen.sum() < _MIN_RAYS:
         return SensorMotion(0.0, 0.0)
-    change = change[chosen]
-    far = distance[chosen]
-    # Normals are of points two columns away on either side: those of near points are inexact.
-    inexact = _ROUGH_M / (np.sqrt(10) * far * 2 * np.pi / distance.shape[1])
-    noise = np.hypot(_ROUGH_M + _KINK * far, _SHIFT_M * inexact)
+    change = changes[chosen]
+    distance = stack.ranges[first].astype(np.float64)[chosen]
+    # Normals are of points two columns away on either side: those of close points are inexact.
+    column_count = stack.ranges.shape[2]
+    normal_error = _ASSUMED_NOISE_M / (np.sqrt(10) * distance * 2 * np.pi / column_count)
+    noise = np.hypot(_ASSUMED_NOISE_M + _MAX_KINK_PER_M * distance, _ASSUMED_SHIFT_M * normal_error)
     # Yaw as metres at a distance of 10 m, so that the unknowns are of about the same size.
-    design = np.column_stack([-plane.normal[chosen], plane.turn[chosen] / _YAW_M])
-    changed = np.abs(change) > 5 * noise  # in a street, few rays tell how far the sensor goes
+    design = np.column_stack([-plane.normal[chosen], plane.azimuth_slope[chosen] / _YAW_ARM_M])
+    changed = np.abs(change) > 5 * noise  # in a street, few rays show how far the sensor moves
     for rays in (slice(None), changed):
         motion = _rigid_motion(design[rays], change[rays], noise[rays])
-        explained = design @ motion
-        off = np.abs(change - explained)
-        scale = 1.4826 * np.median(off / noise)
-        limit = np.hypot(3 * scale * noise, 3 * inexact * np.linalg.norm(motion[:3]))
-        told = np.abs(explained) > limit
-        if told.sum() < _FEW or (off < np.abs(explained) / 2)[told].mean() < _AGREEING:
-            continue
-        shift_m = float(np.linalg.norm(motion[:3]))
-        yaw_rad = float(abs(motion[3])) / _YAW_M
-        return SensorMotion(
-            shift_m if shift_m > _STILL_M else 0.0, yaw_rad if yaw_rad > _STILL_RAD else 0.0
-        )
+        if _explains(motion, design, change, noise, normal_error):
+            shift_m = float(np.linalg.norm(motion[:3]))
+            yaw_rad = float(abs(motion[3])) / _YAW_ARM_M
+            return SensorMotion(
+                shift_m if shift_m > _MIN_SHIFT_M else 0.0,
+                yaw_rad if yaw_rad > _MIN_YAW_RAD else 0.0,
+            )
     return SensorMotion(0.0, 0.0)
 
 
+def _explains(
+    motion: Floats, design: Floats, change: Floats, noise: Floats, normal_error: Floats
+) -> bool:
+    """Return True if a motion (4,) explains most of the large changes (k,) that are predicted.
+
+    `noise` (k,) is that of the changes, metres; `normal_error` (k,) that of the rows of `design`.
+    """
+    predicted = design @ motion
+    residual = np.abs(change - predicted)
+    scale = 1.4826 * np.median(residual / noise)
+    limit = np.hypot(3 * scale * noise, 3 * normal_error * np.linalg.norm(motion[:3]))
+    large = np.abs(predicted) > limit
+    if large.sum() < _MIN_RAYS:
+        return False
+    return bool((residual < np.abs(predicted) / 2)[large].mean() >= _MIN_EXPLAINED_SHARE)
+
+
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a shift and a yaw (4,) to changes of ranges (k,); 0 where the changes do not tell them.
+    """Fit a shift and a yaw (4,) to changes of ranges (k,); 0 where undetermined.
 
     Huber's estimate: few rays of things that move count little.
     """
     motion: Floats = np.zeros(4)
-    if len(change) < _FEW:
+    if len(change) < _MIN_RAYS:
         return motion
     for _ in range(30):
-        size = np.abs(change - design @ motion) / noise
-        weight = np.sqrt(np.minimum(1, 2 / np.maximum(size, 1e-9))) / noise
+        residual = np.abs(change - design @ motion) / noise
+        weight = np.sqrt(np.minimum(1, 2 / np.maximum(residual, 1e-9))) / noise
         weighted = design * weight[:, None]
         motion = np.asarray(np.linalg.lstsq(weighted, change * weight, rcond=1e-6)[0], np.float64)
-    spread, axes = np.linalg.eigh(_sandwich(weighted, (change - design @ motion) * weight))
-    along = axes.T @ motion
-    known = np.abs(along) > 5 * np.sqrt(np.maximum(spread, 0)) + 1e-9
-    motion = axes @ np.where(known, along, 0.0)
+    covariance = _sandwich(weighted, (change - design @ motion) * weight)
+    variance, axes = np.linalg.eigh(covariance)
+    components = axes.T @ motion
+    significant = np.abs(components) > 5 * np.sqrt(np.maximum(variance, 0)) + 1e-9
+    motion = axes @ np.where(significant, components, 0.0)
     return np.asarray(motion)
 
 
-def _meeting(points: Floats) -> Floats:
-    """Where the beams of each row of points (r, c, 3) meet, (r, 1, 3): on the axis, near zero."""
-    with warnings.catch_warnings(action="ignore"):
-        far = np.hypot(points[..., 0], points[..., 1])
-        up = points[..., 2]
-        middle = np.nanmean(far, axis=1)
-        off = far - np.nanmean(far, axis=1, keepdims=True)
-        tangent = np.nansum(off * up, axis=1) / np.nansum(off**2, axis=1)
-        height = np.nanmean(up, axis=1) - tangent * middle
-    known = np.abs(height) < _HEAD_M  # also false of NaN
-    return np.where(known, height, 0)[:, None, None] * np.array([0, 0, 1.0])
-
-
-class Rays(NamedTuple):
+class SmoothRays(NamedTuple):
     """Rays that meet smooth surfaces, (k,) each."""
 
     row: Ints
     column: Ints
     distance: Floats  # mean of the ranges, metres
     slope: Floats  # by how much the range changes with the direction, metres in a radian
-    light: Floats  # mean intensity; NaN if unknown
+    intensity: Floats  # mean; NaN if unknown
     returns: Ints  # sweeps with a return
     trials: Ints  # sweeps that cover the ray
     variance: Floats  # of the range over the sweeps, square metres
-    freedom: Ints  # returns of which it is, less one
+    freedom: Ints  # degrees of freedom of the variance: its returns, less 1
+
+    def select(self, chosen: Bools | Indices) -> SmoothRays:
+        """Select rays by mask or index."""
+        return SmoothRays._make(values[chosen] for values in self)
 
 
-def smooth_rays(
-    repeats: Repeats, sigma: Floats, aim: float, expected: Floats | None = None
-) -> Rays:
-    """Choose rays without edges beside them, with the scatter of their ranges over the sweeps.
+class _RayStatistics(NamedTuple):
+    """Statistics of the returns of rays without outliers, (k,) each."""
 
-    Returns that noise of `sigma` (r, c) and directions that scatter by `aim` radians do not
-    explain are left out, and rays with many of them. Slopes are those of a scene's ranges
-    `expected` (r, c), if they are known.
+    mean_range: Floats  # metres
+    mean_intensity: Floats
+    variance: Floats  # of the range, square metres
+    return_count: Ints
+
+
+def select_smooth_rays(
+    stack: SweepStack, sigma: Floats, aim_rad: float, expected: Floats | None = None
+) -> SmoothRays:
+    """Choose rays away from edges, and compute the statistics of their returns.
+
+    Returns beyond noise of `sigma` (r, c) and directions that scatter by `aim_rad` are left out,
+    and rays with many such returns. Slopes are those of a scene's ranges `expected` (r, c), if
+    known.
     """
-    middle = _median(repeats.ranges, 0)
-    there = np.isfinite(repeats.ranges).sum(axis=0)
-    blur = repeats.sigma / np.sqrt(np.maximum(there, 1))
-    turn, slope, smooth, _ = surfaces(repeats, middle, blur)
+    median = _median(stack.ranges, 0)
+    return_count = np.isfinite(stack.ranges).sum(axis=0)
+    error_m = stack.rough_sigma / np.sqrt(np.maximum(return_count, 1))
+    plane = find_surfaces(stack, median, error_m)
+    slopes = plane.slope
+    smooth = plane.smooth
     if expected is not None:
-        slope = surfaces(repeats, expected, 0 * blur).slope
-        smooth &= np.abs(middle - expected) < _BESIDE_M
-    # A cell that is smooth by chance, as in leaves, has no smooth ones beside it.
-    beside = np.sum([np.roll(smooth, by, axis=1) for by in (-2, -1, 1, 2)], axis=0)
-    row, column = cell = np.nonzero(smooth & (beside >= 3))
-    images = repeats.ranges, repeats.light, repeats.aside
-    ranges, light, aside = (one[:, row, column].astype(np.float64) for one in images)
-    ranges -= turn[cell] * aside
-    slope = slope[cell]
-    returns = there[cell]
-    limit = np.where(returns > 1, _SIGMAS * np.hypot(sigma[cell], aim * slope), np.inf)
-    kept = np.abs(ranges - middle[cell]) <= limit
-    used = kept.sum(axis=0)
+        slopes = find_surfaces(stack, expected, 0 * error_m).slope
+        smooth &= np.abs(median - expected) < _SCENE_TOLERANCE_M
+    # A cell that is smooth by chance, as in leaves, has no smooth cells beside it.
+    neighbours = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
+    cell = np.nonzero(smooth & (neighbours >= 3))
+    slope = slopes[cell]
+    returns = return_count[cell]
+    limit_m = _MAX_SIGMAS * np.hypot(sigma[cell], aim_rad * slope)
+    limit_m = np.where(returns > 1, limit_m, np.inf)
+    statistics = _ray_statistics(stack, cell, plane.azimuth_slope[cell], median[cell], limit_m)
+    rays = SmoothRays(
+        row=cell[0],
+        column=cell[1],
+        distance=statistics.mean_range,
+        slope=slope,
+        intensity=statistics.mean_intensity,
+        returns=returns,
+        trials=stack.trials[cell],
+        variance=statistics.variance,
+        freedom=statistics.return_count - 1,
+    )
+    count = statistics.return_count
+    return rays.select(np.flatnonzero((count > 0) & (count >= _MIN_RETURN_SHARE * returns)))
+
+
+def _ray_statistics(
+    stack: SweepStack,
+    cell: tuple[Indices, ...],
+    azimuth_slope: Floats,
+    median: Floats,
+    limit_m: Floats,
+) -> _RayStatistics:
+    """Compute the statistics of returns within a distance (k,) from the median range (k,).
+
+    `cell` has the rows and columns (k,) of the rays. Ranges are corrected for the azimuths of
+    their pulses by the slopes (k,) of the surfaces.
+    """
+    row, column = cell
+    ranges = stack.ranges[:, row, column].astype(np.float64)
+    ranges -= azimuth_slope * stack.azimuth_offsets[:, row, column].astype(np.float64)
+    intensities = stack.intensities[:, row, column].astype(np.float64)
+    inliers = np.abs(ranges - median) <= limit_m
+    used = inliers.sum(axis=0)
     count = np.maximum(used, 1)
-    mean, bright = (np.where(kept, one, 0).sum(axis=0) / count for one in (ranges, light))
-    variance = np.where(kept, (ranges - mean) ** 2, 0).sum(axis=0) / np.maximum(used - 1, 1)
-    some = np.flatnonzero((used > 0) & (used >= _REPEATED * returns))
-    trials = repeats.trials[cell]
-    rays = row, column, mean, slope, bright, returns, trials, variance, used - 1
-    return Rays._make(one[some] for one in rays)
+    mean_range = np.where(inliers, ranges, 0).sum(axis=0) / count
+    mean_intensity = np.where(inliers, intensities, 0).sum(axis=0) / count
+    squares = np.where(inliers, (ranges - mean_range) ** 2, 0).sum(axis=0)
+    return _RayStatistics(mean_range, mean_intensity, squares / np.maximum(used - 1, 1), used)
 
 
-def meet_frontally(rays: Rays) -> bool:
-    """Whether enough rays meet surfaces so that noise of ranges is not taken for directions'."""
-    frontal = (rays.slope < _FRONTAL * rays.distance).sum()
-    return bool(frontal >= max(_FRONTAL_RAYS, _FRONTAL_SHARE * len(rays.row)))
+def has_frontal_rays(rays: SmoothRays) -> bool:
+    """Return True if enough frontal rays separate noise of ranges from noise of directions."""
+    frontal = (rays.slope < _FRONTAL_TANGENT * rays.distance).sum()
+    return bool(frontal >= max(_MIN_FRONTAL_RAYS, _MIN_FRONTAL_SHARE * len(rays.row)))
 
 
 def fit_performance(
-    repeats: Repeats, rays: Rays, energy: Floats | None
+    stack: SweepStack, rays: SmoothRays, energy: Floats | None
 ) -> tuple[dict[str, Estimate], Floats]:
-    """Estimate what repeated sweeps tell, with the energies of rays (k,) if they are known.
+    """Estimate the performance of a sensor from repeated sweeps.
 
-    Returns what is known by the names of `Noise`; and the standard deviations of rays (k,), metres,
-    by range or by energy, whichever is likelier.
+    `energy` (k,) is that of the returns of rays, if known. Returns estimates by the field names of
+    `Noise`; and the standard deviations of rays (k,), metres, by range or by energy, whichever is
+    likelier.
     """
-    light = np.nan_to_num(rays.light) if energy is None else energy
+    threshold, dropout = _fit_detection(rays, energy)
+    scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
+    if energy is not None and threshold is not None:
+        by_energy = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
+        if "range_at_threshold_m" in by_energy.estimates and by_energy.deviance < scatter.deviance:
+            scatter = by_energy
+    figures = {}
+    if has_frontal_rays(rays):
+        figures = {
+            name: estimate
+            for name, estimate in scatter.estimates.items()
+            if estimate.is_within(_MAX_HALF_INTERVAL)
+        }
+    if threshold is not None:
+        figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
+    if alarms := alarm_share(stack):
+        figures["false_alarms"] = alarms
+    if dropout is not None:
+        figures["dropout"] = dropout
+    return figures, scatter.sigma
+
+
+def _fit_detection(
+    rays: SmoothRays, energy: Floats | None
+) -> tuple[Estimate | None, Estimate | None]:
+    """Estimate the energy of which half of the pulses return, and the share lost at any energy.
+
+    Either is None if undetermined; `energy` (k,) is None if unknown.
+    """
+    light = np.nan_to_num(rays.intensity) if energy is None else energy
     strong = light >= np.median(light)
     threshold = None
     dropout = lost_share(rays, strong)
@@ -743,105 +1066,146 @@ def fit_performance(
         threshold = fit_threshold(energy, rays.returns, rays.trials, lost)
         if threshold is None:
             break
-        strong = energy > 2 * threshold.value  # what loses nothing by energy
+        strong = energy > 2 * threshold.value  # no pulse of these is lost for want of energy
         dropout = lost_share(rays, strong) or dropout
-    figures, sigma, deviance = fit_scatter(rays, "range_per_m", rays.distance, 1)
-    if energy is not None and threshold is not None:
-        other = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
-        if "range_at_threshold_m" in other[0] and other[2] < deviance:
-            figures, sigma, _ = other
-    if not meet_frontally(rays):
-        figures = {}
-    figures = {name: one for name, one in figures.items() if one.known_within(_KNOWN)}
-    if threshold is not None:
-        figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
-    if alarms := alarm_share(repeats):
-        figures["false_alarms"] = alarms
-    if dropout is not None:
-        figures["dropout"] = dropout
-    return figures, sigma
+    return threshold, dropout
 
 
-def lost_share(rays: Rays, chosen: Bools) -> Estimate | None:
-    """Estimate the share of pulses that chosen rays (k,) lose; None if these are too few.
+def lost_share(rays: SmoothRays, chosen: Bools) -> Estimate | None:
+    """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
 
-    A ray is known only by its returns, which therefore tell no share. The other sweeps do: each
-    return in turn is the one that makes the ray known.
+    A ray is known only by its returns, which therefore determine no share. The other sweeps do:
+    each return in turn is the one that makes the ray known.
     """
     chosen = chosen & (rays.trials > 1)
-    if chosen.sum() < _FEW:
+    if chosen.sum() < _MIN_RAYS:
         return None
     returns = rays.returns[chosen]
     trials = rays.trials[chosen]
-    return Estimate.share((trials - returns) * returns / (trials - 1), returns)
+    return Estimate.from_shares((trials - returns) * returns / (trials - 1), returns)
 
 
-def fit_scatter(
-    rays: Rays, growth: str, spread: Floats, power: int
-) -> tuple[dict[str, Estimate], Floats, float]:
+class ScatterFit(NamedTuple):
+    """Noise of ranges and directions that was fitted to the variances of rays."""
+
+    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
+    sigma: Floats  # (k,): standard deviation of the range of each ray, metres
+    deviance: float  # of the rays; smaller is likelier
+
+
+class _VarianceSamples(NamedTuple):
+    """Variances of the ranges of rays that lose few pulses, (k,) each."""
+
+    variance: Floats  # square metres
+    freedom: Ints  # degrees of freedom of the variance
+    growth: Floats  # the quantity with which noise of ranges grows
+    slope: Floats  # metres in a radian
+    distance: Floats  # metres
+    patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
+
+
+@dataclass(frozen=True, eq=False)
+class _VarianceModel:
+    """Variance of ranges: noise that grows with a quantity, plus noise of directions.
+
+    The parameters are the noise of ranges at growth 0, its increase, and the noise of directions,
+    each relative to the usual variance; only `fitted` ones are passed, the others are 0.
+    """
+
+    power: int  # of the growth
+    fitted: Bools  # (3,)
+    variance_scale: float  # usual variance, square metres
+    growth_scale: float
+    slope_scale: float
+
+    def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
+        """Return the variances (k,) of rays, square metres."""
+        theta = np.zeros(3)
+        theta[self.fitted] = parameters
+        ranges = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
+        directions = theta[2] * (slope / self.slope_scale) ** 2
+        return np.asarray(self.variance_scale * (ranges ** (2 / self.power) + directions))
+
+    def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
+        """Return the variances (k,) of samples, square metres."""
+        return self.variance(parameters, samples.growth, samples.slope)
+
+
+def fit_scatter(rays: SmoothRays, growth_name: str, growth: Floats, power: int) -> ScatterFit:
     """Fit noise of ranges and directions to the variances of rays, by their likelihood.
 
-    Noise of ranges grows with a power of `spread` (k,). What rays do not tell, for want of spreads
-    or inclined surfaces, is left out. Intervals are of sandwich estimators, for patches of rays
-    that may be alike, and of errors of the model: edges, slopes, and growth. Returns figures, noise
-    of ranges (k,) in metres, and the deviance.
+    Noise of ranges grows with a power of `growth` (k,), whose estimate is `growth_name`. Figures
+    that the rays do not determine, for want of different growths or inclined surfaces, are left
+    out. Intervals are of sandwich estimators, for patches of rays that may be alike, and of errors
+    of the model: edges, slopes, and growth.
     """
-    low, unit, high = np.quantile(spread, (0.05, 0.5, 0.95))
-    tilted = np.quantile(rays.slope / rays.distance, 0.9) > _TILT
-    # Growth is fitted even where it is not told: it makes the interval of range_m as wide as it is.
-    known = np.array([True, True, tilted])
-    # Rays that lose some of their pulses are known by the nearer or brighter ones of these.
-    repeated = (rays.freedom > 0) & (rays.returns >= _REPEATED * rays.trials)
-    variance = rays.variance[repeated]
-    slope = rays.slope[repeated]
-    freedom = rays.freedom[repeated]
-    steep = np.median(rays.slope)
-    usual = max(float(np.median(variance)), 1e-12)
-
-    def model(some: Floats, spread: Floats, slope: Floats) -> Floats:
-        theta = np.zeros(3)
-        theta[known] = some
-        ranges = theta[0] + theta[1] * (spread / unit) ** power
-        return np.asarray(usual * (ranges ** (2 / power) + theta[2] * (slope / steep) ** 2))
-
-    def expected(some: Floats) -> Floats:
-        return model(some, spread[repeated], slope)
-
-    start = np.array([1.0, 0.1, 0.1])[known]
-    wide = max(int(rays.column.max()) // _PATCHES, 1)  # columns of a patch
-    patch = (rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // wide)[repeated]
-    theta, covariance = _trimmed(expected, start, variance, freedom, _TRIMMED, patch)
-    # Edges that are finer than the rays make the variances of some rays larger: what the figures
-    # change if fewer of these are left out is an error of the model.
-    others, _ = _trimmed(expected, theta, variance, freedom, _REJECTED, patch)
-    spreads = np.diag(covariance) + (theta - others) ** 2
-    # Nor are slopes exact: variances of steep rays, or far ones, may be wrong against the others.
-    for quantity in (slope / rays.distance[repeated], spread[repeated]):
-        wrong = _WRONG * np.where(quantity > np.median(quantity), 1.0, -1.0)
-        biased, _ = _trimmed(expected, theta, variance * (1 + wrong), freedom, _TRIMMED, patch)
-        spreads += (biased - theta) ** 2
-    names = ("range_m", growth, "angle_deg")
-    roots = (1 / power, 1 / power, 0.5)
-    scales = np.sqrt(usual) / np.array([1, unit, np.radians(steep)])
-    figures = {
-        names[k]: Estimate.of(value, square).power(roots[k], scales[k])
-        for k, value, square in zip(np.flatnonzero(known), theta, spreads, strict=True)
-        if k != 1 or high > _SPAN * low
+    lower, middle, upper = np.quantile(growth, (0.05, 0.5, 0.95))
+    samples = _variance_samples(rays, growth)
+    is_tilted = np.quantile(rays.slope / rays.distance, 0.9) > _MIN_TILT_TANGENT
+    model = _VarianceModel(
+        power=power,
+        # Growth is fitted even if undetermined: it widens the interval of range_m rightly.
+        fitted=np.array([True, True, is_tilted]),
+        variance_scale=max(float(np.median(samples.variance)), 1e-12),
+        growth_scale=middle,
+        slope_scale=np.median(rays.slope),
+    )
+    exponents = (1 / power, 1 / power, 0.5)
+    scales = np.sqrt(model.variance_scale) / np.array([1, middle, np.radians(model.slope_scale)])
+    theta, theta_variance = _fit_variances(model, samples)
+    names = ("range_m", growth_name, "angle_deg")
+    estimates = {
+        names[k]: Estimate.from_variance(value, variance).power(exponents[k], scales[k])
+        for k, value, variance in zip(
+            np.flatnonzero(model.fitted), theta, theta_variance, strict=True
+        )
+        if k != 1 or upper > _MIN_RANGE_RATIO * lower
     }
-    sizes = np.minimum(variance / expected(theta), _OUTLIER)
-    deviance = freedom @ (np.log(expected(theta)) + sizes)
-    return figures, np.sqrt(model(theta, spread, rays.slope)), float(deviance)
+    expected = model.expected(theta, samples)
+    ratios = np.minimum(samples.variance / expected, _MAX_VARIANCE_RATIO)
+    deviance = float(samples.freedom @ (np.log(expected) + ratios))
+    return ScatterFit(estimates, np.sqrt(model.variance(theta, growth, rays.slope)), deviance)
 
 
-def _trimmed(
-    expected: Callable[[Floats], Floats],
-    start: Floats,
-    variance: Floats,
-    freedom: Ints,
-    chance: float,
-    patch: Ints,
+def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
+    """Choose the rays whose variances are fitted, with the growth (k,) of their noise.
+
+    Rays that lose some of their pulses are known by the nearer or brighter returns only.
+    """
+    repeated = (rays.freedom > 0) & (rays.returns >= _MIN_RETURN_SHARE * rays.trials)
+    patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
+    patch = rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // patch_columns
+    return _VarianceSamples(
+        variance=rays.variance[repeated],
+        freedom=rays.freedom[repeated],
+        growth=growth[repeated],
+        slope=rays.slope[repeated],
+        distance=rays.distance[repeated],
+        patch=patch[repeated],
+    )
+
+
+def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Floats, Floats]:
+    """Fit the parameters of a model (p,), and estimate their variances (p,)."""
+    start = np.array([1.0, 0.1, 0.1])[model.fitted]
+    theta, covariance = _fit_trimmed(model, start, samples, _TAIL_CHANCE)
+    # Edges that are finer than the rays make the variances of some rays larger: the change of the
+    # figures if fewer rays are left out is an error of the model.
+    untrimmed, _ = _fit_trimmed(model, theta, samples, _OUTLIER_CHANCE)
+    variances = np.diag(covariance) + (theta - untrimmed) ** 2
+    # Slopes are not exact: variances of steep or distant rays may be wrong against the others.
+    for quantity in (samples.slope / samples.distance, samples.growth):
+        error = _VARIANCE_ERROR * np.where(quantity > np.median(quantity), 1.0, -1.0)
+        changed = samples._replace(variance=samples.variance * (1 + error))
+        biased, _ = _fit_trimmed(model, theta, changed, _TAIL_CHANCE)
+        variances += (biased - theta) ** 2
+    return theta, variances
+
+
+def _fit_trimmed(
+    model: _VarianceModel, start: Floats, samples: _VarianceSamples, chance: float
 ) -> tuple[Floats, Floats]:
-    """Fit a model to variances (k,), and estimate the covariance of its parameters.
+    """Fit a model to variances, and estimate the covariance (p, p) of its parameters (p,).
 
     Variances above a quantile of their distribution, which they exceed with a `chance`, are left
     out, and the mean of the others is that of the truncated distribution.
@@ -849,33 +1213,37 @@ def _trimmed(
     from scipy.optimize import least_squares
     from scipy.stats import chi2
 
+    freedom = samples.freedom
     limit = chi2.isf(chance, freedom)
-    kept = np.ones(len(variance), bool)
-    truncated = chi2.cdf(limit, freedom + 2) / (1 - chance)
+    inliers = np.ones(len(samples.variance), bool)
+    truncated_mean = chi2.cdf(limit, freedom + 2) / (1 - chance)
     theta = start
     for step in range(12):
+        expected = model.expected(theta, samples)
         if step:
-            kept = freedom * variance / expected(theta) < limit
-        scale = truncated if step else 1.0
-        weight = np.sqrt(freedom / 2) / expected(theta)
+            inliers = freedom * samples.variance / expected < limit
+        scale = truncated_mean if step else 1.0
+        weight = np.sqrt(freedom / 2) / expected
 
-        def off(
-            some: Floats, kept: Bools = kept, weight: Floats = weight, scale: Any = scale
+        def residuals(
+            parameters: Floats, rows: Bools = inliers, weight: Floats = weight, scale: Any = scale
         ) -> Any:
-            return ((variance - scale * expected(some)) * weight)[kept]
+            variance = scale * model.expected(parameters, samples)
+            return ((samples.variance - variance) * weight)[rows]
 
-        solved = least_squares(off, theta, bounds=(0, np.inf), x_scale=np.maximum(theta, 0.01))
+        x_scale = np.maximum(theta, 0.01)
+        solved = least_squares(residuals, theta, bounds=(0, np.inf), x_scale=x_scale)
         theta = solved.x
-    return theta, _sandwich(solved.jac, solved.fun, patch[kept])
+    return theta, _sandwich(solved.jac, solved.fun, samples.patch[inliers])
 
 
-def _sandwich(design: Floats, off: Floats, patch: Ints | None = None) -> Floats:
-    """Estimate the covariance of a least-squares fit whose residuals are of unequal size.
+def _sandwich(design: Floats, residuals: Floats, patch: Ints | None = None) -> Floats:
+    """Estimate the covariance of a least-squares fit whose residuals (k,) are of unequal size.
 
     Residuals of one patch (k,), such as of a surface, may be alike.
     """
     inverse = np.linalg.pinv(design.T @ design, hermitian=True)
-    score = design * off[:, None]
+    score = design * residuals[:, None]
     if patch is not None:
         _, patch = np.unique(patch, return_inverse=True)
         sums = np.zeros((patch.max() + 1, score.shape[1]))
@@ -886,204 +1254,264 @@ def _sandwich(design: Floats, off: Floats, patch: Ints | None = None) -> Floats:
 
 
 def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> Estimate | None:
-    """Energy of which half of the pulses return, by the curve of `Noise.detected`.
+    """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
 
-    A ray is there only if a pulse returned: the likelihood is that of a truncated binomial
+    A ray is recorded only if a pulse returned: the likelihood is that of a truncated binomial
     distribution. None if too few rays lose some of their pulses.
     """
     from scipy.optimize import brute
     from scipy.special import ndtr
     from scipy.stats import binom
 
-    def seen(log_threshold: Any) -> Floats:
+    def detection(log_threshold: Any) -> Floats:
         share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
         return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
 
-    def unlikely(log_threshold: Any) -> Floats:
-        p: Floats = seen(log_threshold)
+    def deviance(log_threshold: Any) -> Floats:
+        p: Floats = detection(log_threshold)
         return np.log1p(-((1 - p) ** trials)) - binom.logpmf(count, trials, p)
 
-    low, high = np.log(np.quantile(energy, (0.001, 0.999)))
-    (found,) = brute(lambda one: unlikely(one).sum(), [(low - 2, high)], Ns=60)
-    if (seen(found) < 0.9 * (1 - dropout)).sum() < _WEAK_RAYS:
+    lower, upper = np.log(np.quantile(energy, (0.001, 0.999)))
+    (fitted,) = brute(lambda guess: deviance(guess).sum(), [(lower - 2, upper)], Ns=60)
+    if (detection(fitted) < 0.9 * (1 - dropout)).sum() < _MIN_WEAK_RAYS:
         return None
-    before, at, after = (unlikely(found + by) for by in (-_STEP, 0, _STEP))
-    information = (after - 2 * at + before).sum() / _STEP**2
-    score = (((after - before) / (2 * _STEP)) ** 2).sum()
-    return Estimate(*np.exp(Estimate.of(found, score / information**2)).tolist())
+    below, centre, above = (deviance(fitted + step) for step in (-_LOG_STEP, 0, _LOG_STEP))
+    information = (above - 2 * centre + below).sum() / _LOG_STEP**2
+    score = (((above - below) / (2 * _LOG_STEP)) ** 2).sum()
+    return Estimate(*np.exp(Estimate.from_variance(fitted, score / information**2)).tolist())
 
 
-def alarm_share(repeats: Repeats) -> Estimate | None:
-    """Share of pulses into the sky that return; None with little sky, or with two sweeps.
+def alarm_share(stack: SweepStack) -> Estimate | None:
+    """Estimate the share of pulses into the sky that return.
 
-    A pulse is one into the sky if no other of its ray returns, and no ray beside it repeats, of
-    three pulses or more.
+    A pulse is a pulse into the sky if no other pulse of its ray returns, and no ray beside it
+    repeats, of three pulses or more. None with little sky, or with two sweeps.
     """
     from scipy.ndimage import maximum_filter
     from scipy.stats import binomtest
 
-    count = np.isfinite(repeats.ranges).sum(axis=0)
+    count = np.isfinite(stack.ranges).sum(axis=0)
     # Weak surfaces, which return seldom, are beside those that return more often.
     size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
     repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
-    sky = ~repeated & (repeats.trials > 2)
+    sky = ~repeated & (stack.trials > 2)
     alarms = int((count[sky] == 1).sum())
-    trials = int(repeats.trials[sky & (count == 0)].sum()) + alarms
-    if trials < _SKY_PULSES:
+    trials = int(stack.trials[sky & (count == 0)].sum()) + alarms
+    if trials < _MIN_SKY_PULSES:
         return None
     return Estimate(alarms / trials, *map(float, binomtest(alarms, trials).proportion_ci()))
 
 
-def ring_bias(rays: Rays, directions: Floats, blur: Floats) -> dict[int, Estimate]:
+class _PlaneRays(NamedTuple):
+    """Rays on large planes that several rings cross, (n,) each."""
+
+    rays: Indices  # indices into the rays
+    plane: Ints  # numbers of the planes
+
+
+def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
     """Estimate by how much the ranges of rows differ from the mean of all: {row: metres}.
 
     Large planes u · x = 1 and offsets b of the rows are fitted at once: 1 / r = u · d − b / r²,
-    times r². Ranges have standard deviations `blur` (k,), metres. A row that lies in a single plane
-    has no offset. Intervals hold noise and errors of the planes, which are not quite plane: by what
-    offsets change without the farther points, and without each plane (jackknife; Efron, 1982).
+    times r². Ranges have standard deviations `error_m` (k,). A row that lies in a single plane
+    has no offset. Intervals hold noise and errors of the planes, which are not quite plane: by how
+    much offsets change without the farther points, and without each plane (jackknife; Efron, 1982).
     """
     if not len(rays.row):
         return {}
-    some = even_indices(len(rays.row), _PLANE_POINTS)
-    plane = _planes(rays.distance[some, None] * directions[some])
-    count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)
-    np.add.at(count, (rays.row[some], plane), 1)  # the last column is of points in no plane
-    crossing = (count[:, :-1] >= _RING_RAYS).sum(axis=1) > 1
-    chosen = (plane >= 0) & crossing[rays.row[some]]
-    some = some[chosen]
-    plane = plane[chosen]
-    rows, place = np.unique(rays.row[some], return_inverse=True)
+    chosen = _plane_rays(rays, directions)
+    rows, row_index = np.unique(rays.row[chosen.rays], return_inverse=True)
     if len(rows) < 3:
         return {}
-    _, plane = np.unique(plane, return_inverse=True)
-    planes = plane.max() + 1
-    distance = rays.distance[some] / blur[some]
-    normals = np.eye(planes)[plane][:, :, None] * directions[some][:, None]
-    normals = normals.reshape(len(some), -1) * rays.distance[some, None] ** 2
-    design = np.hstack([normals, -np.eye(len(rows))[place]]) / blur[some, None]
-    # One offset of all is nearly the same as other planes: the mean of the rows is 0.
-    centred = np.eye(len(rows)) - 1 / len(rows)
-    solution, kept = _without_outliers(design, distance, _FAR_SIGMAS)
-    offsets = centred @ solution[3 * planes :]
-    nearer, _ = _without_outliers(design, distance, _NEAR_SIGMAS)
-    used = design[kept]
-    covariance = _sandwich(used, distance[kept] - used @ solution)[3 * planes :, 3 * planes :]
-    moved = centred @ nearer[3 * planes :] - offsets
-    replicates = [
-        centred @ np.linalg.lstsq(design[rest], distance[rest], rcond=None)[0][3 * planes :]
-        for rest in (kept & (plane != number) for number in range(planes))
-    ]
-    spread = np.diag(centred @ covariance @ centred) + moved**2
-    spread += (planes - 1) * np.var(replicates, axis=0)
-    estimates = zip(rows.tolist(), offsets, spread, strict=True)
-    return {row: Estimate.of(*estimate) for row, *estimate in estimates}
+    _, plane = np.unique(chosen.plane, return_inverse=True)
+    plane_count = plane.max() + 1
+    error_m = error_m[chosen.rays]
+    distance = rays.distance[chosen.rays]
+    normals = np.eye(plane_count)[plane][:, :, None] * directions[chosen.rays][:, None]
+    normals = normals.reshape(len(distance), -1) * distance[:, None] ** 2
+    design = np.hstack([normals, -np.eye(len(rows))[row_index]]) / error_m[:, None]
+    offsets, variances = _solve_offsets(design, distance / error_m, plane)
+    estimates = zip(rows.tolist(), offsets, variances, strict=True)
+    return {row: Estimate.from_variance(offset, variance) for row, offset, variance in estimates}
 
 
-def _without_outliers(design: Floats, values: Floats, sigmas: float) -> tuple[Floats, Bools]:
-    """Solve least squares without residuals beyond some standard deviations.
+def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
+    """Choose rays, with directions (k, 3), of rings that cross at least two large planes."""
+    indices = even_indices(len(rays.row), _MAX_PLANE_POINTS)
+    plane = _segment_planes(rays.distance[indices, None] * directions[indices])
+    count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)
+    np.add.at(count, (rays.row[indices], plane), 1)  # the last column is of points in no plane
+    crosses_planes = (count[:, :-1] >= _MIN_RING_RAYS).sum(axis=1) > 1
+    chosen = (plane >= 0) & crosses_planes[rays.row[indices]]
+    return _PlaneRays(indices[chosen], plane[chosen])
 
-    Returns the solution, and which equations (k,) are used.
+
+def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats, Floats]:
+    """Return the offsets of rows (r,) and their variances (r,), of mean 0.
+
+    The unknowns of `design` (n, 3 p + r) are the normals of planes, then the offsets; `plane` (n,)
+    is the plane of each equation.
     """
-    off = np.zeros(len(values))
+    plane_count = plane.max() + 1
+    first = 3 * plane_count
+    row_count = design.shape[1] - first
+    # One offset of all rows is nearly the same as other planes: the mean of the rows is 0.
+    centred = np.eye(row_count) - 1 / row_count
+    solution, inliers = _solve_without_outliers(design, values, _OUTLIER_SIGMAS)
+    offsets = centred @ solution[first:]
+    strict_solution, _ = _solve_without_outliers(design, values, _STRICT_SIGMAS)
+    used = design[inliers]
+    covariance = _sandwich(used, values[inliers] - used @ solution)[first:, first:]
+    shift = centred @ strict_solution[first:] - offsets
+    replicates = [
+        centred @ np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0][first:]
+        for chosen in (inliers & (plane != number) for number in range(plane_count))
+    ]
+    variances = np.diag(centred @ covariance @ centred) + shift**2
+    variances += (plane_count - 1) * np.var(replicates, axis=0)
+    return offsets, variances
+
+
+def _solve_without_outliers(
+    design: Floats, values: Floats, max_sigmas: float
+) -> tuple[Floats, Bools]:
+    """Solve least squares without residuals beyond a number of standard deviations.
+
+    Returns the solution, and a mask of the equations (k,) that are used.
+    """
+    residuals = np.zeros(len(values))
     for _ in range(4):
-        kept = np.abs(off) <= sigmas * 1.4826 * np.median(np.abs(off))
-        solution = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
-        off = values - design @ solution
-    return solution, kept
+        sizes = np.abs(residuals)
+        inliers = sizes <= max_sigmas * 1.4826 * np.median(sizes)
+        solution = np.linalg.lstsq(design[inliers], values[inliers], rcond=None)[0]
+        residuals = values - design @ solution
+    return solution, inliers
 
 
-def _planes(points: Floats) -> Ints:
-    """Tell the number of the large plane that each point (n, 3) lies in; -1 for none."""
+def _segment_planes(points: Floats) -> Ints:
+    """Return the number of the large plane that each point (n, 3) lies in; -1 for no plane."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
-    number = np.full(len(points), -1)
-    left = np.arange(len(points))
-    for _ in range(_PLANES):
-        if len(left) < _PLANE_RAYS:
+    plane = np.full(len(points), -1)
+    remaining = np.arange(len(points))
+    for _ in range(_MAX_PLANES):
+        if len(remaining) < _MIN_PLANE_RAYS:
             break
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[left]))
-        (*normal, above), _ = cloud.segment_plane(_PLANE_M, 3, 400)
-        off = np.abs(points[left] @ normal + above)  # from the plane of all inliers
-        inside = np.flatnonzero(off < _PLANE_M)
-        ways = points[left[inside]] / np.linalg.norm(points[left[inside]], axis=1)[:, None]
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(ways))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[remaining]))
+        (*normal, constant), _ = cloud.segment_plane(_PLANE_TOLERANCE_M, 3, 400)
+        offset = np.abs(points[remaining] @ normal + constant)  # from the plane of all inliers
+        inliers = np.flatnonzero(offset < _PLANE_TOLERANCE_M)
+        inlier_points = points[remaining[inliers]]
+        directions = inlier_points / np.linalg.norm(inlier_points, axis=1)[:, None]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(directions))
         # Walls in a line are not quite one plane: the largest piece is.
-        piece = np.asarray(cloud.cluster_dbscan(_GAP, 3))
-        inside = inside[piece == np.bincount(piece + 1)[1:].argmax()]
+        piece = np.asarray(cloud.cluster_dbscan(_MAX_DIRECTION_GAP, 3))
+        inliers = inliers[piece == np.bincount(piece + 1)[1:].argmax()]
         # What fills the slab evenly is cut out of other surfaces.
-        if len(inside) >= _PLANE_RAYS and np.median(off[inside]) < _EVEN * _PLANE_M:
-            number[left[inside]] = number.max() + 1
-        left = np.delete(left, inside)
-    return number
+        is_large = len(inliers) >= _MIN_PLANE_RAYS
+        if is_large and np.median(offset[inliers]) < _MAX_MEDIAN_OFFSET * _PLANE_TOLERANCE_M:
+            plane[remaining[inliers]] = plane.max() + 1
+        remaining = np.delete(remaining, inliers)
+    return plane
 
 
-def _channels(
-    repeats: Repeats, rays: Rays, own: Floats, sigma: Floats, expected: Floats | None
+def _channel_figures(
+    stack: SweepStack, measured: _MeasuredRays, expected: Floats | None
 ) -> list[dict[str, Any]]:
-    """Noise, bias and spread of azimuths of each ring."""
-    flat = Rays._make(one[rays.slope < _FLAT * rays.distance] for one in rays)
-    cell = flat.row, flat.column
-    if expected is not None:
-        off = flat.distance - expected[cell]
-        bias = {row: Estimate.mean(off[flat.row == row]) for row in set(flat.row.tolist())}
-    else:
-        blur = sigma[cell] / np.sqrt(flat.returns) + _LEAST_M
-        bias = ring_bias(flat, repeats.directions[cell], blur)
-    uneven = np.degrees(np.diff(repeats.aside, axis=2)) ** 2 / 2
+    """Return the noise, bias and spread of azimuths of each ring.
+
+    Bias is against the scene's ranges `expected` (r, c), or against large planes.
+    """
+    rays = measured.rays
+    range_variance = _range_variances(measured)
+    bias = _bias(stack, measured, expected)
+    azimuth_variance = np.degrees(np.diff(stack.azimuth_offsets, axis=2)) ** 2 / 2
+    has_pairs = len(azimuth_variance) > 1
     return [
         {
             "ring": int(ring),
-            "elevation_deg": float(repeats.elevation_deg[row]),
-            "rays": int(np.isfinite(own[rays.row == row]).sum()),
-            "noise_m": _noise(own[rays.row == row]),
+            "elevation_deg": float(stack.elevation_deg[row]),
+            "rays": int(np.isfinite(range_variance[rays.row == row]).sum()),
+            "noise_m": _root_mean(range_variance[rays.row == row]),
             "bias_m": bias[row]._asdict() if row in bias else None,
-            "uneven_deg": _noise(uneven[:, row]) if len(uneven) > 1 else None,
+            "uneven_deg": _root_mean(azimuth_variance[:, row]) if has_pairs else None,
         }
-        for row, ring in enumerate(repeats.rings)
+        for row, ring in enumerate(stack.rings)
     ]
 
 
-def _noise(variances: Floats) -> dict[str, float] | None:
-    """Root of the mean of the variances that are known, if they are enough."""
-    known = variances[np.isfinite(variances)]
-    return Estimate.mean(known).power(0.5)._asdict() if len(known) >= _FEW else None
+def _bias(
+    stack: SweepStack, measured: _MeasuredRays, expected: Floats | None
+) -> dict[int, Estimate]:
+    """Estimate the bias of each row of the stack, {row: metres}, by rays that are not steep."""
+    rays = measured.rays
+    flat = rays.select(rays.slope < _FLAT_TANGENT * rays.distance)
+    cell = flat.row, flat.column
+    if expected is not None:
+        errors = flat.distance - expected[cell]
+        rows = set(flat.row.tolist())
+        return {row: Estimate.from_values(errors[flat.row == row]) for row in rows}
+    error_m = measured.sigma[cell] / np.sqrt(flat.returns) + _MIN_RANGE_ERROR_M
+    return ring_bias(flat, stack.directions[cell], error_m)
+
+
+def _root_mean(variances: Floats) -> dict[str, float] | None:
+    """Estimate the root of the mean of the finite variances; None for too few variances."""
+    finite = variances[np.isfinite(variances)]
+    if len(finite) < _MIN_RAYS:
+        return None
+    return Estimate.from_values(finite).power(0.5)._asdict()
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, float]]:
-    """Means of values (k,), or their roots, in parts of x of the same size."""
-    known = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
-    order = known[np.argsort(x[known], kind="stable")]
-    parts = np.array_split(order, min(_POINTS, len(order) // _FEW) or 1)
+    """Estimate a power of the mean of values (k,) in parts of x (k,) of the same size."""
+    finite = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
+    order = finite[np.argsort(x[finite], kind="stable")]
+    parts = np.array_split(order, min(_CURVE_POINTS, len(order) // _MIN_RAYS) or 1)
     return [
-        {"x": float(np.median(x[part]))} | Estimate.mean(values[part]).power(power)._asdict()
+        {"x": float(np.median(x[part]))} | Estimate.from_values(values[part]).power(power)._asdict()
         for part in parts
-        if len(part) >= _FEW
+        if len(part) >= _MIN_RAYS
     ]
 
 
-def _drawn(figures: Mapping[str, Any]) -> Page:
+def _draw_charts(figures: Mapping[str, Any]) -> Page:
     """Draw the curves and rings, with their intervals."""
-    rows = figures["channels"]
+    channels = figures["channels"]
     curves = dict(figures["curves"])
     for name in ("noise_m", "bias_m", "uneven_deg"):
-        curves[name] = [{"x": one["elevation_deg"], **one[name]} for one in rows if one[name]]
-    shown = [name for name in _CHARTS if curves.get(name)]
-    tall = 140 + 500 * -(-len(shown) // 3)  # pixels
-    page = Page((1600, tall))
+        curves[name] = [
+            {"x": channel["elevation_deg"], **channel[name]}
+            for channel in channels
+            if channel[name]
+        ]
+    names = [name for name in _CHARTS if curves.get(name)]
+    height = 140 + 500 * -(-len(names) // 3)  # pixels
+    page = Page((1600, height))
     page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
-    for number, name in enumerate(shown):
-        (row, column), points, (x, y, unit) = divmod(number, 3), curves[name], _CHARTS[name]
-        at, *values = (np.array([one[key] for one in points]) for key in ("x", *Estimate._fields))
-        value, low, high = (unit * one for one in values)
-        axes = page.chart((0.075 + 0.32 * column, 1 - (530 + 500 * row) / tall, 0.235, 360 / tall))
-        axes.set(xlabel=x, ylabel=y)
-        if name.endswith("light") and at[0] > 0:
-            axes.set_xscale("log")
-            label_logarithms(axes.xaxis, at[-1] < 1000 * at[0])
-        if share := y.endswith("%"):
-            low, high = np.clip((low, high), 0, 100)
-        axes.vlines(at, low, high, color=theme.UNSEEN, lw=1.8 * page.unit)
-        axes.plot(at, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
-        if share:
-            axes.set_ylim(*np.clip(axes.get_ylim(), -1, 101))
+    for number, name in enumerate(names):
+        row, column = divmod(number, 3)
+        bottom = 1 - (530 + 500 * row) / height
+        axes = page.chart((0.075 + 0.32 * column, bottom, 0.235, 360 / height))
+        _draw_curve(page, axes, name, curves[name])
     return page
+
+
+def _draw_curve(page: Page, axes: Axes, name: str, points: Sequence[Mapping[str, float]]) -> None:
+    """Draw the points of a curve of `_CHARTS`, and their intervals."""
+    chart = _CHARTS[name]
+    x = np.array([point["x"] for point in points])
+    value, lower, upper = (
+        chart.factor * np.array([point[field] for point in points]) for field in Estimate._fields
+    )
+    axes.set(xlabel=chart.x_label, ylabel=chart.y_label)
+    if name.endswith("light") and x[0] > 0:
+        axes.set_xscale("log")
+        label_logarithms(axes.xaxis, x[-1] < 1000 * x[0])
+    is_share = chart.y_label.endswith("%")
+    if is_share:
+        lower, upper = np.clip((lower, upper), 0, 100)
+    axes.vlines(x, lower, upper, color=theme.UNSEEN, lw=1.8 * page.unit)
+    axes.plot(x, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
+    if is_share:
+        axes.set_ylim(*np.clip(axes.get_ylim(), -1, 101))

@@ -457,7 +457,7 @@ class LiveJob:
         """Show the written cloud, with its sweeps: the parts are gone."""
         view = self.view
         view.sweeps = self._job.sweeps
-        view.show(CloudFile(cloud, () if view.pictured is None else view.pictured.own))
+        view.show(CloudFile(cloud, () if view.pictured is None else view.pictured.extra_columns))
         self._ends += 1
 
     # -- the page's side -----------------------------------------------------------------

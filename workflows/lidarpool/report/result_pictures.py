@@ -29,7 +29,7 @@ from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture,
 from lidarview.render import theme
 from lidarview.render.colouring import with_rgb
 from lidarview.render.picture_page import FONT, Page
-from lidarview.render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
+from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
 from lidarview.render.stage import make_axis, nice_step
 
@@ -110,29 +110,29 @@ def _picture_makers(
     @cache
     def shot() -> SurfaceView:
         # A moving sensor has a marker at half time, and a line for its trajectory.
-        places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        places = [w.position_at(middle)[None] if w.moves else w.positions for w in shown.sensors]
         scene = shown.scene
         return take_shot(
             scene.solid(middle),
             np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
             paths=[way.positions for way in shown.sensors if way.moves],
-            around=moving_positions(shown.sensors, scene.actors, shown.duration_ns),
+            trajectories=moving_positions(shown.sensors, scene.actors, shown.duration_ns),
             actors=len(scene.actors),
-            when=shown.when,
+            caption=shown.caption,
             models=shown.models,
             size=size,
         )
 
     @cache
     def points() -> Cloud:
-        return CloudFile(cloud, shown.own).choose(MOST_POINTS)
+        return CloudFile(cloud, shown.extra_columns).choose(MAX_POINTS)
 
     def draw_counts() -> Page:
         places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
         return draw_hits(shot(), shown.hit_counts, places, shown.sample_rays)
 
     def draw_points() -> Page:
-        file = CloudFile(cloud, shown.own)
+        file = CloudFile(cloud, shown.extra_columns)
         known = with_rgb({name: c for c in (Z, *file.table) for name in (c.name, c.in_files)})
         if colour not in known:
             there = list(dict.fromkeys(c.name for c in known.values()))
@@ -286,22 +286,26 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
     stations, places = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     width = shot.camera.size[0]
-    kinds = np.full(shot.whole.triangle.size, HIDDEN)
-    surface = np.flatnonzero(shot.whole.triangle >= 0)
-    covered = _seen(sight, stations, shot.whole, surface)
+    kinds = np.full(shot.pixel_samples.triangle.size, HIDDEN)
+    surface = np.flatnonzero(shot.pixel_samples.triangle >= 0)
+    covered = _seen(sight, stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
     # Of each triangle one pixel in a block is asked: to ask all would take minutes.
     left = surface[~covered]
     block = left // width // _BLOCK * width + left % width // _BLOCK
-    key = block * np.int64(len(shot.scene.faces)) + shot.whole.triangle[left]
+    key = block * np.int64(len(shot.scene.faces)) + shot.pixel_samples.triangle[left]
     _, asked, alike = np.unique(key, return_index=True, return_inverse=True)
-    visible = _seen(sight, places, shot.whole, left[asked])
+    visible = _seen(sight, places, shot.pixel_samples, left[asked])
     kinds[left[visible[alike]]] = UNCOVERED
-    edges = shot.finer.triangle.size // max(len(shot.edges), 1)
+    edges = shot.edge_samples.triangle.size // max(len(shot.edges), 1)
     finer = np.repeat(np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges]), edges)
-    some = np.flatnonzero(shot.finer.triangle >= 0)
-    finer[some[_seen(sight, stations, shot.finer, some)]] = COVERED
-    return replace(shot, whole=_painted(shot.whole, kinds), finer=_painted(shot.finer, finer))
+    some = np.flatnonzero(shot.edge_samples.triangle >= 0)
+    finer[some[_seen(sight, stations, shot.edge_samples, some)]] = COVERED
+    return replace(
+        shot,
+        pixel_samples=_painted(shot.pixel_samples, kinds),
+        edge_samples=_painted(shot.edge_samples, finer),
+    )
 
 
 def _painted(samples: Samples, kinds: Ints) -> Samples:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import Normalize
 
+from lidarsim.base.arrays import Floats
 from lidarsim.sensor import LineSensor, Sensor
 
 from .picture_page import Page
@@ -14,43 +16,67 @@ from .shot import SIZE
 from .theme import mapped
 
 COLOURS = "viridis"
-FIRINGS = 8  # shown, where each is many rays
+MAX_FIRINGS = 8  # of sensors of several channels
+
+
+class _BeamPlot(NamedTuple):
+    """Directions and times of rays, and the labels of the axes."""
+
+    x_values: Floats  # (n,)
+    y_values: Floats  # (n,)
+    labels: tuple[str, str]
 
 
 def draw_beams(path: Path, sensor: Sensor) -> None:
     """Draw the directions of a sensor's first rays, coloured by time.
 
-    These are the rays of some firings; if a firing is one ray, those of a frame, or of two cycles
-    of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over time.
-    LidarError if the file, a .png, cannot be written.
+    The rays are those of some firings; for sensors of a single channel, those of a frame, or of two
+    cycles of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over
+    time. LidarError if the file, a .png, cannot be written.
     """
     page = Page(SIZE)
-    turn = round(getattr(sensor.head, "firings_per_turn", 1000))
-    down = isinstance(sensor, LineSensor)
-    many = sensor.channels > 1
-    firings = np.arange(FIRINGS if many else 2 * turn if down else turn)
+    firings_per_revolution = round(getattr(sensor.head, "firings_per_turn", 1000))
+    looks_down = isinstance(sensor, LineSensor)
+    has_channels = sensor.channels > 1
+    if has_channels:
+        count = MAX_FIRINGS
+        words = f"{MAX_FIRINGS} firings"
+    elif looks_down:
+        count = 2 * firings_per_revolution
+        words = "two cycles"
+    else:
+        count = firings_per_revolution
+        words = "one frame"
+    firings = np.arange(count)
     times = sensor.times_ns(firings).reshape(-1) / 1e3
     unit = "µs"
     if times.max() > 9999:
         times = times / 1e3
         unit = "ms"
-    x, y, z = sensor.directions(firings).reshape(-1, 3).T
-    if down:
-        across = times
-        up = np.degrees(np.arctan2(y, -z))
-        labels = f"time, {unit}", "angle, degrees"
-    else:
-        middle = np.degrees(np.arctan2(y[0], x[0]))  # no jump where azimuths pass 180 degrees
-        azimuth = np.degrees(np.arctan2(y, x))
-        across = (azimuth - middle + 180) % 360 - 180 + middle
-        up = np.degrees(np.arcsin(z))
-        labels = "azimuth, degrees", "elevation, degrees"
-    shape = "auto" if many or down else "equal"
-    axes = page.chart((0.075, 0.12, 0.75, 0.73), aspect=shape, xlabel=labels[0], ylabel=labels[1])
+    directions = sensor.directions(firings).reshape(-1, 3)
+    plot = _plot_angle(directions, times, unit) if looks_down else _plot_directions(directions)
+    axes = page.chart((0.075, 0.12, 0.75, 0.73), xlabel=plot.labels[0], ylabel=plot.labels[1])
+    if not (has_channels or looks_down):
+        axes.set_aspect("equal")
     norm = Normalize(0, max(float(times.max()), 1e-3))
-    size = (10 if many else 2) * page.unit**2
-    axes.scatter(across, up, s=size, c=mapped(COLOURS, norm(times)), linewidths=0)
+    size = (10 if has_channels else 2) * page.unit**2
+    axes.scatter(plot.x_values, plot.y_values, s=size, c=mapped(COLOURS, norm(times)), linewidths=0)
     page.colour_bar(mapped(COLOURS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
-    shown = f"{FIRINGS} firings" if many else "two cycles" if down else "one frame"
-    page.title(sensor.name, f"{sensor.channels:,} channel{'s' * many} · {shown}")
+    page.title(sensor.name, f"{sensor.channels:,} channel{'s' * has_channels} · {words}")
     page.save(path)
+
+
+def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
+    """Plot the angle of directions (n, 3) in a vertical plane over times (n,)."""
+    _, y, z = directions.T
+    return _BeamPlot(times, np.degrees(np.arctan2(y, -z)), (f"time, {unit}", "angle, degrees"))
+
+
+def _plot_directions(directions: Floats) -> _BeamPlot:
+    """Plot the azimuths and elevations of directions (n, 3)."""
+    x, y, z = directions.T
+    middle = np.degrees(np.arctan2(y[0], x[0]))  # no jump where azimuths pass 180 degrees
+    azimuth = np.degrees(np.arctan2(y, x))
+    continuous = (azimuth - middle + 180) % 360 - 180 + middle
+    labels = ("azimuth, degrees", "elevation, degrees")
+    return _BeamPlot(continuous, np.degrees(np.arcsin(z)), labels)

@@ -31,7 +31,7 @@ class Camera:
         return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Pixel coordinates (n, 2) and distances from the eye (n,) of points (n, 3).
+        """Return pixel coordinates (n, 2) of points (n, 3), and distances (n,) from the eye.
 
         Points beside or behind the eye have NaN coordinates.
         """
@@ -42,14 +42,14 @@ class Camera:
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def look_up(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
-        """Values (n,) of an image at pixel coordinates (n, 2); `outside` beside it, or for NaN."""
-        place = np.asarray(pixels)
-        inside = np.all((place >= 0) & (place < np.array(self.size)), axis=1)
-        column, row = np.where(inside[:, None], place, 0).astype(np.int64).T
+        """Return values (n,) of an image at pixels (n, 2); `outside` beside the image."""
+        position = np.asarray(pixels)
+        inside = np.all((position >= 0) & (position < np.array(self.size)), axis=1)
+        column, row = np.where(inside[:, None], position, 0).astype(np.int64).T
         return np.where(inside, image[row, column], outside)
 
     def footprint(self, distance: ArrayLike) -> Floats:
-        """Width in metres that one pixel covers at a distance, seen face on."""
+        """Return the width in metres that a pixel covers at a distance, seen face on."""
         return np.asarray(distance, dtype=np.float64) / self.focal
 
 
@@ -60,25 +60,30 @@ def fit_camera(
     azimuth_deg: float,
     elevation_deg: float,
 ) -> Camera:
-    """Place a camera so that points (n, 3), not all in one place, fill a frame within its image.
+    """Place a camera so that points (n, 3) at two positions or more fill a frame within the image.
 
-    Seen from the points, the eye is in the given direction, at 7 times their radius, which keeps
-    uprights upright; focal length and image centre are then chosen so that the projected points
-    touch the frame: left, top, right and bottom as fractions of the image.
+    Seen from the points, the eye is in the direction of azimuth and elevation, at 7 times their
+    radius, which keeps uprights upright; focal length and image centre are then chosen so that the
+    projected points touch the frame: left, top, right and bottom as fractions of the image.
     """
     corners = np.asarray(points, dtype=np.float64)
-    low = corners.min(axis=0)
-    high = corners.max(axis=0)
-    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    back = ahead * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
-    right = np.array([-ahead[1], ahead[0], 0.0])
-    axes = np.stack([right, np.cross(back, right), -back])
-    eye = (low + high) / 2 + back * 7.0 * np.linalg.norm(high - low) / 2
+    lower = corners.min(axis=0)
+    upper = corners.max(axis=0)
+    axes = _camera_axes(*np.radians([azimuth_deg, elevation_deg]))
+    back = -axes[2]
+    eye = (lower + upper) / 2 + back * 7.0 * np.linalg.norm(upper - lower) / 2
     flat, _ = Camera(eye, axes, 1.0, np.zeros(2), size).project(corners)
-    least = flat.min(axis=0)
-    most = flat.max(axis=0)
+    flat_lower = flat.min(axis=0)
+    flat_upper = flat.max(axis=0)
     start, end = np.array(frame).reshape(2, 2)
     middle = (start + end) * size / 2
-    focal = float(((end - start) * size / (most - least)).min())
-    return Camera(eye, axes, focal, middle - focal * (least + most) / 2, size)
+    focal = float(((end - start) * size / (flat_upper - flat_lower)).min())
+    return Camera(eye, axes, focal, middle - focal * (flat_lower + flat_upper) / 2, size)
+
+
+def _camera_axes(azimuth: float, elevation: float) -> Floats:
+    """Return `Camera.axes` (3, 3) of a camera in a direction from the scene, radians."""
+    horizontal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    back = horizontal * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([-horizontal[1], horizontal[0], 0.0])
+    return np.stack([right, np.cross(back, right), -back])

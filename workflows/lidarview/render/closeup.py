@@ -1,4 +1,4 @@
-"""What part of a scene to show: around a trajectory, and under a roof."""
+"""Chooses the part of a scene to show: around a trajectory, and under a roof."""
 
 from __future__ import annotations
 
@@ -15,68 +15,80 @@ from raybeam import RayCaster
 from .surface import spiral
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
-# lowest point, and least metres.
-_SHARE = 0.35
-_HEIGHTS = 2.0
-_LEAST_M = 25.0
-_MOST = 0.5  # share of the scene's ground from which all of it is shown
+# lowest point, and a minimum in metres.
+_MARGIN_SHARE = 0.35
+_MARGIN_HEIGHTS = 2.0
+_MIN_MARGIN_M = 25.0
+_MAX_SHARE = 0.5  # share of the scene's ground from which all of it is shown
 
-_ROOFED = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
+_MIN_ROOF_SHARE = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
 _STEEP_DEG = 60.0
 _RAYS = 64
-_ROUGH = 0.5  # spread of what is above a sensor over its height there: more is a tree's crown
-_TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
-_PLACES = 8  # that are asked
+_MAX_SPREAD = 0.5  # spread of the heights above a sensor, over their median: more is a tree's crown
+_CONTACT = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
+_MAX_POSITIONS = 8  # of sensors, from which rays are cast
 
 
-def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
-    """Box (2, 3) around trajectories (k, 3), down to the ground; None if it is most of the scene.
+def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | None:
+    """Return a box (2, 3) around trajectories (k, 3), or None if the box is most of the scene.
+
+    The box reaches down to the ground.
 
     `bounds` (2, 3) are those of the scene; all in metres.
     """
-    if not ways:
+    if not trajectories:
         return None
-    places = np.concatenate(ways)
-    low = places.min(axis=0)
-    high = places.max(axis=0)
-    length = float(np.linalg.norm((high - low)[:2]))
-    room = max(_SHARE * length, _HEIGHTS * float(high[2] - bounds[0, 2]), _LEAST_M)
-    box = np.stack([low - room, high + room]).clip(*bounds)
+    positions = np.concatenate(trajectories)
+    lower = positions.min(axis=0)
+    upper = positions.max(axis=0)
+    length = float(np.linalg.norm((upper - lower)[:2]))
+    margin = max(
+        _MARGIN_SHARE * length, _MARGIN_HEIGHTS * float(upper[2] - bounds[0, 2]), _MIN_MARGIN_M
+    )
+    box = np.stack([lower - margin, upper + margin]).clip(*bounds)
     box[0, 2] = bounds[0, 2]
-    ground, whole = (float(np.prod((b[1] - b[0])[:2])) for b in (box, bounds))
-    return box if ground < _MOST * whole else None
+    box_area, scene_area = (float(np.prod((b[1] - b[0])[:2])) for b in (box, bounds))
+    return box if box_area < _MAX_SHARE * scene_area else None
 
 
 def floor_and_cut(
-    scene: Scene, caster: RayCaster, places: Floats
+    scene: Scene, caster: RayCaster, positions: Floats
 ) -> tuple[float | None, float | None]:
-    """Height of the floor under places (p, 3); and where to cut the scene open, metres.
+    """Return the heights of the floor under positions (p, 3) and of the cut that opens the scene.
 
-    That is halfway up to the roof, None under the sky. There is no floor over an abyss.
+    Both in metres. The cut is halfway up to the roof, None under the sky; the floor is None over an
+    abyss.
     """
-    some = places[np.linspace(0, len(places) - 1, min(len(places), _PLACES)).astype(int)]
-    floor = some[:, 2] - caster.cast(some, np.tile([0.0, 0.0, -1.0], (len(some), 1))).distance
+    sampled = positions[
+        np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POSITIONS)).astype(int)
+    ]
+    floor = (
+        sampled[:, 2] - caster.cast(sampled, np.tile([0.0, 0.0, -1.0], (len(sampled), 1))).distance
+    )
     rays = spiral(_RAYS, np.sin(np.radians(_STEEP_DEG)))
-    near = _TOUCHES * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
-    found = caster.cast(np.repeat(some, _RAYS, axis=0), np.tile(rays, (len(some), 1)), t_min=near)
-    above = found.distance.reshape(-1, _RAYS) * rays[:, 2]
-    met = np.isfinite(above)
-    cut = None
+    start_m = _CONTACT * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+    hits = caster.cast(
+        np.repeat(sampled, _RAYS, axis=0), np.tile(rays, (len(sampled), 1)), t_min=start_m
+    )
+    clearance = hits.distance.reshape(-1, _RAYS) * rays[:, 2]
+    is_hit = np.isfinite(clearance)
+    cut_height = None
     if (
-        met.mean() >= _ROOFED
-        and np.median([_rough(a[m]) for a, m in zip(above, met, strict=True)]) <= _ROUGH
+        is_hit.mean() >= _MIN_ROOF_SHARE
+        and np.median([_relative_spread(a[m]) for a, m in zip(clearance, is_hit, strict=True)])
+        <= _MAX_SPREAD
     ):
-        heights = some[:, 2, None] + above
-        cut = float(places[:, 2].max() + np.median(heights[met])) / 2
-    return (float(floor.min()) if np.isfinite(floor).all() else None), cut
+        heights = sampled[:, 2, None] + clearance
+        cut_height = float(positions[:, 2].max() + np.median(heights[is_hit])) / 2
+    return (float(floor.min()) if np.isfinite(floor).all() else None), cut_height
 
 
-def _rough(heights: Floats) -> float:
-    """Spread of the middle half of heights (n,), in their median; of none it is 0."""
+def _relative_spread(heights: Floats) -> float:
+    """Return the spread of the middle half of heights (n,), over the median; 0 without heights."""
     if not len(heights):
         return 0.0
-    low, middle, high = np.percentile(heights, [25, 50, 75])
-    return float((high - low) / middle)
+    lower, middle, upper = np.percentile(heights, [25, 50, 75])
+    return float((upper - lower) / middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,75 +96,91 @@ class ShownPart:
     """A part of a scene."""
 
     scene: Scene
-    parents: Ints  # (f,) the whole scene's triangle of each triangle
-    shares: Floats  # (f,) its share of that triangle's area
+    parents: Ints  # (f,): the triangle of the uncut scene that each triangle is cut from
+    shares: Floats  # (f,): share of the parent's area
 
     @classmethod
-    def whole(cls, scene: Scene) -> ShownPart:
-        """All of a scene."""
+    def from_scene(cls, scene: Scene) -> ShownPart:
+        """Return the part that is the uncut scene."""
         return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
 
     def cut(self, box: Floats) -> ShownPart:
-        """Cut a box (2, 3) out; all if there is nothing in it.
+        """Return the part inside a box (2, 3), or this part if the box is empty.
 
-        Objects narrower than the box are included if their middle is inside; wider ones, such as
+        Objects narrower than the box are included if their middle is inside; wider objects, such as
         the ground, are cut at its sides. All are cut at its top, because towers would hide the
-        trajectory. Objects keep their numbers, also if nothing of them is left.
+        trajectory. Objects keep their numbers, also if no triangle is left.
         """
         scene = self.scene
         boxes = scene.object_bounds[:, :, :2]
         middle = boxes.mean(axis=1)
         narrow = ((boxes[:, 1] - boxes[:, 0]) <= (box[1] - box[0])[:2]).all(axis=1)
         inside = ((middle >= box[0, :2]) & (middle <= box[1, :2])).all(axis=1)
-        whole = np.flatnonzero((narrow & inside)[scene.face_object])
+        uncut_faces = np.flatnonzero((narrow & inside)[scene.face_object])
         vertices = scene.vertices
-        own = np.flatnonzero(~narrow[scene.face_object])
-        faces = scene.faces[own].astype(np.int64)
+        parents = np.flatnonzero(~narrow[scene.face_object])
+        faces = scene.faces[parents].astype(np.int64)
         for axis in (0, 1):
             for sign, limit in ((1.0, box[1, axis]), (-1.0, box[0, axis])):
-                vertices, faces, own = _clipped(vertices, faces, own, axis, sign, limit)
-        faces = np.concatenate([scene.faces[whole], faces])
-        own = np.append(whole, own)
-        vertices, faces, own = _clipped(vertices, faces, own, 2, 1.0, box[1, 2])
+                vertices, faces, parents = _clip_triangles(
+                    vertices, faces, parents, axis, sign, limit
+                )
+        faces = np.concatenate([scene.faces[uncut_faces], faces])
+        parents = np.append(uncut_faces, parents)
+        vertices, faces, parents = _clip_triangles(vertices, faces, parents, 2, 1.0, box[1, 2])
         if not len(faces):
             return self
-        owners = scene.face_object[own]
-        colours = scene.colours and scene.colours.take(own)
+        face_object = scene.face_object[parents]
+        colours = scene.colours and scene.colours.take(parents)
         part = Scene(
-            vertices, faces.astype(np.int32), owners, scene.names, scene.origin, colours=colours
+            vertices,
+            faces.astype(np.int32),
+            face_object,
+            scene.names,
+            scene.origin,
+            colours=colours,
         )
-        was = triangle_areas(scene.vertices[scene.faces[own]])
+        full_areas = triangle_areas(scene.vertices[scene.faces[parents]])
         areas = triangle_areas(vertices[faces])
-        shares = np.divide(areas, was, out=np.ones(len(was)), where=was > 0)
-        return ShownPart(part, self.parents[own], self.shares[own] * shares)
+        shares = np.divide(areas, full_areas, out=np.ones(len(full_areas)), where=full_areas > 0)
+        return ShownPart(part, self.parents[parents], self.shares[parents] * shares)
 
 
-def _clipped(
+def _clip_triangles(
     vertices: Floats, faces: Ints, parents: Ints, axis: int, sign: float, limit: float
 ) -> tuple[Floats, Ints, Ints]:
-    """Keep what of triangles lies where ``sign * (coordinate - limit) <= 0``.
+    """Clip triangles to the half-space ``sign * (coordinate - limit) <= 0``.
 
-    A triangle with one corner there becomes a smaller one, one with two becomes two.
+    A triangle with one corner inside becomes a smaller triangle, with two corners two triangles.
+    Returns vertices (v, 3), faces (f, 3), and the parent (f,) of each face.
     """
     beyond = sign * (vertices[:, axis] - limit)
-    out = beyond[faces] > 0  # (f, 3)
-    count = out.sum(axis=1)
-    kept = [faces[count == 0]]
-    origins = [parents[count == 0]]
-    for number in (1, 2):  # corners that are beyond
-        rows = np.flatnonzero(count == number)
-        # The corner that is alone comes first.
-        first = np.argmax(out[rows] == (number == 1), axis=1)
+    outside = beyond[faces] > 0  # (f, 3)
+    count = outside.sum(axis=1)
+    clipped = [faces[count == 0]]
+    piece_parents = [parents[count == 0]]
+    for corners_outside in (1, 2):
+        rows = np.flatnonzero(count == corners_outside)
+        # The corner without another on its side comes first.
+        first = np.argmax(outside[rows] == (corners_outside == 1), axis=1)
         a, b, c = (faces[rows, (first + k) % 3] for k in range(3))
-        ends = []
-        for other in (b, c):
-            share = beyond[a] / (beyond[a] - beyond[other])
-            ends.append(len(vertices) + np.arange(len(rows)))
-            new = vertices[a] + share[:, None] * (vertices[other] - vertices[a])
-            vertices = np.concatenate([vertices, new])
-            beyond = np.append(beyond, np.zeros(len(rows)))
-        ab, ac = ends
-        pieces = [(a, ab, ac)] if number == 2 else [(ab, b, c), (ab, c, ac)]
-        kept += [np.stack(piece, axis=1) for piece in pieces]
-        origins += [parents[rows]] * len(pieces)
-    return vertices, np.concatenate(kept), np.concatenate(origins)
+        ab = len(vertices) + np.arange(len(rows))
+        ac = ab + len(rows)
+        crossings = [_crossing(vertices, beyond, a, corner) for corner in (b, c)]
+        vertices = np.concatenate([vertices, *crossings])
+        beyond = np.append(beyond, np.zeros(2 * len(rows)))
+        pieces = [(ab, b, c), (ab, c, ac)]
+        if corners_outside == 2:
+            pieces = [(a, ab, ac)]
+        clipped += [np.stack(piece, axis=1) for piece in pieces]
+        piece_parents += [parents[rows]] * len(pieces)
+    return vertices, np.concatenate(clipped), np.concatenate(piece_parents)
+
+
+def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floats:
+    """Return the points (n, 3) where edges between vertices cross a plane.
+
+    `beyond` (v,) are the distances of all vertices from the plane.
+    """
+    share = beyond[start] / (beyond[start] - beyond[stop])
+    return vertices[start] + share[:, None] * (vertices[stop] - vertices[start])

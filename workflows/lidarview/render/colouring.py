@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.columns.table import COLOURS, NO_SURFACE, OBJECT, Column
 from lidarsim.scene.colours import packed, unpacked
 
@@ -15,23 +16,23 @@ from .theme import mapped, object_colours
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
 DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle is pale
-MOST_ENTRIES = 12  # most labels without names that have a colour each
-MOST_COLOURS = 1 << 16  # of labels
+MAX_UNNAMED_LABELS = 12  # labels without names that have a colour each
+MAX_COLOURS = 1 << 16  # of labels
 
 RGB = Column("rgb", "uint32", "", "colours of the surfaces")  # see `values_of`
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 # The scale is logarithmic if numbers differ by the first factor and the median is this low in their
 # range, or if numbers without a unit, such as intensities, differ by the second factor.
-_WIDE = 10.0
-_SKEWED = 0.1
-_MANIFOLD = 30.0
-_TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
+_SKEWED_RATIO = 10.0
+_SKEWED_MEDIAN = 0.1
+_WIDE_RATIO = 30.0
+_TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
 @dataclass(frozen=True, eq=False)
 class Colouring:
-    """How points are coloured, and a legend: a scale between two limits, or labels."""
+    """Colours of points, and a legend: a scale between two limits, or labels."""
 
     # Returns colours (n, 3) in 0 to 1 of values (n,).
     paint: Callable[[AnyArray], Floats]
@@ -40,97 +41,137 @@ class Colouring:
     meaning: str
     limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
-    # Name and colour of existing labels, those with most points first if there are many.
+    # Name and colour of existing labels, in order of their points if there are many.
     labels: tuple[tuple[str, Floats], ...] = ()
-    values: tuple[int, ...] = ()  # of the column, that the labels stand for
+    values: tuple[int, ...] = ()  # of the column, one for each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
 
 
 def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
     """Add `RGB` to columns that have red, green and blue, for points in their own colours."""
-    made = {*COLOURS} <= {*columns} and RGB.name not in columns
-    return {**columns, **({RGB.name: RGB} if made else {})}
+    has_colours = {*COLOURS} <= {*columns} and RGB.name not in columns
+    return {**columns, **({RGB.name: RGB} if has_colours else {})}
 
 
 def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
-    """Values of a column, by a function that reads those of a name; of `RGB` packed colours."""
+    """Return the values of a column, or packed colours for `RGB`; `read` returns a named column."""
     if column is RGB:
         return packed(np.stack([read(name) for name in COLOURS], axis=1))
     return read(column.name)
 
 
 def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
-    """Word for a value of a label; `names` are those of the values 0, 1, 2, …."""
+    """Return the word for a label; `names` are the words for the values 0, 1, 2, …."""
     if 0 <= value < len(names) and names[value]:
         return names[value]
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
 def colours_of(values: AnyArray, column: Column, names: Sequence[str] = ()) -> Colouring:
-    """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
+    """Choose colours for the values (n,) of a column.
 
-    Labels have a colour each; labels without names and with too many values for a legend are on a
-    scale like numbers. Numbers that are mostly small with a few large ones, and intensities of a
-    wide range, have a logarithmic scale. Velocities are blue below 0 and red above. NaN is grey,
-    and so is what is no surface.
+    `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
+    without names and with too many values for a legend are on a scale like numbers. Numbers that
+    are mostly small with a few large numbers, and intensities of a wide range, have a logarithmic
+    scale. Velocities are blue below 0 and red above. NaN is grey, and so are points on no surface.
     """
     if column is RGB:
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
-    spread = _SPREAD
+    spread: tuple[float, float] = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
         values = values.astype(np.int64)
-        found, counts = np.unique(values, return_counts=True)
-        if names or len(found) <= MOST_ENTRIES:
-            count = max(len(names), int(found.max(initial=0)) + 1)
-            palette = object_colours(min(count, MOST_COLOURS))
-            if len(found) > MOST_ENTRIES:
-                found = found[np.argsort(-counts, kind="stable")]
-            palette, none = np.vstack([palette, [_GREY] * 3]), len(palette)
-
-            def label(values: AnyArray) -> Floats:
-                numbers = values.astype(np.int64)
-                surface = (numbers >= 0) | (column.name != OBJECT.name)
-                return np.asarray(palette[np.where(surface, numbers % none, none)])
-
-            words = [word_of(value, column, names) for value in found.tolist()]
-            labels = tuple(zip(words, label(found), strict=True))
-
-            kept = tuple(found.tolist())
-            return Colouring(label, column.name, "", column.meaning, labels=labels, values=kept)
+        labels, counts = np.unique(values, return_counts=True)
+        if names or len(labels) <= MAX_UNNAMED_LABELS:
+            if len(labels) > MAX_UNNAMED_LABELS:
+                labels = labels[np.argsort(-counts, kind="stable")]
+            return _label_colouring(labels, column, names)
         spread = (0, 100)
-    known = np.isfinite(values)
-    unit = column.unit
-    size = 1.0
+    return _number_colouring(values, column, spread)
+
+
+def _label_colouring(labels: Ints, column: Column, names: Sequence[str]) -> Colouring:
+    """Return a colour for each label (k,), in the order of the legend."""
+    count = max(len(names), int(labels.max(initial=0)) + 1)
+    colours = object_colours(min(count, MAX_COLOURS))
+    grey = len(colours)
+    palette = np.vstack([colours, [_GREY] * 3])
+
+    def paint(values: AnyArray) -> Floats:
+        numbers = values.astype(np.int64)
+        is_surface = (numbers >= 0) | (column.name != OBJECT.name)
+        return np.asarray(palette[np.where(is_surface, numbers % grey, grey)])
+
+    values = tuple(labels.tolist())
+    words = [word_of(value, column, names) for value in values]
+    entries = tuple(zip(words, paint(labels), strict=True))
+    return Colouring(paint, column.name, "", column.meaning, labels=entries, values=values)
+
+
+class _Range(NamedTuple):
+    """Range of numbers on a scale."""
+
+    lower: float
+    middle: float  # median
+    upper: float
+
+    def is_logarithmic(self, unit: str) -> bool:
+        """Return True if numbers of a unit, "" for none, need a logarithmic scale."""
+        is_low = self.middle - self.lower < _SKEWED_MEDIAN * (self.upper - self.lower)
+        is_skewed = self.upper > _SKEWED_RATIO * self.lower and is_low
+        is_wide = not unit and self.upper > _WIDE_RATIO * self.lower
+        return bool(self.lower > 0 and (is_skewed or is_wide))
+
+
+def _number_colouring(
+    values: AnyArray, column: Column, percentiles: tuple[float, float]
+) -> Colouring:
+    """Return a scale for values (n,) between two percentiles."""
+    finite = np.isfinite(values)
+    lower = 0.0
     middle = 0.5
-    low = 0.0
-    high = 1.0
-    if known.any():
-        numbers = values[known].astype(np.float64)
-        low, middle, high = np.percentile(numbers, [spread[0], 50, spread[1]])
+    upper = 1.0
+    if finite.any():
+        numbers = values[finite].astype(np.float64)
+        lower, middle, upper = np.percentile(numbers, [percentiles[0], 50, percentiles[1]])
+    unit = column.unit
+    divisor = 1.0
     if unit == "ns":
-        span = high - low
-        unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
-        low = low / size
-        middle = middle / size
-        high = high / size
+        span = upper - lower
+        unit, divisor = next(
+            (entry for entry in _TIME_UNITS if span >= 0.1 * entry[1]), ("ns", 1.0)
+        )
+    limits = _Range(lower / divisor, middle / divisor, upper / divisor)
     scale = TURBO
     if unit == "m/s" and values.dtype.kind == "f":
-        high = max(-low, high)
-        low = -high
+        max_speed = max(-limits.lower, limits.upper)
+        limits = _Range(-max_speed, limits.middle, max_speed)
         scale = DIVERGING
-    skewed = high > _WIDE * low and middle - low < _SKEWED * (high - low)
-    logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
-    ends = np.log([low, high]) if logarithmic else (low, high)
+    logarithmic = limits.is_logarithmic(unit)
+    paint = _scale_painter(limits, divisor, logarithmic, scale)
+    range_limits = float(limits.lower), float(limits.upper)
+    return Colouring(
+        paint, column.name, unit, column.meaning, range_limits, logarithmic, scale=scale
+    )
 
-    def shade(values: AnyArray) -> Floats:
-        known = np.isfinite(values)
-        numbers = values.astype(np.float64) / size
+
+def _scale_painter(
+    limits: _Range, divisor: float, logarithmic: bool, scale: Floats
+) -> Callable[[AnyArray], Floats]:
+    """Return the function from values (n,) to colours (n, 3) of a scale (256, 3).
+
+    `limits` are those of values over the divisor.
+    """
+    lower, _, upper = limits
+    start, stop = np.log([lower, upper]) if logarithmic else (lower, upper)
+
+    def paint(values: AnyArray) -> Floats:
+        finite = np.isfinite(values)
+        numbers = values.astype(np.float64) / divisor
         if logarithmic:
-            numbers = np.log(np.clip(numbers, low, high))
-        scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
-        colours = scale[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
-        colours[~known] = _GREY
+            numbers = np.log(np.clip(numbers, lower, upper))
+        scaled = (numbers - start) * (255 / (stop - start if upper > lower else 1.0))
+        colours = scale[np.clip(np.where(finite, scaled, 0), 0, 255).astype(np.uint8)]
+        colours[~finite] = _GREY
         return colours
 
-    limits = float(low), float(high)
-    return Colouring(shade, column.name, unit, column.meaning, limits, logarithmic, scale=scale)
+    return paint

@@ -10,7 +10,7 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 
 from .surface import Surface, dot, spiral
 
-MOST_SENSORS = 8  # sensors that are tested for what they see
+MAX_SENSORS = 8  # sensors whose surroundings are tested
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall
 ENCLOSED = 0.7  # share of horizontal rays from indoor sensors that hit the scene
 HIDDEN = 0.65  # the camera sees less than this share of what the sensors see
@@ -29,11 +29,11 @@ class Cutaway:
     surface: Surface
     sensors: Floats  # (p, 3) metres
     eye: Floats  # (3,) the camera
-    surrounds: Bools  # (objects,) whether the sensors are within it, seen from above
+    surrounds: Bools  # (objects,) whether the sensors are within the object, seen from above
     core: Floats  # (objects, 2, 3) box inside each object's shell
 
     @classmethod
-    def around(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:
+    def from_sensors(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:
         """Find the surfaces that hide sensors at (p, 3) from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
@@ -50,45 +50,45 @@ class Cutaway:
         return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
     def removes(self, points: Floats, triangle: Ints) -> Bools:
-        """Whether hits at points (n, 3) on triangles (n,) are removed."""
+        """Mark hits (n,) at points (n, 3) on triangles (n,) that are removed."""
         owner = self.surface.scene.face_object[triangle]
-        low = self.core[owner, 0]
-        high = self.core[owner, 1]
-        beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
-        out: Bools = self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > high[:, 2]))
-        which = np.flatnonzero(out)
-        normal = self.surface.face_normals[triangle[which]]
-        height = dot(normal, points[which])
+        lower = self.core[owner, 0]
+        upper = self.core[owner, 1]
+        beside = (points[:, :2] < lower[:, :2]) | (points[:, :2] > upper[:, :2])
+        removed: Bools = self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > upper[:, 2]))
+        indices = np.flatnonzero(removed)
+        normal = self.surface.face_normals[triangle[indices]]
+        height = dot(normal, points[indices])
         eye_above = normal @ self.eye > height
         sensor_above = normal @ self.sensors.T > height[:, None]
-        out[which] = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
-        return out
+        removed[indices] = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
+        return removed
 
 
 def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Decide whether to remove surfaces to show what the sensors at poses (p, 3) see.
+    """Return a cutaway that shows the surroundings of sensors at poses (p, 3) to a camera.
 
-    None if the sensors are outdoors, or the camera sees most of it anyway.
+    None if the sensors are outdoors, or the camera sees most of their surroundings anyway.
     """
     if not len(poses):
         return None
-    sensors = poses[np.linspace(0, len(poses) - 1, min(len(poses), MOST_SENSORS)).astype(int)]
+    sensors = poses[np.linspace(0, len(poses) - 1, min(len(poses), MAX_SENSORS)).astype(int)]
     level = surface.caster.cast(*_probes(sensors, 128, 0.0, 15.0)).distance
     if np.isfinite(level).mean() < ENCLOSED:
         return None
     origins, directions = _probes(sensors, 512, -60.0, 30.0)
-    seen = surface.caster.cast(origins, directions).distance
-    hit = np.isfinite(seen)
-    offset = origins[hit] + seen[hit, None] * directions[hit] - eye
+    distances = surface.caster.cast(origins, directions).distance
+    hit = np.isfinite(distances)
+    offset = origins[hit] + distances[hit, None] * directions[hit] - eye
     distance = np.linalg.norm(offset, axis=1)
     nearest = surface.caster.cast(eye, offset / distance[:, None]).distance
     if (nearest >= distance * (1 - 1e-3)).mean() >= HIDDEN:
         return None
-    return Cutaway.around(surface, sensors, eye)
+    return Cutaway.from_sensors(surface, sensors, eye)
 
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Origins and directions (p * count, 3) of `count` rays from each, between two elevations."""
+    """Return origins and directions (p * count, 3) of rays from sensors, between two elevations."""
     rays = spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 
@@ -96,7 +96,7 @@ def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tup
 def cast_through(
     surface: Surface, cutaway: Cutaway | None, eye: Floats, directions: Floats
 ) -> tuple[Floats, Ints, Floats, Floats]:
-    """Closest hits on surfaces that are not removed.
+    """Cast rays from the eye to the closest surfaces that are not removed.
 
     Returns
     -------
@@ -117,11 +117,11 @@ def cast_through(
         if not len(live):
             break
         start = distance[live] * (1 + 1e-6)
-        again = surface.caster.cast(eye + start[:, None] * directions[live], directions[live])
-        distance[live] = start + again.distance
-        triangle[live] = again.triangle
-        u[live] = again.u
-        v[live] = again.v
+        next_hits = surface.caster.cast(eye + start[:, None] * directions[live], directions[live])
+        distance[live] = start + next_hits.distance
+        triangle[live] = next_hits.triangle
+        u[live] = next_hits.u
+        v[live] = next_hits.v
         live = live[triangle[live] >= 0]
     return distance, triangle, u, v
 
@@ -129,11 +129,13 @@ def cast_through(
 def blocked(
     surface: Surface, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Whether rays (n, 3) hit a surface within `reach` metres that is not removed."""
+    """Mark rays (n, 3) that hit a surface within `reach` metres that is not removed."""
     hits = surface.caster.cast(origins, directions, t_max=reach)
-    met = np.asarray(hits.triangle >= 0)
+    is_hit = np.asarray(hits.triangle >= 0)
     if cutaway is not None:
-        which = np.flatnonzero(met)
-        points = origins[which] + hits.distance[which, None] * directions[which]
-        met[which] = ~cutaway.removes(points, np.asarray(hits.triangle[which], dtype=np.int64))
-    return met
+        indices = np.flatnonzero(is_hit)
+        points = origins[indices] + hits.distance[indices, None] * directions[indices]
+        is_hit[indices] = ~cutaway.removes(
+            points, np.asarray(hits.triangle[indices], dtype=np.int64)
+        )
+    return is_hit

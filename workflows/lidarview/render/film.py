@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lidarsim.base.arrays import AnyFloats, Bytes, Floats
+from lidarsim.base.arrays import AnyFloats, Bools, Bytes, Floats
 from lidarsim.scene.actors import Actor
 from raybeam import RayCaster
 
@@ -19,138 +20,212 @@ from .theme import rgb
 
 SIZE = (960, 540)  # pixels
 BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "#eac9a0"))
-# the way; Pillow draws no endless lines
+# the carrier's trajectory; Pillow draws no endless lines
 _RED = "#ff4d5e"
 _WHITE = "#ffffff"
-_FAR_OUT = 4000
+_MAX_PIXEL = 4000
 _FOCAL = 922.0  # pixels: 55 degrees across
-# times the range: the camera, and what it looks at
+# distances of the camera from the carrier, and of its target ahead, times the range
 _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
-_HEADING = 0.12  # of the film, before and after, tells where the carrier is heading
-# of a camera that circles: times the size, and up for a metre away
-_AWAY = 1.25
-_SLOPE = 0.62
-# times the focus: nearer surfaces are left out, farther ones vanish
-_NEAR = 0.3
-_HAZE = 6.0
-# brightness of old points; frames in which new ones come near it
-_OLD = 0.42
-_FADES = 3.0
-_DOT = 2.3  # half pixels: the radius of points
+_HEADING_SHARE = 0.12  # of the film, before and after, over which the heading is measured
+# of a camera that circles: its distance, times the size, and its rise for a metre of distance
+_CIRCLE_RADIUS = 1.25
+_CIRCLE_SLOPE = 0.62
+# times the focus: closer surfaces are left out; more distant ones fade
+_MIN_FOCUS = 0.3
+_HAZE_FOCUS = 6.0
+# brightness of old points; frames in which new points fade to it
+_OLD_BRIGHTNESS = 0.42
+_FADE_FRAMES = 3.0
+_POINT_RADIUS = 2.3  # half pixels
 _NOISE = 0.02  # of the distance, that a point may lie beside its surface
 
-_Shape = tuple[RayCaster, Floats, Floats]  # of triangles: their normals (f, 3) and colour (4,)
+
+class _Shape(NamedTuple):
+    """Triangles in a single colour."""
+
+    caster: RayCaster
+    normals: Floats  # (f, 3)
+    colour: Floats  # (4,)
+
+
+class _Sights(NamedTuple):
+    """Where the camera is and looks in each frame, metres."""
+
+    eyes: Floats  # (k, 3)
+    targets: Floats  # (k, 3)
+    carrier: Floats  # (k, 3), or (0, 3) without a carrier
+    focus: float  # distance from the eye to what the film shows
+
+    def camera(self, number: int) -> Camera:
+        """Return the camera of a frame."""
+        ahead = unit((self.targets - self.eyes)[number, None])
+        right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+        axes = np.concatenate([right, np.cross(right, ahead), ahead])
+        return Camera(self.eyes[number], axes, _FOCAL, np.array(SIZE) / 2, SIZE)
+
+
+@dataclass(eq=False)
+class _FilmPoints:
+    """Points that a frame shows, of the frame and of earlier frames."""
+
+    positions: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    colours: Floats = field(default_factory=lambda: np.empty((0, 4)))
+    first_frame: Floats = field(default_factory=lambda: np.empty(0))
+
+    def add(self, number: int, positions: Floats, colours: Floats) -> None:
+        """Add the points of a frame."""
+        self.positions = np.vstack([self.positions, positions])
+        self.colours = np.vstack([self.colours, colours])
+        new = np.full(len(self.positions) - len(self.first_frame), number)
+        self.first_frame = np.append(self.first_frame, new)
+
+    def select(self, chosen: Bools) -> None:
+        """Keep chosen points (n,) only."""
+        self.positions = self.positions[chosen]
+        self.colours = self.colours[chosen]
+        self.first_frame = self.first_frame[chosen]
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """What a film shows; local coordinates in metres, times since the survey's start."""
+    """Content of a film; local coordinates in metres, times since the survey's start."""
 
     moments_ns: Floats  # (k,) of the frames
-    parts: Iterable[tuple[Floats, Floats]]  # points (n, 3) each adds, colours (n, 4) in 0 to 1
-    kept: float  # share of the points that later frames show, too
-    still: AnyFloats  # (f, 3, 3): triangles of the scene
+    parts: Iterable[tuple[Floats, Floats]]  # per frame: new points (n, 3), colours (n, 4) in 0 to 1
+    keep_share: float  # share of the points that later frames show, too
+    scene_triangles: AnyFloats  # (f, 3, 3): triangles of the scene
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
     box: Floats  # (2, 3), that the camera circles around if it follows nothing
-    way: tuple[Floats, Floats] | None = None  # times (w,), ns, and places (w, 3) of the carrier
-    range_m: float = 1.0  # at which the carrier sees most
+    carrier_trajectory: tuple[Floats, Floats] | None = None  # times (w,), ns, and positions (w, 3)
+    range_m: float = 1.0  # typical range of the carrier's points
 
     def frames(self) -> Iterator[Bytes]:
-        """Draw the frames, (height, width, 3) each; new points are bright, older ones darker.
+        """Draw the frames, (height, width, 3) each, with new points brighter than old points.
 
-        Old points in front of all surfaces are left out: there was an actor that has moved on.
+        Old points in front of all surfaces are left out: an actor was there and has moved on.
         """
         random = np.random.default_rng(0)
-        born = np.empty(0)
-        points = np.empty((0, 3))
-        paint = np.empty((0, 4))
-        still = [_shape(self.still, SURFACE)] if len(self.still) else []
-        eyes, targets, places, focus = self._sights()
+        points = _FilmPoints()
+        scene = [_shape(self.scene_triangles, SURFACE)] if len(self.scene_triangles) else []
+        sights = self._sights()
         for number, (moment, part) in enumerate(zip(self.moments_ns, self.parts, strict=True)):
-            ahead = unit((targets - eyes)[number, None])
-            right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
-            axes = np.concatenate([right, np.cross(right, ahead), ahead])
-            camera = Camera(eyes[number], axes, _FOCAL, np.array(SIZE) / 2, SIZE)
-            meshes = [actor.placed(moment) for actor in self.actors]
-            there = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
-            moving = [_shape(np.concatenate(there), ACTOR)] if there else []
-            image, depth = _surfaces([*still, *moving], camera, focus, self.top)
-            points, paint = (np.vstack(each) for each in zip((points, paint), part, strict=True))
-            born = np.append(born, np.full(len(points) - len(born), number))
-            pixels, distance = camera.project(points)
-            surface = camera.look_up(depth, pixels, -np.inf)  # there is none outside
-            slack = _NOISE * distance + 2 * camera.footprint(distance)
-            shown = (distance <= surface + slack) & (distance >= _NEAR * focus)
-            shown &= (born == number) | (distance >= surface - slack) | np.isinf(surface)
-            fade = _OLD + (1 - _OLD) * np.exp((born - number) / _FADES)
-            rows = np.flatnonzero(shown)  # of points on one surface, the newest are drawn last
-            rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
-            image = splat(image, pixels[rows], BACK + (paint[rows] - BACK) * fade[rows, None], _DOT)
+            camera = sights.camera(number)
+            shapes = [*scene, *self._actor_shapes(moment)]
+            image, depth = _draw_surfaces(shapes, camera, sights.focus, self.top)
+            points.add(number, *part)
+            image = _draw_points(image, depth, camera, points, number, sights.focus)
             frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
-            pen, (way, _) = ImageDraw.Draw(frame), camera.project(places[: number + 1])
-            line = [(float(x), float(y)) for x, y in way if max(abs(x), abs(y)) < _FAR_OUT]
-            pen.line(line, _RED, 3)
-            for x, y in line[-1:]:
-                pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
+            _draw_trajectory(frame, camera, sights.carrier[: number + 1])
             yield np.asarray(frame)
-            kept = (born < number) | (random.random(len(born)) < self.kept)
-            points = points[kept]
-            paint = paint[kept]
-            born = born[kept]
+            is_old = points.first_frame < number
+            points.select(is_old | (random.random(len(is_old)) < self.keep_share))
 
-    def _sights(self) -> tuple[Floats, Floats, Floats, float]:
-        """Of each frame: eye, target and carrier, if any, (k, 3); metres to what is looked at."""
+    def _actor_shapes(self, moment_ns: float) -> list[_Shape]:
+        """Return the triangles of the actors that are present at a time."""
+        meshes = [actor.placed(moment_ns) for actor in self.actors]
+        present = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
+        return [_shape(np.concatenate(present), ACTOR)] if present else []
+
+    def _sights(self) -> _Sights:
+        """Choose the camera's position and target in each frame."""
         count = len(self.moments_ns)
-        if self.way is None:
-            turn = 2 * np.pi * np.arange(count) / count - 1.1
-            away = unit(np.stack([np.cos(turn), np.sin(turn), np.full(count, _SLOPE)], axis=1))
-            far = _AWAY * float(np.linalg.norm(np.ptp(self.box, 0)))
+        if self.carrier_trajectory is None:
+            azimuth = 2 * np.pi * np.arange(count) / count - 1.1
+            rise = np.full(count, _CIRCLE_SLOPE)
+            direction = unit(np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1))
+            distance = _CIRCLE_RADIUS * float(np.linalg.norm(np.ptp(self.box, 0)))
             middle = self.box.mean(axis=0)
-            return middle + far * away, np.tile(middle, (count, 1)), np.empty((0, 3)), far
-        reach = _HEADING * self.moments_ns[-1]
-        early, now, late = (
-            np.stack([np.interp(self.moments_ns + by, self.way[0], x) for x in self.way[1].T], 1)
-            for by in (-reach, 0, reach)
+            eyes = middle + distance * direction
+            return _Sights(eyes, np.tile(middle, (count, 1)), np.empty((0, 3)), distance)
+        lead_ns = _HEADING_SHARE * self.moments_ns[-1]
+        times, positions = self.carrier_trajectory
+        earlier, carrier, later = (
+            np.stack([np.interp(self.moments_ns + shift, times, x) for x in positions.T], 1)
+            for shift in (-lead_ns, 0, lead_ns)
         )
-        ahead = unit((late - early) * [1.0, 1.0, 0.0])
+        ahead = unit((later - earlier) * [1.0, 1.0, 0.0])
         ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # it stands, or rises
-        eye = now - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
-        return eye, now + _AHEAD * self.range_m * ahead, now, _BEHIND * self.range_m
+        eyes = carrier - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
+        targets = carrier + _AHEAD * self.range_m * ahead
+        return _Sights(eyes, targets, carrier, _BEHIND * self.range_m)
+
+
+def _draw_points(
+    image: AnyFloats,
+    depth: Floats,
+    camera: Camera,
+    points: _FilmPoints,
+    number: int,
+    focus: float,
+) -> AnyFloats:
+    """Draw the points of a frame over an image of surfaces at a depth, both (height, width, …)."""
+    age = number - points.first_frame
+    pixels, distance = camera.project(points.positions)
+    surface = camera.look_up(depth, pixels, -np.inf)  # no point is drawn outside the image
+    slack = _NOISE * distance + 2 * camera.footprint(distance)
+    shown = (distance <= surface + slack) & (distance >= _MIN_FOCUS * focus)
+    shown &= (age == 0) | (distance >= surface - slack) | np.isinf(surface)
+    fade = _OLD_BRIGHTNESS + (1 - _OLD_BRIGHTNESS) * np.exp(-age / _FADE_FRAMES)
+    rows = np.flatnonzero(shown)  # of points on one surface, the newest are drawn last
+    rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
+    colours = BACK + (points.colours[rows] - BACK) * fade[rows, None]
+    return splat(image, pixels[rows], colours, _POINT_RADIUS)
+
+
+def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
+    """Draw positions (k, 3) of the carrier as a line, with a disc at the last."""
+    pen = ImageDraw.Draw(frame)
+    pixels, _ = camera.project(positions)
+    line = [(float(x), float(y)) for x, y in pixels if max(abs(x), abs(y)) < _MAX_PIXEL]
+    pen.line(line, _RED, 3)
+    for x, y in line[-1:]:
+        pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
 
 
 def _shape(corners: AnyFloats, colour: Floats) -> _Shape:
+    """Prepare triangles with corners (f, 3, 3) for rays."""
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    return RayCaster(corners.reshape(-1, 3), faces), normals, colour
+    return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, colour)
 
 
-def _surfaces(
+def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces: (height, width, 4), and metres (height, width) from the eye to them."""
+    """Draw surfaces; return the image (height, width, 4), and the depth (height, width), metres."""
     width, height = SIZE
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rays = camera.rays(grid.reshape(-1, 2) + 0.5)
     forward = rays @ camera.axes[2]
-    start = _NEAR * focus / forward
-    if camera.eye[2] > top:  # rays begin where the scene is cut
+    start = _MIN_FOCUS * focus / forward
+    if camera.eye[2] > top:  # rays start where the scene is cut
         start = np.maximum(start, (top - camera.eye[2]) / np.minimum(rays[:, 2], -1e-6))
     depth = np.full(len(rays), np.inf)
     image = np.tile(BACK, (len(rays), 1))
     for caster, normals, colour in shapes:
         hits = caster.cast(camera.eye + start[:, None] * rays, rays)
-        found = np.flatnonzero(hits.distance + start < depth)
-        depth[found] = (hits.distance + start)[found]
-        normal = normals[hits.triangle[found]]
-        light = 0.2 + 0.4 * np.abs(dot(normal, rays[found])) + 0.4 * np.abs(normal[:, 2])
-        light *= np.exp(-depth[found] / (_HAZE * focus))
-        image[found] = BACK + light[:, None] * (colour - BACK)
-    # The inverse of depth is linear in the picture of a plane: less of it is behind an edge.
-    near = np.pad((1 / (depth * forward)).reshape(height, width), 1, mode="edge")
-    sides = np.maximum(near[:-2, 1:-1] + near[2:, 1:-1], near[1:-1, :-2] + near[1:-1, 2:]) / 2
-    edge = np.clip(4 * (sides / np.maximum(near[1:-1, 1:-1], 1e-9) - 1), 0, 0.5)[..., None]
+        nearer = np.flatnonzero(hits.distance + start < depth)
+        depth[nearer] = (hits.distance + start)[nearer]
+        normal = normals[hits.triangle[nearer]]
+        light = 0.2 + 0.4 * np.abs(dot(normal, rays[nearer])) + 0.4 * np.abs(normal[:, 2])
+        light *= np.exp(-depth[nearer] / (_HAZE_FOCUS * focus))
+        image[nearer] = BACK + light[:, None] * (colour - BACK)
+    edge = _edges((1 / (depth * forward)).reshape(height, width))
     image = BACK + (image.reshape(height, width, 4) - BACK) * (1 - edge)
     return image.astype(np.float32), depth.reshape(height, width)
+
+
+def _edges(inverse_depth: Floats) -> Floats:
+    """Return the strength (height, width, 1) of edges between surfaces.
+
+    The inverse of depth is linear in the picture of a plane: behind an edge there is less of it.
+    """
+    padded = np.pad(inverse_depth, 1, mode="edge")
+    sides = (
+        np.maximum(padded[:-2, 1:-1] + padded[2:, 1:-1], padded[1:-1, :-2] + padded[1:-1, 2:]) / 2
+    )
+    return np.clip(4 * (sides / np.maximum(padded[1:-1, 1:-1], 1e-9) - 1), 0, 0.5)[..., None]

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Floats32
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 
 from .camera import Camera
 from .cutaway import Cutaway, blocked
@@ -16,11 +16,14 @@ from .surface import Surface, dot, spiral
 STRIDE = 2  # shadows are computed at every second pixel of every second row
 SKY_LIGHTS = 24
 SUN_LIGHTS = 4
-TURNS = 0.12, 0.02  # radians from a grid point's light to its neighbour's, of the sky and the sun
-SUN_RADIUS = 0.045  # radians: ten times the real one, for soft edges
+ROTATIONS = (
+    0.12,
+    0.02,
+)  # radians from a grid point's light to its neighbour's, of the sky and the sun
+SUN_RADIUS_RAD = 0.045  # radians: ten times the real one, for soft edges
 SUN_SHARE = 0.4  # share of the light on open horizontal ground
-THIN = 0.5  # openness of surfaces too thin for a grid point
-# brightness of a surface that faces them
+THIN_OPENNESS = 0.5  # openness of surfaces too thin for a grid point
+# brightness of a surface that faces the light
 AMBIENT = 0.24
 SKY = 0.54
 SUN = 0.36
@@ -28,10 +31,10 @@ SUN = 0.36
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Light at a grid of pixels, and the surface of each."""
+    """Light at a grid of pixels, and their surfaces."""
 
     camera: Camera
-    sun: Floats  # (3,) unit vector towards it
+    sun: Floats  # (3,) unit vector towards the sun
     openness: Floats32  # (rows, columns) in 0 to 1: the unblocked share of the light
     position: Floats32  # (rows, columns, 3) metres; NaN where there is no surface
     normal: Floats32  # (rows, columns, 3)
@@ -39,10 +42,10 @@ class LightMap:
     def brightness(
         self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
     ) -> Floats32:
-        """Brightness (n,) of points: Lambert's law for the sun, and the open part of the sky.
+        """Return the brightness (n,) of points by Lambert's law, and the open part of the sky.
 
-        `pixels` (n, 2) are where points (n, 3) are in the picture, and `ground` (n,) whether they
-        are on the ground, whose open parts keep their colour.
+        `pixels` (n, 2) are the coordinates of points (n, 3) in the picture, and `ground` (n,) marks
+        points on the ground, whose open parts keep their colour.
         """
         openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
@@ -59,11 +62,11 @@ class LightMap:
         # The mean of two by two, because neighbours rotate the lights, interpolated.
         shares = 1 - part, np.ones_like(part), part
         total = np.full(len(pixels), 1e-3, np.float32)
-        summed = np.full(len(pixels), 1e-3 * THIN, np.float32)
+        summed = np.full(len(pixels), 1e-3 * THIN_OPENNESS, np.float32)
         for down, right in product(range(3), repeat=2):
             row = np.clip(cell[:, 1] + down, 0, rows - 1)
             column = np.clip(cell[:, 0] + right, 0, columns - 1)
-            weight = alike(
+            weight = surface_similarity(
                 position, normal, self.position[row, column], self.normal[row, column], tolerance
             )
             weight *= shares[down][:, 1] * shares[right][:, 0]
@@ -72,27 +75,27 @@ class LightMap:
         return summed / total
 
 
-def alike(
+def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """How well points (n, 3) share a surface with spots (n, 3): from 0, for not, to 0.4.
+    """Return how well points (n, 3) share a surface with spots (n, 3), from 0 to 0.4.
 
-    Those on it lie within `tolerance` (n,), in metres, of each other's plane.
+    Points of the same surface lie within `tolerance` (n,), metres, of each other's plane.
     """
     with np.errstate(invalid="ignore"):
-        near = np.abs(dot(spot - position, normal)) < tolerance
-        return np.where(near, np.clip(dot(facing, normal) - 0.6, 0, None), 0)
+        in_plane = np.abs(dot(spot - position, normal)) < tolerance
+        return np.where(in_plane, np.clip(dot(facing, normal) - 0.6, 0, None), 0)
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Tolerance in metres for points of one plane that are `stride` pixels apart."""
+    """Return the tolerance (n,), metres, for points of a plane at a distance of `stride` pixels."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
 
 
 def _sun_direction(camera: Camera) -> Floats:
-    """Towards the sun, (3,): over the camera's left shoulder, so that shadows fall right."""
+    """Return the direction (3,) of the sun, left behind the camera: shadows fall to the right."""
     back = -camera.axes[2] * np.array([1.0, 1.0, 0.0])
     sun = 0.4 * back / np.linalg.norm(back) - 0.55 * camera.axes[0] + np.array([0.0, 0.0, 0.95])
     return sun / np.linalg.norm(sun)
@@ -106,49 +109,65 @@ def make_light_map(
     normal: Floats32,
     reach: float,
 ) -> LightMap:
-    """Cast rays from a grid of surface points to lights all over the sky, many of them the sun.
+    """Cast rays from a grid of surface points to lights all over the sky and in the sun.
 
-    The same lights for all points: steps in brightness are invisible, while random directions
+    All points have the same lights: steps in brightness are invisible, while random directions
     would need smoothing. Positions and normals are (rows, columns, 3), NaN without a surface.
-    Surfaces that the cutaway removes cast no shadow, nor do those farther than `reach`, metres.
+    Surfaces that the cutaway removes cast no shadow, nor do surfaces farther than `reach`, metres.
     """
     sun = _sun_direction(camera)
-    there = np.isfinite(position[..., 0])
-    at = position[there].astype(np.float64)
-    facing = normal[there].astype(np.float64)
+    has_surface = np.isfinite(position[..., 0])
+    origins = position[has_surface].astype(np.float64)
+    facing = normal[has_surface].astype(np.float64)
     # Rays start half a pixel off the surface, so that it does not shade itself.
-    at += 0.5 * camera.footprint(np.sqrt(dot(at - camera.eye, at - camera.eye)))[:, None] * facing
+    origins += (
+        0.5
+        * camera.footprint(np.sqrt(dot(origins - camera.eye, origins - camera.eye)))[:, None]
+        * facing
+    )
     # Neighbours rotate the lights differently, and are averaged: like four times as many lights.
-    row, column = np.nonzero(there)
-    number = row % 2 + 2 * (column % 2)
-    full = np.full(len(at), 1e-9)
-    open_ = np.full(len(at), 1e-9)
-    for (x, y, z), strength, turn in zip(*_lights(sun), strict=True):
-        cos = np.cos(turn * np.arange(4))[number]
-        sin = np.sin(turn * np.arange(4))[number]
-        towards = np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
-        falls = strength * np.clip(dot(facing, towards), 0, None)
-        lit = np.flatnonzero(falls)
-        free = lit[~blocked(surface, cutaway, at[lit], towards[lit], reach)]
-        full += falls
-        open_[free] += falls[free]
-    openness = np.ones(there.shape, np.float32)
-    openness[there] = open_ / full
+    quarter = _quarters(has_surface)
+    total_light = np.full(len(origins), 1e-9)
+    open_light = np.full(len(origins), 1e-9)
+    for direction, strength, rotation in zip(*_lights(sun), strict=True):
+        towards = _rotated(direction, rotation)[quarter]
+        light = strength * np.clip(dot(facing, towards), 0, None)
+        lit = np.flatnonzero(light)
+        free = lit[~blocked(surface, cutaway, origins[lit], towards[lit], reach)]
+        total_light += light
+        open_light[free] += light[free]
+    openness = np.ones(has_surface.shape, np.float32)
+    openness[has_surface] = open_light / total_light
     return LightMap(camera, sun, openness, position, normal)
 
 
-def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
-    """Directions (k, 3) of lights, even over sky and sun's disc, strengths and rotations.
+def _quarters(has_surface: Bools) -> Ints:
+    """Return 0 to 3 for each point of a grid (rows, columns) with a surface, by its neighbours."""
+    row, column = np.nonzero(has_surface)
+    return np.asarray(row % 2 + 2 * (column % 2))
 
-    The strengths (k,) of sky and sun together are 1 on level ground; turns (k,) in radians.
+
+def _rotated(direction: Floats, rotation: float) -> Floats:
+    """Return a direction (3,) in four rotations around z, a step of `rotation` radians apart."""
+    x, y, z = direction
+    angles = rotation * np.arange(4)
+    cos = np.cos(angles)
+    sin = np.sin(angles)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
+
+
+def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return directions (k, 3) of lights, even over sky and sun's disc, strengths and rotations.
+
+    The strengths (k,) of sky and sun together are 1 on level ground; rotations (k,) in radians.
     """
     n = np.arange(SUN_LIGHTS)
-    turn = 2 * np.pi * 0.6180339887 * n
-    radius = SUN_RADIUS * np.sqrt((n + 0.5) / SUN_LIGHTS)
+    azimuth = 2 * np.pi * 0.6180339887 * n
+    radius = SUN_RADIUS_RAD * np.sqrt((n + 0.5) / SUN_LIGHTS)
     side = np.cross(sun, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
-    disc = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(side, sun)
+    disc = np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * np.cross(side, sun)
     counts = [SKY_LIGHTS, SUN_LIGHTS]
     strengths = [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS]
     lights = np.concatenate([spiral(SKY_LIGHTS), sun + radius[:, None] * disc])
-    return lights, np.repeat(strengths, counts), np.repeat(TURNS, counts)
+    return lights, np.repeat(strengths, counts), np.repeat(ROTATIONS, counts)

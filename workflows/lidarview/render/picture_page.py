@@ -32,26 +32,26 @@ from .shot import SurfaceView
 
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
-MANY_POSES = 40  # more sensors than this are small dots
-PATH_PIECES = 200  # of which the way of a sensor is drawn
-MOST_NAMES = 12  # of actors beside what they name
+MAX_LARGE_MARKERS = 40  # more sensors than this are small dots
+MAX_PATH_POINTS = 200  # of the drawn trajectory of a sensor
+MAX_NAMES = 12  # of actors, beside them
 # pixels of a picture 1600 wide
 NAME_ABOVE = 26.0
-NAME_ROOM = (150.0, 26.0)
+NAME_SIZE = (150.0, 26.0)
 LEGEND_ROWS = 30
 # Of the numbers along the axes, in pixels of a picture 1600 wide.
 TICK = 7.0  # length of a tick mark
 # from an edge to the numbers right or left of it, and under it
-BESIDE = 14.0
-BELOW = 24.0
-LETTER = 12.0  # width of a digit
-TITLE = 32.0  # from the numbers to the title
-APART = 34.0  # numbers stand at least this far apart
-SHORTEST_AXIS = 36.0  # a shorter height axis has no room for numbers
+LABEL_MARGIN_X = 14.0
+LABEL_MARGIN_Y = 24.0
+LETTER_WIDTH = 12.0  # width of a digit
+TITLE_DISTANCE = 32.0  # from the numbers to the title
+LABEL_SPACING = 34.0  # numbers stand at least this far apart
+MIN_AXIS = 36.0  # a shorter height axis has no room for numbers
 
 
 class Page:
-    """One picture under construction; its size is (width, height) in pixels."""
+    """A picture under construction; its size is (width, height) in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -74,112 +74,144 @@ class Page:
         grid = shot.runs(_grid(shot), shot.on_ground)
         axes.add_collection(LineCollection(grid, colors=theme.LINE, linewidths=0.6 * self.unit))
         self._label_axes(axes, shot)
-        self._sensors(axes, shot)
-        self._actors(axes, shot)
+        self._draw_sensors(axes, shot)
+        self._name_actors(axes, shot)
         return axes
 
     def _label_axes(self, axes: Axes, shot: SurfaceView) -> None:
         """Write numbers and titles along the ground's near edges and up from its left corner."""
-        taken: list[Floats] = []
+        label_positions: list[Floats] = []
         for k, (start, end, outward) in enumerate(_axis_edges(shot)):
             axis = shot.stage.axes[k]
-            ends, _ = shot.camera.project([start, end])
-            if k == 2 and np.linalg.norm(ends[1] - ends[0]) < SHORTEST_AXIS * self.unit:
+            end_pixels, _ = shot.camera.project([start, end])
+            if k == 2 and np.linalg.norm(end_pixels[1] - end_pixels[0]) < MIN_AXIS * self.unit:
                 return
-            clear = BESIDE * abs(outward[0]) + BELOW * abs(outward[1])
-            places = np.repeat(start[None], len(axis.ticks), axis=0)
-            places[:, k] = axis.ticks
-            lines = [ends] if k == 2 else []
-            for pixel, text in zip(shot.camera.project(places)[0], axis.labels, strict=True):
-                wide = LETTER / 2 * len(text) * abs(outward[0])
-                place = pixel + (clear + wide) * self.unit * outward
-                apart = (APART + 4 * max(0, len(text) - 3)) * (0.7 if k == 2 else 1.0) * self.unit
-                if all(np.linalg.norm(place - other) >= apart for other in taken):
-                    taken.append(place)
+            clearance = LABEL_MARGIN_X * abs(outward[0]) + LABEL_MARGIN_Y * abs(outward[1])
+            tick_positions = np.repeat(start[None], len(axis.ticks), axis=0)
+            tick_positions[:, k] = axis.ticks
+            lines = [end_pixels] if k == 2 else []
+            for pixel, text in zip(
+                shot.camera.project(tick_positions)[0], axis.labels, strict=True
+            ):
+                half_width = LETTER_WIDTH / 2 * len(text) * abs(outward[0])
+                position = pixel + (clearance + half_width) * self.unit * outward
+                min_distance = (
+                    (LABEL_SPACING + 4 * max(0, len(text) - 3))
+                    * (0.7 if k == 2 else 1.0)
+                    * self.unit
+                )
+                if all(
+                    np.linalg.norm(position - earlier) >= min_distance
+                    for earlier in label_positions
+                ):
+                    label_positions.append(position)
                     lines.append(np.stack([pixel, pixel + TICK * self.unit * outward]))
-                    self._text(axes, place, text, 6.6, theme.MUTED)
+                    self._text(axes, position, text, 6.6, theme.MUTED)
             marks = LineCollection(lines, colors=theme.MUTED, linewidths=0.6 * self.unit)
             axes.add_collection(marks)
-            along = ends[1] - ends[0]
-            angle = (90 - math.degrees(math.atan2(along[1], along[0]))) % 180 - 90
+            direction = end_pixels[1] - end_pixels[0]
+            angle = (90 - math.degrees(math.atan2(direction[1], direction[0]))) % 180 - 90
             widest = max((len(text) for text in axis.labels), default=0)
-            away = (clear + TITLE + LETTER * widest * abs(outward[0])) * self.unit
-            place = ends.mean(axis=0) + away * outward
-            self._text(axes, place, axis.title, 7.2, theme.INK, rotation=90.0 if k == 2 else angle)
+            distance = (
+                clearance + TITLE_DISTANCE + LETTER_WIDTH * widest * abs(outward[0])
+            ) * self.unit
+            position = end_pixels.mean(axis=0) + distance * outward
+            self._text(
+                axes, position, axis.title, 7.2, theme.INK, rotation=90.0 if k == 2 else angle
+            )
 
     def _text(
-        self, on: Axes | Figure, place: Any, text: str, size: float, colour: str, **more: Any
+        self,
+        parent: Axes | Figure,
+        position: Any,
+        text: str,
+        size: float,
+        colour: str,
+        **options: Any,
     ) -> None:
-        style = {"ha": "center", "va": "center", "color": colour, "family": FONT} | more
-        made = on.text(float(place[0]), float(place[1]), text, fontsize=size * self.unit, **style)
-        made.set_parse_math(False)  # names come from files
+        style = {"ha": "center", "va": "center", "color": colour, "family": FONT} | options
+        text_artist = parent.text(
+            float(position[0]), float(position[1]), text, fontsize=size * self.unit, **style
+        )
+        text_artist.set_parse_math(False)  # names come from files
 
-    def _sensors(self, axes: Axes, shot: SurfaceView) -> None:
+    def _draw_sensors(self, axes: Axes, shot: SurfaceView) -> None:
         """Mark the sensors, hollow if hidden, each on a stem."""
         for path in shot.paths:
-            some = path[np.linspace(0, len(path) - 1, min(len(path), PATH_PIECES)).astype(int)]
-            pixels, _ = shot.camera.project(some)
+            points = path[
+                np.linspace(0, len(path) - 1, min(len(path), MAX_PATH_POINTS)).astype(int)
+            ]
+            pixels, _ = shot.camera.project(points)
             axes.plot(
                 *pixels.T, color=theme.SENSOR, lw=0.9 * self.unit, alpha=0.35, zorder=4,
                 solid_capstyle="round",
             )  # fmt: skip
-            self.lines(axes, shot, np.stack([some[:-1], some[1:]], axis=1), 1.8, 0.9)
+            self.lines(axes, shot, np.stack([points[:-1], points[1:]], axis=1), 1.8, 0.9)
         poses = shot.sensors
-        many = len(shot.sensors) > MANY_POSES
-        pixels, seen = shot.visible(poses)
-        if not many:
+        is_crowded = len(shot.sensors) > MAX_LARGE_MARKERS
+        pixels, is_visible = shot.visible(poses)
+        if not is_crowded:
             feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
             self.lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
-        size, edge_width = (5, 0.2) if many else (20, 0.7)
-        for which, face, edge in ((seen, theme.SENSOR, theme.PAGE), (~seen, "none", theme.SENSOR)):
+        size, edge_width = (5, 0.2) if is_crowded else (20, 0.7)
+        for chosen, face, edge in (
+            (is_visible, theme.SENSOR, theme.PAGE),
+            (~is_visible, "none", theme.SENSOR),
+        ):
             axes.scatter(
-                pixels[which, 0], pixels[which, 1], s=size * self.unit**2, facecolors=face,
+                pixels[chosen, 0], pixels[chosen, 1], s=size * self.unit**2, facecolors=face,
                 edgecolors=edge, linewidths=edge_width * self.unit, zorder=5,
             )  # fmt: skip
 
-    def _actors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Name the actors, if they are few, each above its position; paler if hidden.
+    def _name_actors(self, axes: Axes, shot: SurfaceView) -> None:
+        """Name the actors, if there are not too many, above their positions; paler if hidden.
 
-        Of a robot, whose links are called ROBOT/LINK, the first has its name.
+        Of a robot, whose links are called ROBOT/LINK, the first link has its name.
         """
         boxes = shot.scene.object_bounds
-        taken = np.empty((0, 2))
-        some = np.arange(len(boxes) - shot.actors, len(boxes))
-        # Absent ones are one point.
-        there = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
-        some = some[there[some]]
-        names = [whole_of(shot.scene.names[k]) for k in some]
-        some = some[np.sort(np.unique(names, return_index=True)[1])]
+        label_positions = np.empty((0, 2))
+        actor_indices = np.arange(len(boxes) - shot.actors, len(boxes))
+        # Absent actors are a single point.
+        is_present = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
+        actor_indices = actor_indices[is_present[actor_indices]]
+        names = [robot_name(shot.scene.names[k]) for k in actor_indices]
+        actor_indices = actor_indices[np.sort(np.unique(names, return_index=True)[1])]
         names = list(dict.fromkeys(names))
-        if len(some) > MOST_NAMES:
+        if len(actor_indices) > MAX_NAMES:
             return
-        tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
+        tops = np.column_stack(
+            [boxes[actor_indices, :, :2].mean(axis=1), boxes[actor_indices, 1, 2]]
+        )
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
-        places, seen = shot.visible(tops)
-        for k in np.argsort(-places[:, 1]).tolist():  # those in front first
-            pixel = places[k]
+        pixels, is_visible = shot.visible(tops)
+        for k in np.argsort(-pixels[:, 1]).tolist():  # those in front first
+            pixel = pixels[k]
             name = names[k]
-            colour = theme.INK if seen[k] else theme.LINE
-            place = pixel - (0, NAME_ABOVE * self.unit)
-            while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
-                place = place - (0, NAME_ROOM[1] * self.unit)
-            taken = np.vstack([taken, place])
+            colour = theme.INK if is_visible[k] else theme.LINE
+            position = pixel - (0, NAME_ABOVE * self.unit)
+            while (
+                (np.abs(label_positions - position) < np.array(NAME_SIZE) * self.unit)
+                .all(axis=1)
+                .any()
+            ):
+                position = position - (0, NAME_SIZE[1] * self.unit)
+            label_positions = np.vstack([label_positions, position])
             axes.plot(
-                *np.stack([pixel, place]).T, color=colour, lw=0.7 * self.unit, zorder=6,
+                *np.stack([pixel, position]).T, color=colour, lw=0.7 * self.unit, zorder=6,
                 path_effects=halo,
             )  # fmt: skip
-            ink = theme.INK if seen[k] else theme.MUTED
+            ink = theme.INK if is_visible[k] else theme.MUTED
             style = {"va": "bottom", "path_effects": halo, "zorder": 7}
-            self._text(axes, place, shortened(name), 6.6, ink, **style)
+            self._text(axes, position, shortened(name), 6.6, ink, **style)
 
     def numbers(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
-        pixels, seen = shot.visible(shot.sensors)
+        """Write numbers from 1 on the sensors' markers; hidden sensors have white markers."""
+        pixels, is_visible = shot.visible(shot.sensors)
         for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
             x = float(pixels[k, 0])
             y = float(pixels[k, 1])
             above = 8 + rank / len(pixels)
-            face, ink = (theme.SENSOR, theme.PAGE) if seen[k] else (theme.PAGE, theme.SENSOR)
+            face, ink = (theme.SENSOR, theme.PAGE) if is_visible[k] else (theme.PAGE, theme.SENSOR)
             axes.scatter(
                 [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
                 linewidths=0.7 * self.unit, zorder=above,
@@ -198,11 +230,11 @@ class Page:
             )
         )
 
-    def chart(self, frame: tuple[float, float, float, float], **given: Any) -> Axes:
-        """Axes with a grid in a frame: left, bottom, width and height as fractions of the page."""
+    def chart(self, frame: tuple[float, float, float, float], **options: Any) -> Axes:
+        """Add axes with a grid in a frame (left, bottom, width, height), fractions of the page."""
         axes = self.figure.add_axes(frame)
         small = 0.6 * self.unit
-        axes.set(facecolor=theme.GROUND, axisbelow=True, **given)
+        axes.set(facecolor=theme.GROUND, axisbelow=True, **options)
         axes.grid(color=theme.LINE, lw=0.5 * self.unit)
         axes.spines[:].set(color=theme.LINE, linewidth=small)
         for side in (axes.xaxis, axes.yaxis):
@@ -214,25 +246,25 @@ class Page:
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, and lines of detail under it."""
+        """Write a title at the top left, above lines of detail."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
-        place = 0.03, 1 - line
-        self._text(self.figure, place, text, 11, theme.INK, ha="left", weight="bold")
+        position = 0.03, 1 - line
+        self._text(self.figure, position, text, 11, theme.INK, ha="left", weight="bold")
         for number, detail in enumerate(details):
-            place = 0.03, 1 - (1.84 + 0.62 * number) * line
-            self._text(self.figure, place, detail, 7.2, theme.MUTED, ha="left")
+            position = 0.03, 1 - (1.84 + 0.62 * number) * line
+            self._text(self.figure, position, detail, 7.2, theme.MUTED, ha="left")
 
-    def heading(self, axes: Axes, text: str, **given: Any) -> None:
+    def heading(self, axes: Axes, text: str, **options: Any) -> None:
         """Name a chart, above its left end."""
         style: dict[str, Any] = {
             "fontsize": 7.6 * self.unit,
             "color": theme.INK,
             "family": FONT,
-        } | given
+        } | options
         axes.set_title(text, loc="left", parse_math=False, **style)
 
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
-        """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
+        """Draw a legend of (name, colour) in the right margin; the last line counts the rest."""
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
         rows.append(("o", sensor, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
@@ -248,12 +280,16 @@ class Page:
         )  # fmt: skip
 
     def key(
-        self, handles: Sequence[Artist], size: float, on: Axes | Figure | None = None, **given: Any
+        self,
+        handles: Sequence[Artist],
+        size: float,
+        parent: Axes | Figure | None = None,
+        **options: Any,
     ) -> None:
-        """Put a legend of handles into the right margin, or elsewhere; `size` in points."""
-        style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | given
+        """Draw a legend of handles in the right margin, or on a parent; `size` in points."""
+        style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
-        legend = (on or self.figure).legend(
+        legend = (parent or self.figure).legend(
             handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
             prop={"family": FONT, "size": size * self.unit}, **style,
         )  # fmt: skip
@@ -270,7 +306,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
+        """Draw a colour bar of colours (n, 3) in the right margin, beside its title."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
@@ -282,11 +318,11 @@ class Page:
             labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,
         )  # fmt: skip
         if isinstance(norm, LogNorm):
-            few = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
-            label_logarithms(axes.yaxis, few)
+            is_narrow = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
+            label_logarithms(axes.yaxis, is_narrow)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colours; a link in its place goes.
+        """Write the page as a PNG, in its light colours; a link at the path is replaced.
 
         Raises
         ------
@@ -304,14 +340,14 @@ class Page:
         return image.getvalue()
 
     def svg(self) -> str:
-        """Return the page as an element of HTML, whose ink may follow the style around it.
+        """Return the page as an element of HTML, whose ink may follow the style of a document.
 
         The colours of `theme.STYLED` are variables of CSS, such as --picture-ink.
         """
         text = io.StringIO()
         with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
             self.figure.savefig(text, format="svg", dpi=DPI, metadata={"Date": None})
-        # Without what all elements of the document would share, and nobody reads.
+        # Comments and styles would be repeated by all elements of a document.
         svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
         svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
         svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
@@ -320,42 +356,42 @@ class Page:
         return svg
 
 
-def label_logarithms(axis: Axis, few: bool) -> None:
-    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis, or powers of ten if not few."""
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
+def label_logarithms(axis: Axis, is_narrow: bool) -> None:
+    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis; powers of ten if not narrow."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Lines (n, 2, 3) of the ground: its border, and one at each tick."""
+    """Return lines (n, 2, 3) of the ground: its border, and a line at each tick."""
     (x0, y0), (x1, y1) = shot.stage.ground.tolist()
     level = shot.stage.level
-    across, along = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
+    x_ticks, y_ticks = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
     return np.array(
-        [((x, y0, level), (x, y1, level)) for x in (x0, *across, x1)]
-        + [((x0, y, level), (x1, y, level)) for y in (y0, *along, y1)]
+        [((x, y0, level), (x, y1, level)) for x in (x0, *x_ticks, x1)]
+        + [((x0, y, level), (x1, y, level)) for y in (y0, *y_ticks, y1)]
     )
 
 
 def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
-    """For x, y and z: two ends (3,) in the scene, and the outward direction (2,) in the picture."""
+    """Return the ends (3,) of the axes x, y and z, and the outward direction (2,) in pixels."""
     corners = shot.stage.corners
     flat, _ = shot.camera.project(corners)
     middle, _ = shot.camera.project(corners.mean(axis=0)[None])
-    out = []
+    edges = []
     for sides in (((0, 1), (3, 2)), ((0, 3), (1, 2))):  # corners along x and along y
         a, b = max(sides, key=lambda side: float(flat[list(side), 1].mean()))  # the nearer one
-        along = flat[b] - flat[a]
-        outward = np.array([along[1], -along[0]]) / np.linalg.norm(along)
+        direction = flat[b] - flat[a]
+        outward = np.array([direction[1], -direction[0]]) / np.linalg.norm(direction)
         outward *= np.sign(outward @ ((flat[a] + flat[b]) / 2 - middle[0]))
-        out.append((corners[a], corners[b], outward))
+        edges.append((corners[a], corners[b], outward))
     foot = corners[np.argmin(flat[:, 0])]
     top = np.array([*foot[:2], shot.stage.bounds[1, 2]])
-    return [*out, (foot, top, np.array([-1.0, 0.0]))]
+    return [*edges, (foot, top, np.array([-1.0, 0.0]))]
 
 
-def whole_of(name: str) -> str:
-    """Name of the robot of a link, ROBOT/LINK; of another actor its own."""
+def robot_name(name: str) -> str:
+    """Return the robot of a link, ROBOT/LINK, or the name itself of an actor without links."""
     # Traffic has names of its files in brackets, with any letters.
     return name if "(" in name else name.partition("/")[0]

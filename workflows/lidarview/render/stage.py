@@ -9,24 +9,24 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 
-# Numbers of more digits than this are not read: far coordinates are labelled from an offset.
-MOST_DIGITS = 5
+# Longer numbers are hard to read: coordinates with more digits are labelled from an offset.
+MAX_DIGITS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """Ticks of one axis."""
+    """Ticks of an axis."""
 
-    title: str  # its name, what the labels leave out, and unit
+    title: str  # name, offset of the labels, and unit
     ticks: Floats  # (n,) local metres; round numbers in world coordinates
-    labels: tuple[str, ...]  # the world coordinates, less what the title says
+    labels: tuple[str, ...]  # world coordinates, less the offset in the title
 
 
 @dataclass(frozen=True, eq=False)
 class PlotBox:
-    """A box with round ticks on its axes, and the ground rectangle under it; local metres."""
+    """A box with round ticks on its axes, above a ground rectangle; local metres."""
 
-    bounds: Floats  # (2, 3) lowest and highest corner of what is shown
+    bounds: Floats  # (2, 3) lowest and highest corner of the shown part
     ground: Floats  # (2, 2) lowest and highest corner of the ground
     level: float  # height of the ground, a little under the lowest point
     axes: tuple[Axis, Axis, Axis]
@@ -43,37 +43,39 @@ class PlotBox:
         return np.array([[x, y, self.level] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
 
     @classmethod
-    def around(cls, bounds: Floats, origin: Floats) -> PlotBox:
+    def from_bounds(cls, bounds: Floats, origin: Floats) -> PlotBox:
         """Build the stage of a box (2, 3), local metres, which may be flat or a single point."""
-        low, high = bounds
-        widest = float((high - low).max()) or 1.0
+        lower, upper = bounds
+        widest = float((upper - lower).max()) or 1.0
         # A flat or pointlike box gets some width, so that there is something to look at.
-        pad = np.maximum(np.array([0.15, 0.15, 0.0]) * widest - (high - low), 0) / 2
-        low = low - pad
-        high = high + pad
-        high[2] = max(high[2], low[2] + 0.02 * widest)
+        pad = np.maximum(np.array([0.15, 0.15, 0.0]) * widest - (upper - lower), 0) / 2
+        lower = lower - pad
+        upper = upper + pad
+        upper[2] = max(upper[2], lower[2] + 0.02 * widest)
         margin = 0.05 * widest
-        ground = np.stack([low[:2] - margin, high[:2] + margin])
-        level = float(low[2]) - 1e-3 * widest
+        ground = np.stack([lower[:2] - margin, upper[:2] + margin])
+        level = float(lower[2]) - 1e-3 * widest
         step = nice_step(float(np.ptp(ground, axis=0).max()) / 6)
         x, y = (
             make_axis(name, g0, g1, min(step, nice_step((g1 - g0) / 2)), float(o))
             for name, (g0, g1), o in zip("xy", ground.T.tolist(), origin, strict=False)
         )
-        up = nice_step(float(high[2] - low[2]) / 3)
-        z = make_axis("z", level, float(high[2]), up, float(origin[2]))
-        return cls(np.stack([low, high]), ground, level, (x, y, z))
+        up = nice_step(float(upper[2] - lower[2]) / 3)
+        z = make_axis("z", level, float(upper[2]), up, float(origin[2]))
+        return cls(np.stack([lower, upper]), ground, level, (x, y, z))
 
 
-def make_axis(name: str, low: float, high: float, step: float, origin: float) -> Axis:
-    """Place round ticks between `low` and `high`, which are local; world = local + origin."""
-    first = math.ceil((low + origin) / step - 2e-3)
-    last = math.floor((high + origin) / step + 1e-6)
+def make_axis(name: str, lower: float, upper: float, step: float, origin: float) -> Axis:
+    """Place round ticks between `lower` and `upper`, which are local; world = local + origin."""
+    first = math.ceil((lower + origin) / step - 2e-3)
+    last = math.floor((upper + origin) / step + 1e-6)
     world: Floats = np.arange(first, last + 1, dtype=np.float64) * step
     offset = 0.0
-    far = 10.0**MOST_DIGITS
-    if high - low < far and np.abs(world).max(initial=0.0) >= min(far, far * step):
-        unit = 10.0 ** math.floor(math.log10(max(high - low, 1.0)))
+    max_number = 10.0**MAX_DIGITS
+    if upper - lower < max_number and np.abs(world).max(initial=0.0) >= min(
+        max_number, max_number * step
+    ):
+        unit = 10.0 ** math.floor(math.log10(max(upper - lower, 1.0)))
         offset = math.floor(world[0] / unit) * unit
         sign = "−" if offset > 0 else "+"
         name = f"{name} {sign} {abs(offset):,.0f}".replace(",", "\u2009")

@@ -12,8 +12,8 @@ from raybeam import RayCaster
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
 CREASE_COSINE = np.cos(np.radians(35))
-_DEPTHS = 5  # of objects that are neighbours
-_SHARPEST = 0.1  # squared length of the mean normal at corners that move no farther
+_DEPTH_LEVELS = 5  # of objects that are neighbours
+_MIN_SQUARE = 0.1  # squared length of the mean normal at corners that move no farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Surface:
     vertex_normals: Floats  # (v, 3) unit length, weighted by area; zero if faces cancel out
 
     @classmethod
-    def of(cls, scene: Scene, backend: str = "auto") -> Surface:
+    def from_scene(cls, scene: Scene, backend: str = "auto") -> Surface:
         """Prepare a scene for rendering."""
         a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
         doubled = np.cross(b - a, c - a)
@@ -38,7 +38,7 @@ class Surface:
         return cls(scene, caster, unit(doubled), unit(at_vertices))
 
     def normals(self, triangle: Ints, u: Floats, v: Floats, towards: Floats) -> Floats:
-        """Shading normals (n, 3) at hits, on the side of the ray.
+        """Return shading normals (n, 3) at hits, on the side of the ray.
 
         Interpolated from the corners (Phong 1975), except across creases, where the face's normal
         replaces a corner's. `towards` (n, 3) are the directions of the rays.
@@ -55,8 +55,8 @@ class Surface:
         return smooth
 
 
-def apart(scene: Scene, objects: Integers, step: float) -> Scene:
-    """Move surfaces inwards a little, so that objects that touch do not show through each other.
+def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
+    """Move surfaces inwards a little, so that objects in contact do not show through.
 
     Each vertex moves against the mean of the normals around it, weighted by angle (Thürmer and
     Wüthrich, 1998), so that the sides of a box all move by `step` metres, or up to three times as
@@ -65,25 +65,27 @@ def apart(scene: Scene, objects: Integers, step: float) -> Scene:
     vertices = scene.vertices
     a, b, c = (vertices[scene.faces[:, k]] for k in range(3))
     normals = unit(np.cross(b - a, c - a))
-    place = _places(scene, objects)
-    count = int(place.max(initial=-1)) + 1
+    corner_index = _shared_corners(scene, objects)
+    count = int(corner_index.max(initial=-1)) + 1
     mean = np.zeros((count, 3))
-    whole = np.full(count, 1e-30)
+    total_angle = np.full(count, 1e-30)
     inwards = np.zeros(count)
-    around = zip((a, b, c), (b, c, a), (c, a, b), place[scene.faces].T, strict=True)
-    for here, left, right, corner in around:
-        angle = np.arccos(np.clip(dot(unit(left - here), unit(right - here)), -1, 1))
-        whole += np.bincount(corner, angle, count)
+    corners = zip((a, b, c), (b, c, a), (c, a, b), corner_index[scene.faces].T, strict=True)
+    for position, next_position, previous_position, corner in corners:
+        angle = np.arccos(
+            np.clip(dot(unit(next_position - position), unit(previous_position - position)), -1, 1)
+        )
+        total_angle += np.bincount(corner, angle, count)
         for k in range(3):
             mean[:, k] += np.bincount(corner, angle * normals[:, k], count)
-        inwards[corner] = step * (1 + objects % _DEPTHS / 2)
-    mean /= whole[:, None]
-    inwards /= np.maximum(dot(mean, mean), _SHARPEST)
-    return replace(scene, vertices=vertices - (inwards[:, None] * mean)[place])
+        inwards[corner] = step * (1 + objects % _DEPTH_LEVELS / 2)
+    mean /= total_angle[:, None]
+    inwards /= np.maximum(dot(mean, mean), _MIN_SQUARE)
+    return replace(scene, vertices=vertices - (inwards[:, None] * mean)[corner_index])
 
 
-def _places(scene: Scene, objects: Integers) -> Ints:
-    """Return a number (v,) for each vertex, the same for those of one object at one place.
+def _shared_corners(scene: Scene, objects: Integers) -> Ints:
+    """Return a number (v,) for each vertex, shared by vertices of an object at the same position.
 
     Files such as .stl have three vertices for each triangle, which must not come apart.
     """
@@ -96,20 +98,20 @@ def _places(scene: Scene, objects: Integers) -> Ints:
 
 
 def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Scalar products (...,) of vectors (..., 3)."""
+    """Return the scalar products (...,) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
     """Spread unit vectors (count, 3) over the sphere between two heights: a golden spiral."""
     n = np.arange(count)
-    turn = 2 * np.pi * 0.6180339887 * n
-    up = lowest + (highest - lowest) * (n + 0.5) / count
-    level = np.sqrt(1 - up * up)
-    return np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
+    azimuth = 2 * np.pi * 0.6180339887 * n
+    height = lowest + (highest - lowest) * (n + 0.5) / count
+    level = np.sqrt(1 - height * height)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
 
 
 def unit(vectors: Floats) -> Floats:
-    """Scale vectors (n, 3) to length one; those of no length stay zero."""
+    """Scale vectors (n, 3) to length 1; zero vectors stay zero."""
     length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1.0)

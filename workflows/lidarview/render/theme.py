@@ -20,7 +20,7 @@ CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
 SENSOR = "#e0182d"
 VEIL = 0.085  # of MUTED over the page: the ground in a rendered picture
-# In pictures within a page, the page's style says what these are.
+# In pictures within a page, the style of the page defines these colours.
 STYLED = {
     PAGE: "page", GROUND: "ground", LINE: "line", INK: "ink", MUTED: "muted", UNSEEN: "unseen",
     SENSOR: "sensor",
@@ -40,19 +40,19 @@ def rgb(colour: str) -> Floats:
 
 
 def object_colours(count: int) -> Floats:
-    """Colours of `count` objects, (count, 3) in 0 to 1.
+    """Return the colours of `count` objects, (count, 3) in 0 to 1.
 
-    The first twelve are a chosen set; more are spread over the hues by the golden angle, with
-    lightness in three steps.
+    The first twelve are a chosen set; further colours are spread over the hues by the golden angle,
+    with lightness in three steps.
     """
     chosen = [to_rgb(colour) for colour in OBJECT_COLOURS[:count]]
-    more = [
+    further = [
         colorsys.hls_to_rgb((0.08 + 0.618034 * n) % 1.0, (0.42, 0.56, 0.68)[n % 3], 0.5)
         for n in range(count - len(chosen))
     ]
-    return np.array(chosen + more, dtype=np.float64).reshape(count, 3)
+    return np.array(chosen + further, dtype=np.float64).reshape(count, 3)
 
 
 def mapped(name: str, fraction: ArrayLike) -> Floats:
-    """Colours (n, 3) of a matplotlib colour map at fractions (n,) in 0 to 1."""
+    """Return the colours (n, 3) of a matplotlib colour map at fractions (n,) in 0 to 1."""
     return np.asarray(matplotlib.colormaps[name](np.asarray(fraction)), dtype=np.float64)[..., :3]

@@ -20,12 +20,12 @@ from lidarsim.columns.table import Column
 RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
-BLOCK = 1 << 15  # rows that are read at a time
-_FIRST_LOOK = 200_000  # points that tell how many are where in the picture
-_ACROSS = 48
-_DOWN = 27
-TILES = _ACROSS * _DOWN  # parts of a picture
-_KEPT = 0.8  # of the points, as often as they are too many
+BLOCK_ROWS = 1 << 15  # rows that are read at a time
+_SAMPLE_POINTS = 200_000  # points from which the counts of tiles are estimated
+_TILE_COLUMNS = 48
+_TILE_ROWS = 27
+TILES = _TILE_COLUMNS * _TILE_ROWS  # parts of a picture
+_KEEP_SHARE = 0.8  # of the points, each time there are too many
 
 
 class HeldPoints:
@@ -39,7 +39,7 @@ class HeldPoints:
         return len(self._cloud)
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Values of a column, or of x, y or z in world coordinates, in some rows."""
+        """Return the values of a column at rows; columns x, y and z are world coordinates."""
         if name in AXES:
             return np.asarray(self._cloud.positions[rows, AXES.index(name)])
         return self._cloud[name][rows]
@@ -50,7 +50,7 @@ class HeldPoints:
 
 
 class JoinedPoints:
-    """Points of several results, one after the other, with the columns that all of them have."""
+    """Points of several results in turn, with the columns that all results have."""
 
     table: tuple[Column, ...]
 
@@ -58,20 +58,22 @@ class JoinedPoints:
         self._firsts = np.cumsum([0, *map(len, parts)])  # rows; the last is one past all
         self.parts = [*zip(self._firsts[:-1].tolist(), parts, strict=True)]
         shared = set.intersection(*({column.name for column in part.table} for part in parts))
-        self.table = (*(one for one in parts[0].table if one.name in shared), RESULT)
+        self.table = (*(entry for entry in parts[0].table if entry.name in shared), RESULT)
 
     def __len__(self) -> int:
         return int(self._firsts[-1])
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Values of a column, or of x, y or z in world coordinates, in some rows, ascending."""
+        """Return the values of a column at ascending rows; x, y and z are world coordinates."""
         if isinstance(rows, slice):
             rows = np.arange(*rows.indices(len(self)))
-        ends = np.searchsorted(rows, self._firsts)
+        bounds = np.searchsorted(rows, self._firsts)
         if name == RESULT.name:
-            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(ends))
-        pieces = zip(self.parts, itertools.pairwise(ends), strict=True)
-        return np.concatenate([of.values(name, rows[a:b] - at) for (at, of), (a, b) in pieces])
+            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(bounds))
+        pieces = zip(self.parts, itertools.pairwise(bounds), strict=True)
+        return np.concatenate(
+            [part.values(name, rows[a:b] - first) for (first, part), (a, b) in pieces]
+        )
 
 
 Points = CloudFile | HeldPoints | JoinedPoints
@@ -89,9 +91,9 @@ class Filter:
 
     @classmethod
     def read(cls, text: str, names: Sequence[str]) -> Filter:
-        """Read limits from an address, ``column,lowest,highest;…``; others are left out.
+        """Read limits of known columns from an address, ``column,lowest,highest;…``.
 
-        ValueError if a limit is not a number.
+        `names` are the known columns. ValueError if a limit is not a number.
 
         Examples
         --------
@@ -102,23 +104,23 @@ class Filter:
         """
         limits = dict[str, tuple[float, float]]()
         for entry in filter(None, text.split(";")):
-            name, *ends = entry.rsplit(",", 2)
-            low, high = map(float, ends)
-            if math.isnan(low) or math.isnan(high):
+            name, *texts = entry.rsplit(",", 2)
+            lower, upper = map(float, texts)
+            if math.isnan(lower) or math.isnan(upper):
                 raise ValueError(f"{entry!r} has a limit that is not a number")
             if name in names:
-                lowest, highest = limits.get(name, (low, high))
-                limits[name] = max(low, lowest), min(high, highest)
-        return cls(tuple((name, *ends) for name, ends in limits.items()))
+                lowest, highest = limits.get(name, (lower, upper))
+                limits[name] = max(lower, lowest), min(upper, highest)
+        return cls(tuple((name, *texts) for name, texts in limits.items()))
 
     def keeps(self, points: Points, rows: Ints | slice) -> Bools:
-        """Whether some points, (n,), are within all limits."""
+        """Return a mask (n,) of the points at rows that are within all limits."""
         x, y, z = (points.values(axis, rows) for axis in AXES)
-        kept = np.asarray(np.isfinite(x + y + z))
-        for name, low, high in self.limits:
+        is_kept = np.asarray(np.isfinite(x + y + z))
+        for name, lower, upper in self.limits:
             values = points.values(name, rows)
-            kept &= (values >= low) & (values <= high)  # NaN is not
-        return kept
+            is_kept &= (values >= lower) & (values <= upper)  # False for NaN
+        return is_kept
 
 
 def read_scans(text: str) -> ScanRanges:
@@ -149,85 +151,89 @@ class Eye:
 
     @classmethod
     def read(cls, text: str) -> Eye:
-        """Read 16 numbers, column by column, as WebGL has them; ValueError if they are not."""
+        """Read 16 numbers in the order of WebGL, column by column; ValueError for other text."""
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
-    def seen(self, places: AnyFloats) -> tuple[AnyFloats, Bools]:
-        """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
-        x, y, z, w = self._clip(places)
+    def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
+        """Project points (n, 3) to the picture, (n, 2) in -1 to 1, with a visibility mask."""
+        x, y, z, w = self._clip(points)
         inside = (np.abs(x) < w) & (np.abs(y) < w) & (z > -w)
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
-    def _clip(self, places: AnyFloats) -> AnyFloats:
-        """Points (n, 3) in clip coordinates, (4, n)."""
-        return np.asarray(self.matrix[:, :3] @ places.T + self.matrix[:, 3:])
+    def _clip(self, points: AnyFloats) -> AnyFloats:
+        """Return points (n, 3) in clip coordinates, (4, n)."""
+        return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
-    def tiles(self, places: AnyFloats) -> Ints:
-        """Part of the picture of each point (n, 3): (n,); -1 outside."""
-        at, inside = self.seen(places)
-        across, down = (np.clip(at, -1, 0.9999).T + 1) / 2
-        column = (across * _ACROSS).astype(np.int64)
-        row = (down * _DOWN).astype(np.int64)
-        return np.where(inside, row * _ACROSS + column, -1)
+    def tiles(self, points: AnyFloats) -> Ints:
+        """Return the tile (n,) of the picture that each point (n, 3) is in; -1 outside."""
+        projected, inside = self.project(points)
+        x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
+        column = (x_share * _TILE_COLUMNS).astype(np.int64)
+        row = (y_share * _TILE_ROWS).astype(np.int64)
+        return np.where(inside, row * _TILE_COLUMNS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
-        """Whether a box (2, 3) may be partly in the picture."""
+        """Return True if a box (2, 3) may be partly in the picture."""
         x, y, z, w = self._clip(corners_of(box))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
 
 
 def corners_of(box: Floats) -> Floats:
-    """Corners (8, 3) of a box (2, 3)."""
+    """Return the corners (8, 3) of a box (2, 3)."""
     return np.array(list(itertools.product(*box.T)))
 
 
-def even_shares(counts: AnyArray, most: int) -> Floats:
-    """Shares (t,) of the points (t,) of each part of a picture, so that each part shows as many.
+def even_shares(counts: AnyArray, max_points: int) -> Floats:
+    """Return the share (t,) of points that each tile shows, the same number of points in each.
 
-    A part with fewer points shows all of them; they are `most` in all.
+    `counts` (t,) are the points of the tiles. A tile with fewer points shows all its points; all
+    tiles together show `max_points`.
     """
     ordered = np.sort(counts)
-    # All points of the parts before, and as many of each of the others.
-    each = (most - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
-    level = each[(each <= ordered).argmax()] if ordered.sum() > most else np.inf
+    # All points of smaller tiles, and equally many points of each further tile.
+    shares = (max_points - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
+    level = shares[(shares <= ordered).argmax()] if ordered.sum() > max_points else np.inf
     return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
 def positions(points: Points, rows: Ints | slice) -> Floats:
-    """Positions of some rows, float64 (n, 3), world coordinates, metres."""
-    # Columns one after the other are what the matrix product of a camera reads fastest.
+    """Return the positions at rows, float64 (n, 3), world coordinates, metres."""
+    # The matrix product of a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, rows) for axis in AXES], dtype=np.float64).T
 
 
 class Abandoned(Exception):  # noqa: N818 - no error: nobody waits for the answer any more
-    """Nobody waits for the points any more."""
+    """Raised when nobody waits for an answer any more."""
 
 
 class PointFinder:
     """Selects points of a cloud.
 
-    It remembers the bounding boxes of the blocks that it has read, 48 bytes each: 150 kB for a
+    The finder remembers the bounding boxes of blocks that were read, 48 bytes each: 150 kB for a
     hundred million points. `origin` is the world position of the local origin, (3,).
     """
 
     def __init__(self, points: Points, origin: Floats) -> None:
         self.points = points
         self._origin = origin
-        self._boxes = np.full((-(-len(points) // BLOCK), 2, 3), np.nan)  # NaN for unread blocks
+        self._boxes = np.full(
+            (-(-len(points) // BLOCK_ROWS), 2, 3), np.nan
+        )  # NaN for unread blocks
 
     def find(
         self,
-        most: int,
-        wanted: Filter = Filter(),
+        max_points: int,
+        point_filter: Filter = Filter(),
         scans: ScanRanges | None = None,
         eye: Eye | None = None,
         abandoned: Callable[[], bool] = lambda: False,
     ) -> tuple[Ints, int]:
-        """Find at most `most` points that pass a filter, in order.
+        """Find at most `max_points` points that pass a filter, in order.
 
-        They are evenly spaced in the file, or with an eye over its picture, where all are then.
-        `abandoned` is asked now and then; once it returns True, nobody waits for the answer.
+        The points are evenly spaced in the file; with an eye, all are in its picture and evenly
+        spaced there. `abandoned` is called now and then; once it returns True, nobody waits for the
+        answer.
 
         Returns
         -------
@@ -247,23 +253,27 @@ class PointFinder:
             parts: Sequence[tuple[int, Any]] = [(0, points)]
             if isinstance(points, JoinedPoints):
                 parts = points.parts
-            each = ((first, part.rows_of(one)) for first, part in parts for one in scans)
-            ranges = sorted((first + low, first + high) for first, (low, high) in each)
-        whole = sum(high - low for low, high in ranges)
-        if not wanted.limits and (eye is None or whole <= most):
-            numbers = even_indices(whole, most)
-            before = np.cumsum([0, *(high - low for low, high in ranges)])[:-1]
-            part = np.searchsorted(before, numbers, "right") - 1
-            rows = numbers + (np.array([low for low, _ in ranges], np.int64) - before)[part]
-            return rows[wanted.keeps(self.points, rows)], whole
+            row_ranges = (
+                (first, part.rows_of(scan_range)) for first, part in parts for scan_range in scans
+            )
+            ranges = sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
+        total = sum(stop - start for start, stop in ranges)
+        if not point_filter.limits and (eye is None or total <= max_points):
+            numbers = even_indices(total, max_points)
+            offsets = np.cumsum([0, *(stop - start for start, stop in ranges)])[:-1]
+            part = np.searchsorted(offsets, numbers, "right") - 1
+            rows = numbers + (np.array([start for start, _ in ranges], np.int64) - offsets)[part]
+            return rows[point_filter.keeps(self.points, rows)], total
         if eye is None:
-            return self._search(ranges, most, wanted, abandoned)
-        some, count = self.find(_FIRST_LOOK, wanted, scans, None, abandoned)
-        tiles = eye.tiles(self._local(some))
-        counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(some), 1))
-        if counts.sum() == 0:  # the sample may have missed a few
+            return self._search(ranges, max_points, point_filter, abandoned)
+        sample, count = self.find(_SAMPLE_POINTS, point_filter, scans, None, abandoned)
+        tiles = eye.tiles(self._local(sample))
+        counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(sample), 1))
+        if counts.sum() == 0:  # the sample may have missed rare points
             counts += 1
-        rows, _ = self._search(ranges, most, wanted, abandoned, eye, even_shares(counts, most))
+        rows, _ = self._search(
+            ranges, max_points, point_filter, abandoned, eye, even_shares(counts, max_points)
+        )
         return rows, count
 
     def _local(self, rows: Ints | slice) -> Floats:
@@ -272,40 +282,46 @@ class PointFinder:
     def _search(
         self,
         ranges: Sequence[tuple[int, int]],
-        most: int,
-        wanted: Filter,
+        max_points: int,
+        point_filter: Filter,
         abandoned: Callable[[], bool],
         eye: Eye | None = None,
         shares: Floats | None = None,
     ) -> tuple[Ints, int]:
-        """Read blocks one after the other; the points that are kept become fewer on the way."""
+        """Read blocks in turn, and thin the points out while there are too many.
+
+        Arguments and results are those of `find`, with ranges of rows (start, stop), and the shares
+        (tiles,) of the points that are kept in each tile of the eye's picture.
+        """
         random = np.random.default_rng(0)
         thin = 1.0
-        found = 0
-        kept = [np.empty(0, np.int64)]
-        for low, high in ranges:
-            for number in range(low // BLOCK, -(-high // BLOCK)):
+        count = 0
+        chunks = [np.empty(0, np.int64)]
+        for start, stop in ranges:
+            for block in range(start // BLOCK_ROWS, -(-stop // BLOCK_ROWS)):
                 if abandoned():
                     raise Abandoned
-                first = max(low, number * BLOCK)
-                last = min(high, (number + 1) * BLOCK)
-                box = self._boxes[number]
+                first = max(start, block * BLOCK_ROWS)
+                last = min(stop, (block + 1) * BLOCK_ROWS)
+                box = self._boxes[block]
                 is_read = not np.isnan(box[0, 0])
                 if eye is not None and is_read and not eye.may_see(box):
                     continue
-                rows = first + np.flatnonzero(wanted.keeps(self.points, slice(first, last)))
-                found += len(rows)
+                rows = first + np.flatnonzero(point_filter.keeps(self.points, slice(first, last)))
+                count += len(rows)
                 share = np.full(len(rows), thin)
                 if eye is not None and shares is not None and len(rows):
-                    places = self._local(rows)
-                    whole = len(rows) == min(BLOCK, len(self.points) - number * BLOCK)
-                    if whole and not is_read:
-                        box[:] = places.min(axis=0), places.max(axis=0)
-                    tiles = eye.tiles(places)
+                    local = self._local(rows)
+                    is_whole_block = len(rows) == min(
+                        BLOCK_ROWS, len(self.points) - block * BLOCK_ROWS
+                    )
+                    if is_whole_block and not is_read:
+                        box[:] = local.min(axis=0), local.max(axis=0)
+                    tiles = eye.tiles(local)
                     share *= np.where(tiles >= 0, shares[tiles], 0.0)
-                kept.append(rows[random.random(len(rows)) < share])
-                while sum(map(len, kept)) > most:
-                    thin *= _KEPT
-                    joined = np.concatenate(kept)
-                    kept = [joined[random.random(len(joined)) < _KEPT]]
-        return np.concatenate(kept), found
+                chunks.append(rows[random.random(len(rows)) < share])
+                while sum(map(len, chunks)) > max_points:
+                    thin *= _KEEP_SHARE
+                    joined = np.concatenate(chunks)
+                    chunks = [joined[random.random(len(joined)) < _KEEP_SHARE]]
+        return np.concatenate(chunks), count

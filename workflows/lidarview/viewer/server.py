@@ -1,8 +1,8 @@
-"""Serves a page to browsers of this machine: files, and answers to what the page asks for.
+"""Serves a page to browsers of this machine: files, and answers to the questions of the page.
 
 The page asks with GET and gives orders with POST. Its address holds a random token; other addresses
-are answered with 404, so that only who knows the token sees the page or orders anything: no other
-user of the machine, and no website. All addresses within the page are relative, so that it also
+are answered with 404, so that no website, and no user of the machine who does not know the token,
+sees the page or gives orders. All addresses within the page are relative, so that the page also
 works behind a proxy.
 """
 
@@ -41,10 +41,10 @@ PORT = 8080  # or the next that is free
 VIEWER = "index.html"
 _PORTS_TRIED = 100
 
-_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
+_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable of a hub's kernels: the user's path
 
-SLOW_AT_ONCE = 2  # slow answers of a kind that are made or sent at a time
-SLOW_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
+MAX_SLOW = 2  # slow answers of a kind that are computed or sent at a time
+MAX_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
 LARGE_POINTS = 1_000_000  # an answer of more points is large
 LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
 STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
@@ -55,65 +55,66 @@ _PIECE = 1 << 20  # bytes that are written at a time
 _LOGGER = logging.getLogger(__name__)
 
 Arguments = Mapping[str, str]
-Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # what is written as JSON, and arrays
+Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # content of the JSON text, and arrays
 
 
 # Answers a question with its arguments: KeyError or ValueError if there is no such question or an
-# argument is wrong; Abandoned if the function it is given says that nobody waits any more.
+# argument is wrong; Abandoned once the function (the last argument) says that nobody waits.
 Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
 
 
 def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes]:
-    """Write JSON and arrays as one message.
+    """Write JSON and arrays as a single message.
 
-    It begins with the length of the JSON text, uint32, which lists the arrays: name, type, shape,
-    and first byte after the text. All numbers are little-endian.
+    The message starts with the length of the JSON text, uint32. The text lists the arrays: name,
+    type, shape, and first byte after the text. All numbers are little-endian.
     """
     listed: list[Any] = []
     pieces: list[bytes] = []
-    at = 0
+    offset = 0
     for name, values in arrays.items():
         little = values.astype(values.dtype.newbyteorder("<"), order="C", copy=False)
-        listed.append([name, little.dtype.name, list(little.shape), at])
-        room = -little.nbytes % _ALIGNED
-        pieces += [little.tobytes(), bytes(room)]
-        at += little.nbytes + room
+        listed.append([name, little.dtype.name, list(little.shape), offset])
+        padding = -little.nbytes % _ALIGNED
+        pieces += [little.tobytes(), bytes(padding)]
+        offset += little.nbytes + padding
     text = json.dumps(header | {"arrays": listed}, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % _ALIGNED)
     return [len(text).to_bytes(4, "little"), text, *pieces]
 
 
-def is_large(what: str, asked: Arguments) -> bool:
-    """Whether an answer may have millions of points: then it holds memory until it is read.
+def is_large(question: str, arguments: Arguments) -> bool:
+    """Return True if an answer may have millions of points, and holds memory until it is read.
 
     ValueError if the number of points is no number.
     """
-    kind = what.rpartition("/")[2]
-    return kind == "export" or (kind == "points" and int(asked.get("most", 0)) > LARGE_POINTS)
+    kind = question.rpartition("/")[2]
+    return kind == "export" or (kind == "points" and int(arguments.get("most", 0)) > LARGE_POINTS)
 
 
-def is_search(what: str, asked: Arguments) -> bool:
-    """Whether an answer may take seconds because all points are searched."""
-    long_lists = len(asked.get("scans", "")) > LONG_TEXT
-    return what.rpartition("/")[2] == "points" and (bool(asked.get("filter")) or long_lists)
+def is_search(question: str, arguments: Arguments) -> bool:
+    """Return True if an answer may take seconds because all points are searched."""
+    long_lists = len(arguments.get("scans", "")) > LONG_TEXT
+    return question.rpartition("/")[2] == "points" and (bool(arguments.get("filter")) or long_lists)
 
 
 class SlowQuestions:
-    """Answers few slow questions of a kind at a time, in threads of their own.
+    """Slots for slow questions of a kind, which are answered in separate threads.
 
-    An answer has its turn until the browser has read it, so that few large ones are in memory.
-    Large answers and searches are two kinds: large ones that nobody reads delay no search.
+    An answer holds its slot until the browser has read the answer, so that few large answers are in
+    memory. Large answers and searches are two kinds: large answers that nobody reads delay no
+    search.
     """
 
     def __init__(self) -> None:
-        self.threads = ThreadPoolExecutor(SLOW_AT_ONCE, "lidarpool-page-slow")
-        self._free = asyncio.Semaphore(SLOW_AT_ONCE)
+        self.threads = ThreadPoolExecutor(MAX_SLOW, "lidarpool-page-slow")
+        self._free = asyncio.Semaphore(MAX_SLOW)
         self._waiting = 0
 
     @asynccontextmanager
-    async def turn(self) -> AsyncIterator[None]:
-        """Wait for a turn, which lasts as long as the body; HTTPError if too many wait."""
-        if self._waiting >= SLOW_WAITING:
+    async def slot(self) -> AsyncIterator[None]:
+        """Wait for a slot and hold it during the body; HTTPError if too many questions wait."""
+        if self._waiting >= MAX_WAITING:
             raise HTTPError(503, "too many slow questions wait")
         self._waiting += 1
         try:
@@ -127,19 +128,19 @@ class SlowQuestions:
 
 
 class _Guarded(RequestHandler):
-    """Answers who knows the page's token."""
+    """Answers requests with the page's token."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
         self.set_header("Referrer-Policy", "no-referrer")  # the address holds the token
-        # The page of a campaign frames those of its jobs. The cell of a notebook, whose address is
-        # unknown here, frames any of them.
+        # The page of a campaign frames the pages of its jobs. The cell of a notebook, whose address
+        # is unknown here, frames any page.
         if not self.settings["in_notebook"]:
             self.set_header("Content-Security-Policy", "frame-ancestors 'self'")
 
     def prepare(self) -> None:
-        """Answer 404 without the token, and lead there from an address that is good once."""
+        """Answer 404 without the token, and redirect an address of single use to the page."""
         page: PageServer = self.settings["page"]
         token = self.request.path.split("/")[1]
         if token in page.good_once:
@@ -149,7 +150,7 @@ class _Guarded(RequestHandler):
             raise HTTPError(404)
 
     def log_exception(self, *error: Any) -> None:
-        """Log what is our fault only."""
+        """Log errors that are not the client's."""
         if not isinstance(error[1], HTTPError):
             _LOGGER.error("the page's question was not answered", exc_info=error)
 
@@ -159,62 +160,62 @@ class _File(_Guarded, StaticFileHandler):
 
 
 class _Question(_Guarded):
-    """Answers one question. `source` may take long: it is asked in a thread of its own.
+    """Answers a question by `source`, which may take long, in a separate thread.
 
-    Slow questions of a kind wait for one another, others are answered meanwhile.
+    Slow questions of a kind wait for a slot; the rest are answered meanwhile.
     """
 
     def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
         self._source = source
         self._stop = stop
-        self._gone = threading.Event()
+        self._disconnected = threading.Event()
 
-    async def get(self, what: str) -> None:
-        asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
+    async def get(self, question: str) -> None:
+        arguments = {name: self.get_query_argument(name) for name in self.request.query_arguments}
         try:
             slow: SlowQuestions | None = None
-            if is_large(what, asked):
+            if is_large(question, arguments):
                 slow = self.settings["large"]
-            elif is_search(what, asked):
+            elif is_search(question, arguments):
                 slow = self.settings["searches"]
             if slow is not None:
-                async with slow.turn():
-                    await self._answer(slow.threads, what, asked)
+                async with slow.slot():
+                    await self._answer(slow.threads, question, arguments)
             else:
-                await self._answer(None, what, asked)
+                await self._answer(None, question, arguments)
         except (KeyError, ValueError) as error:
             raise HTTPError(404, "%s", repr(error)) from error
         except (Abandoned, StreamClosedError):
             return
 
     async def _answer(
-        self, threads: ThreadPoolExecutor | None, what: str, asked: Arguments
+        self, threads: ThreadPoolExecutor | None, question: str, arguments: Arguments
     ) -> None:
-        """Make an answer in a thread and send it; Abandoned if the browser has left."""
-        if self._gone.is_set():
+        """Compute an answer in a thread and send the answer; Abandoned if the browser has left."""
+        if self._disconnected.is_set():
             raise Abandoned
 
         def pieces() -> list[bytes]:
-            return bundle(*self._source(what, asked, self._gone.is_set))
+            return bundle(*self._source(question, arguments, self._disconnected.is_set))
 
         answer = await asyncio.get_running_loop().run_in_executor(threads, pieces)
         self.set_header("Content-Type", "application/octet-stream")
         for piece in answer:
-            for at in range(0, len(piece), _PIECE):
-                self.write(piece[at : at + _PIECE])
+            for offset in range(0, len(piece), _PIECE):
+                self.write(piece[offset : offset + _PIECE])
                 try:
                     await asyncio.wait_for(self.flush(), STALL_S)
                 except TimeoutError as error:
                     self.detach().close()
                     raise Abandoned from error
 
-    def post(self, what: str) -> None:
-        if what != "stop" or self._stop is None:
+    def post(self, order: str) -> None:
+        if order != "stop" or self._stop is None:
             raise HTTPError(404)
         self._stop()
 
     def on_connection_close(self) -> None:
-        self._gone.set()
+        self._disconnected.set()
 
 
 @dataclass(frozen=True)
@@ -227,13 +228,13 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """Its address, which ends with "/"."""
+        """Address of the page, which ends with "/"."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
     def once(self) -> str:
         """Return an address that leads to the page once.
 
-        Other users of the machine see what a browser is started with.
+        Other users of the machine see the arguments that a browser is started with.
         """
         self.good_once.append(secrets.token_urlsafe())
         return f"http://{HOST}:{self.port}/{self.good_once[-1]}/"
@@ -243,16 +244,16 @@ class PageServer:
 def page_server(
     source: Source, port: int = PORT, stop: Callable[[], None] | None = None, *, index: str = VIEWER
 ) -> Iterator[PageServer]:
-    """Serve a page while the body runs, in a thread of its own, on a port or the next free one.
+    """Serve a page while the body runs, in a separate thread, on a port or the next free port.
 
     A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
-    the page's file; the viewer of a job is at ``job/NUMBER/``, and asks what begins with that.
+    the page's file; the viewer of a job is at ``job/NUMBER/``, with which its questions start.
     """
-    bound = _bound(port)
+    listener = _open_socket(port)
     folder = str(files(__package__) / "page")
     page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
-    bound.setblocking(False)
-    made = PageServer(bound.getsockname()[1])
+    listener.setblocking(False)
+    served_page = PageServer(listener.getsockname()[1])
     running: Future[asyncio.AbstractEventLoop] = Future()
     ended = asyncio.Event()
 
@@ -266,11 +267,11 @@ def page_server(
         application.settings |= {
             "large": SlowQuestions(),
             "searches": SlowQuestions(),
-            "page": made,
+            "page": served_page,
             "in_notebook": cell_display() is not None,
         }
         server = HTTPServer(application)
-        server.add_socket(bound)
+        server.add_socket(listener)
         loop = asyncio.get_running_loop()
         loop.set_default_executor(ThreadPoolExecutor(2, "lidarpool-page"))
         running.set_result(loop)
@@ -282,16 +283,17 @@ def page_server(
     thread.start()
     loop = running.result()
     try:
-        yield made
+        yield served_page
     finally:
         loop.call_soon_threadsafe(ended.set)
         thread.join()
 
 
-def _bound(port: int) -> socket.socket:
-    for tried in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
+def _open_socket(port: int) -> socket.socket:
+    """Listen on a port, or a higher port that is free; on any port if it is 0 or none is free."""
+    for candidate in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
         with suppress(OSError):
-            return socket.create_server((HOST, tried), backlog=128)
+            return socket.create_server((HOST, candidate), backlog=128)
     return socket.create_server((HOST, 0), backlog=128)
 
 
@@ -302,7 +304,7 @@ def announced(
     """Print a page's address while the body runs, or show the page in the cell of a notebook.
 
     The address is on stderr, beside the progress of a run, or `on_stdout` where it is the result.
-    `browser`: open one where there is a desktop, and no notebook.
+    `browser` opens a browser where there is a desktop, and no notebook.
     """
     display = cell_display()
     if display is None:
@@ -329,8 +331,8 @@ def announced(
 
 
 def open_browser(url: str) -> None:
-    """Open a page if there is a desktop to open it on."""
+    """Open a page in a browser, if there is a desktop."""
     desktop = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if "SSH_CONNECTION" in os.environ or (sys.platform.startswith("linux") and not desktop):
-        return  # else a browser in the terminal would take it over
+        return  # a browser in the terminal would take the terminal over
     webbrowser.open(url)

@@ -1,4 +1,4 @@
-"""A result as one file to share: a film, or a page that needs no server."""
+"""Writes a result as a single file to share: a film, or a page that needs no server."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import base64
 import io
 import json
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise, repeat
 from pathlib import Path
@@ -25,28 +25,29 @@ from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
+from ..picture_file import SensorPositions
 from ..render.colouring import TURBO
 from ..render.film import Film
 from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
-from .view import MOST_POINTS, View, open_result
+from .view import MAX_POINTS, View, open_result
 
-_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: most frames, colours or quality}
-_FEWEST = 30  # frames of a film
+_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
+_MIN_FRAMES = 30
 _FRAME_MS = 100
 _FILM_BYTES = 3_000_000
-_WIDTHS = range(960, 320, -80)  # of a film, pixels, the best first
+_WIDTHS = range(960, 320, -80)  # of a film, pixels, the widest first
 _FILM_TRIANGLES = 3_000_000
 _FILM_POINTS = 800_000  # that a film shows at a time
 _FRAME_POINTS = 200_000  # that a frame adds
 _PAGE_BYTES = 25_000_000
 _PAGE_POINTS = 1_000_000
 _PAGE_TRIANGLES = 60_000
-_CHOSEN_FROM = 5_000_000  # points of which a page has some
-_CELLS = 300  # along the diagonal of the points, to find where they are dense
+_SAMPLE_POINTS = 5_000_000  # points from which those of a page are chosen
+_CELLS = 300  # along the diagonal of the points, in which their density is counted
 
 
-def _show_nothing(output: str, done: int, total: int, unit: str) -> None:
+def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
     """Show no progress."""
 
 
@@ -58,7 +59,7 @@ def share(
 ) -> None:
     """Write a result's folder, or a cloud, as a film, a page or both; files are replaced.
 
-    `writing` opens the display of an output's progress, under words; by default nothing is shown.
+    `writing` opens the display of an output's progress, with a caption; none by default.
 
     LidarError if there are no points, or a file has another suffix or cannot be written.
     """
@@ -82,9 +83,9 @@ def share(
 
 
 def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> bytes:
-    """Return a film, ".gif" or ".webp", of at most about 3 MB and as wide as these allow.
+    """Return a film, ".gif" or ".webp", of at most about 3 MB, and as wide as possible.
 
-    `show` shows how many frames are drawn.
+    `show` shows the number of frames that are drawn.
     """
     max_frames, quality = _FILMS[suffix]
     film = _film(replace(view, triangles=_FILM_TRIANGLES), max_frames)
@@ -93,79 +94,111 @@ def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> b
         frames.append(Image.fromarray(frame))
         show("film", len(frames), len(film.moments_ns), "frames")
 
-    def encoded(frames: list[Image.Image], width: int) -> bytes:
-        small = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
-        if suffix == ".gif":  # with a palette for each frame, colours would flicker
-            every = np.concatenate([np.asarray(frame)[::2, ::2] for frame in small])
-            palette = Image.fromarray(every).quantize(quality, Image.Quantize.FASTOCTREE)
-            small = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in small]
-        file = io.BytesIO()
-        small[0].save(
-            file,
-            suffix[1:],
-            append_images=small[1:],
-            save_all=True,
-            duration=_FRAME_MS,
-            loop=0,
-            quality=quality,
-        )
-        return file.getvalue()
-
     sample = frames[len(frames) // 6 :: len(frames) // 3]
     max_bytes = 0.95 * _FILM_BYTES * len(sample) / len(frames)
-    fitting = (width for width in _WIDTHS if len(encoded(sample, width)) < max_bytes)
-    return encoded(frames, next(fitting, _WIDTHS[-1]))
+    widths = (w for w in _WIDTHS if len(_encode(sample, suffix, w, quality)) < max_bytes)
+    return _encode(frames, suffix, next(widths, _WIDTHS[-1]), quality)
 
 
-def _film(view: View, max_frames: int) -> Film:
-    """Return the film of a view: along its first moving sensor, or around still points."""
-    finder = PointFinder(view.points, view.origin)
-    still = np.empty((0, 3, 3))
-    top = np.inf
-    if view.pictured is not None and len(view.pictured.scene.faces):
-        header, arrays = view.answer("surface", {"colour": "grey"}, bool)
-        still = arrays["corners"]
-        top = header["roof_cut"] or top
+def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) -> bytes:
+    """Encode frames in a width in pixels; `quality` is the number of colours of a .gif."""
+    scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
+    if suffix == ".gif":  # with a palette for each frame, colours would flicker
+        pixels = np.concatenate([np.asarray(frame)[::2, ::2] for frame in scaled])
+        palette = Image.fromarray(pixels).quantize(quality, Image.Quantize.FASTOCTREE)
+        scaled = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in scaled]
+    file = io.BytesIO()
+    scaled[0].save(
+        file,
+        suffix[1:],
+        append_images=scaled[1:],
+        save_all=True,
+        duration=_FRAME_MS,
+        loop=0,
+        quality=quality,
+    )
+    return file.getvalue()
 
-    def read(max_points: int, scans: ScanRanges | None = None) -> tuple[Floats, Floats]:
-        rows, _ = finder.find(max_points, scans=scans)
-        local = positions(view.points, rows) - view.origin
-        local = local[local[:, 2] <= top]
+
+@dataclass(frozen=True, eq=False)
+class _FilmSource:
+    """Points of a view for a film, coloured by height."""
+
+    view: View
+    finder: PointFinder
+    top: float  # height above which the scene is cut open, metres
+
+    def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
+        """Return local positions (n, 3) of points below the top."""
+        rows, _ = self.finder.find(max_points, scans=scans)
+        local = positions(self.view.points, rows) - self.view.origin
+        return local[local[:, 2] <= self.top]
+
+    def points(
+        self, box: Floats, max_points: int, scans: ScanRanges | None = None
+    ) -> tuple[Floats, Floats]:
+        """Return local positions (n, 3), and colours (n, 4) by the height in a box (2, 3)."""
+        local = self.positions(max_points, scans)
         share = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
         colours = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colours are lost
         return local, np.pad(colours, ((0, 0), (0, 1)), constant_values=1)
 
-    box = np.zeros((2, 3))
-    box = np.percentile(read(_FRAME_POINTS)[0], [1, 99], axis=0)
-    frames = int(np.clip(view.duration_ns / (1e6 * _FRAME_MS), _FEWEST, max_frames))
-    moments: Floats = np.linspace(0, view.duration_ns, frames + 1)[1:]
+    def parts(self, box: Floats, spans: Sequence[ScanRanges]) -> Iterator[tuple[Floats, Floats]]:
+        """Yield the points and colours of each frame's scans."""
+        for scans in spans:
+            yield self.points(box, _FRAME_POINTS, scans)
+
+
+def _film(view: View, max_frames: int) -> Film:
+    """Return the film of a view: along its first moving sensor, or around static points."""
+    triangles = np.empty((0, 3, 3))
+    top = np.inf
+    if view.pictured is not None and len(view.pictured.scene.faces):
+        header, arrays = view.answer("surface", {"colour": "grey"}, bool)
+        triangles = arrays["corners"]
+        top = header["roof_cut"] or top
+    source = _FilmSource(view, PointFinder(view.points, view.origin), top)
+    box = np.percentile(source.positions(_FRAME_POINTS), [1, 99], axis=0)
+    frames = int(np.clip(view.duration_ns / (1e6 * _FRAME_MS), _MIN_FRAMES, max_frames))
+    film = Film(
+        moments_ns=np.linspace(0, view.duration_ns, frames + 1)[1:],
+        parts=repeat(source.points(box, _FILM_POINTS), frames),
+        keep_share=0.0,
+        scene_triangles=triangles,
+        top=top,
+        actors=view.actors,
+        box=box,
+    )
     moving = [sensor for sensor in view.sensors if sensor.moves]
-    film = Film(moments, repeat(read(_FILM_POINTS), frames), 0.0, still, top, view.actors, box)
     if view.sweeps is None or not (moving or view.actors):
         return film
-    intervals = pairwise([-np.inf, *moments[:-1], np.inf])
+    intervals = pairwise([-np.inf, *film.moments_ns[:-1], np.inf])
     spans = [_scans_between(view.sweeps, *interval) for interval in intervals]
     all_points = max(_FILM_POINTS, min(len(view.points), _FRAME_POINTS * frames))
-    parts = (read(_FRAME_POINTS, scans) for scans in spans)
-    film = replace(film, parts=parts, kept=_FILM_POINTS / all_points)
-    if moving:
-        sensor = moving[0]
-        halfway = sensor.at(moments[frames // 2])
-        local, _ = read(_FRAME_POINTS, spans[frames // 2])
-        ranges = np.linalg.norm(local - halfway, axis=1)
-        range_m = float(np.median(ranges)) if len(ranges) else 20.0
-        film = replace(film, way=(sensor.times_ns, sensor.positions), range_m=range_m)
-    return film
+    film = replace(film, parts=source.parts(box, spans), keep_share=_FILM_POINTS / all_points)
+    return _follow(film, moving[0], source, spans) if moving else film
 
 
-def _scans_between(sweeps: Sweeps, begin_ns: float, end_ns: float) -> ScanRanges:
-    """Return the scans from a time to another; scans are even over each sweep."""
+def _follow(
+    film: Film, sensor: SensorPositions, source: _FilmSource, spans: Sequence[ScanRanges]
+) -> Film:
+    """Return a film that follows a sensor; `spans` are the scans of each frame."""
+    middle = len(spans) // 2
+    position = sensor.position_at(film.moments_ns[middle])
+    ranges = np.linalg.norm(source.positions(_FRAME_POINTS, spans[middle]) - position, axis=1)
+    range_m = float(np.median(ranges)) if len(ranges) else 20.0
+    trajectory = (sensor.times_ns, sensor.positions)
+    return replace(film, carrier_trajectory=trajectory, range_m=range_m)
+
+
+def _scans_between(sweeps: Sweeps, start_ns: float, stop_ns: float) -> ScanRanges:
+    """Return the ranges of scans between two times; scans are even over each sweep."""
     first = sweeps.scans[:-1]
     count = np.diff(sweeps.scans)
     scan_ns = np.maximum(sweeps.ends_ns - sweeps.begins_ns, 1.0) / count
     starts, stops = (
         first + np.ceil(np.clip((time - sweeps.begins_ns) / scan_ns, 0, count)).astype(np.int64)
-        for time in (begin_ns, end_ns)
+        for time in (start_ns, stop_ns)
     )
     spans = zip(starts.tolist(), stops.tolist(), strict=True)
     return tuple((start, stop - 1) for start, stop in spans if start < stop)
@@ -174,8 +207,24 @@ def _scans_between(sweeps: Sweeps, begin_ns: float, end_ns: float) -> ScanRanges
 def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
     """Return a page of at most 25 MB that holds the answers to all its questions.
 
-    `show` shows how many answers are held.
+    `show` shows the number of answers that are packed.
     """
+    page = _page_with_modules()
+    view = replace(view, triangles=_PAGE_TRIANGLES)
+    answers = _pack_answers(view, show)
+    free_bytes = _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in answers.values())
+    max_points = _PAGE_POINTS
+    while len(cloud := _packed(*_thinned(view, max_points))) > free_bytes:
+        max_points = int(max_points * min(0.9, 0.95 * max(free_bytes, 0) / len(cloud)))
+        if max_points < 1000:
+            raise LidarError("Even without points the page has 25 MB: use lidarpool view only.")
+    script = '<script type="text/plain" data-question="{}">{}</script>\n'
+    texts = [script.format(*pair) for pair in (answers | {"cloud?": cloud}).items()]
+    return page.replace("</body>", "".join([*texts, "</body>"])).encode()
+
+
+def _page_with_modules() -> str:
+    """Return the viewer's page with its styles and modules inside."""
     folder = files(__package__) / "page"
     modules: dict[str, str] = {}
     page = (folder / VIEWER).read_text("utf-8")
@@ -188,24 +237,19 @@ def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
             modules[file.name] = f"data:text/javascript;base64,{code}"
     inside = f'<script type="importmap">{json.dumps({"imports": modules}, sort_keys=True)}</script>'
     inside += '\n<script type="module">import "page.js";</script>'
-    page = page.replace('<script type="module" src="page.js"></script>', inside)
-    view = replace(view, triangles=_PAGE_TRIANGLES)
+    return page.replace('<script type="module" src="page.js"></script>', inside)
+
+
+def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
+    """Return the answers to all questions of a page but for points: {question: packed answer}."""
     header, arrays = view.answer("state", {}, bool)
-    held = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
+    answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
     questions = [("surface", "colour", value) for value in header["scene"] or ()]
     questions += [("column", "name", value) for value in view.columns]
     for number, (question, key, value) in enumerate(questions, 1):
-        held[f"{question}?{key}={value}"] = _packed(*view.answer(question, {key: value}, bool))
+        answers[f"{question}?{key}={value}"] = _packed(*view.answer(question, {key: value}, bool))
         show("page", number, len(questions), "answers")
-    room = _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in held.values())
-    max_points = _PAGE_POINTS
-    while len(cloud := _packed(*_thinned(view, max_points))) > room:
-        max_points = int(max_points * min(0.9, 0.95 * max(room, 0) / len(cloud)))
-        if max_points < 1000:
-            raise LidarError("Even without points the page has 25 MB: use lidarpool view only.")
-    script = '<script type="text/plain" data-question="{}">{}</script>\n'
-    texts = [script.format(*pair) for pair in (held | {"cloud?": cloud}).items()]
-    return page.replace("</body>", "".join([*texts, "</body>"])).encode()
+    return answers
 
 
 def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
@@ -214,8 +258,8 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 
 
 def _thinned(view: View, max_points: int) -> Answer:
-    """Choose points, fewer where they are dense, with all columns and the colours by each."""
-    rows, _ = PointFinder(view.points, view.origin).find(_CHOSEN_FROM)
+    """Choose points, fewer where points are dense, with all columns and the colours by each."""
+    rows, _ = PointFinder(view.points, view.origin).find(_SAMPLE_POINTS)
     world = positions(view.points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]
@@ -223,15 +267,20 @@ def _thinned(view: View, max_points: int) -> Answer:
     shares = even_shares(counts, max_points)[cell_of_point]
     chosen = np.random.default_rng(0).random(len(rows)) < shares
     columns = {c.name: view.points.values(c.name, rows[chosen]) for c in view.points.table}
-    thin = replace(view, points=HeldPoints(Cloud(world[chosen], columns, view.points.table)))
+    held = HeldPoints(Cloud(world[chosen], columns, view.points.table))
+    return _coloured_points(replace(view, points=held), columns)
+
+
+def _coloured_points(view: View, columns: Mapping[str, AnyArray]) -> Answer:
+    """Return all points of a view with their columns, and colours and legends by each column."""
     legends = dict[str, Any]()
     arrays: dict[str, AnyArray] = {n: values.astype(np.float64) for n, values in columns.items()}
-    for name in thin.answer("state", {}, bool)[0]["colours"]:
-        question = {"colour": name, "most": str(MOST_POINTS)}
-        header, points = thin.answer("points", question, bool)
+    for name in view.answer("state", {}, bool)[0]["colours"]:
+        question = {"colour": name, "most": str(MAX_POINTS)}
+        header, points = view.answer("points", question, bool)
         palette, shades = np.unique(points["colours"].view(np.uint32), return_inverse=True)
-        kind = np.uint8 if len(palette) <= 1 << 8 else np.uint32
-        arrays |= {f"{name} palette": palette, f"{name} shades": shades.ravel().astype(kind)}
+        dtype = np.uint8 if len(palette) <= 1 << 8 else np.uint32
+        arrays |= {f"{name} palette": palette, f"{name} shades": shades.ravel().astype(dtype)}
         legends[name] = header["legend"]
         arrays["positions"] = points["positions"]
     return {"legends": legends, "origin": view.origin.tolist()}, arrays
