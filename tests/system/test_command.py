@@ -290,3 +290,30 @@ def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
         assert command.stderr.read() == ""
     assert command.returncode == 0
     assert (tmp_path / "lidarpool-out" / "cloud.ply").exists() == (arguments[0] == "run")
+
+
+def test_a_timeline_says_when_each_step_ended(tmp_path):
+    (tmp_path / "scenario.yaml").write_text(SHORT)
+    page = tmp_path / "timeline.html"
+    arguments = ["run", "scenario.yaml", "-q", "--only", "cloud", "--timeline", page]
+    ended = subprocess.run(
+        [*COMMAND, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    table = re.search(r"^step +takes +ends at\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
+    lines = table[1].splitlines()
+    rows = [re.fullmatch(r"(\D+?) +([\d.]+) s +([\d.]+) s", line).groups() for line in lines]
+    steps = [name for name, _, _ in rows]
+    assert steps[:3] == ["command imported", "scene read", "workers started"]
+    assert steps[-4:] == ["report written", "result in place", "summary printed", "exit"]
+    assert {"first receipt", "last receipt", "paths planned", "cloud written"} < {*steps}
+    ends = [float(end) for _, _, end in rows]
+    assert ends == sorted(ends)
+    assert sum(float(takes) for _, takes, _ in rows) == pytest.approx(ends[-1], abs=0.1)
+    text = page.read_text("utf-8")
+    assert all(f"<td>{step}</td>" in text for step in steps)
+    assert text.count("<rect") == len(steps)
+
+
+def test_a_timeline_that_cannot_be_written_is_refused_at_once(tmp_path, lidarpool):
+    outcome = lidarpool("run", "x.yaml", "--timeline", tmp_path / "missing" / "timeline.html")
+    assert outcome.code == 2 and "give another name or folder" in outcome.err

@@ -57,6 +57,9 @@ _common_options = shared.combine(
         "--only", type=click.Choice(["cloud"]), help="Write the cloud and report.json, no page."
     ),
     shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
+    shared.path(
+        "--timeline", help="Print when each step of the command ends, and draw it as a page here."
+    ),
     shared.flag("--quiet", "-q", help="No progress, only the result."),
     shared.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
     shared.strict,
@@ -83,13 +86,17 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def prepared(
         *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
-        only: str | None, strict: bool, pictures: bool = False, **settings: Any,
+        only: str | None, strict: bool, pictures: bool = False, timeline: Path | None = None,
+        **settings: Any,
     ) -> None:  # fmt: skip
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
         settings["extent"] = "pictures" if pictures else only
+        from ..base import timeline as steps
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
+        if timeline is not None:
+            steps.timeline.show_at_exit(timeline)
         keep_freed_memory()
         if cluster is None and settings.get("scheduler") is None:
             start_fork_server()
@@ -99,6 +106,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal
+            steps.mark(steps.COMMAND)
             set_logs(verbose)
             run_settings: dict[str, Any] = {}
             if cluster is not None:

@@ -17,6 +17,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural
 from lidarsim.simulator.scene_caster import check_backend_here
 
+from ..base import timeline
 from ..base.shard import Shard, shard_in_words
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
@@ -61,6 +62,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
+    timeline.mark(timeline.SCENE)
     for warning in implausibilities(built):
         terminal.warn(warning)
     if shard is None:
@@ -99,6 +101,7 @@ def _run_survey(
         result, report = Run(jobs, options, output, terminal, page).execute()
         lines = _result_lines(options.out, result, job, report, terminal)
         show(summary(options.out, report), lines, terminal.as_json)
+        timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
                 page.stay(folder / CLOUD)
@@ -126,6 +129,7 @@ def run_campaign(
             f"data set in {click.format_filename(str(options.out))}: see README.md there",
         ]
         show(figures, lines, terminal.as_json)
+        timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             page.stay()
     if run.failed:

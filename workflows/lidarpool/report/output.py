@@ -20,6 +20,7 @@ from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
+from ..base import timeline
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
@@ -112,6 +113,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         workers = None
         if not in_pieces:
             run.cluster_stack.close()
+            timeline.mark(timeline.STOPPED)
         elif run.cluster is not None:
             workers = LidarWorkers(run.cluster)
         run.page.finish(result.seconds, result)
@@ -183,6 +185,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             sizes = len(scene.all_names), len(scene.material_names)
             cloud = CountedCloud(points(CLOUD), *sizes)
             Format("ply").write(staged / CLOUD, cloud, sweeps)
+            timeline.mark(timeline.CLOUD_WRITTEN)
             for one in sorted(formats, key=lambda one: one.row.in_pieces):
                 file = one.row.file
                 if storage and workers and one.row.in_pieces:
@@ -201,6 +204,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             report["files"] = [CLOUD, *further, *made]
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
             (staged / REPORT).write_text(text, encoding="utf-8")
+            timeline.mark(timeline.REPORT_WRITTEN)
             if storage is None:
                 _move(staged, folder, report["files"], earlier, then)
             else:
@@ -210,6 +214,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                         storage.put(staged / name, name)
                 with deferred_interrupts():
                     then()
+        timeline.mark(timeline.IN_PLACE)
         return report
 
     def _report(

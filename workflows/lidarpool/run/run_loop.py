@@ -17,6 +17,7 @@ from distributed.client import FutureCancelledError
 from lidarsim.base.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
 
+from ..base import timeline
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..scenario.build import Job
@@ -284,6 +285,7 @@ class RunLoop:
         started = time.monotonic()
         pause_s = 0.0
         self._begin(first)  # and its trials
+        timeline.mark(timeline.FIRST_BATCH)
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
@@ -291,14 +293,18 @@ class RunLoop:
             moved = False
             if not pipeline.stages.closed:
                 moved = self.step()
+                if pipeline.progress:
+                    timeline.mark(timeline.FIRST_RECEIPT)
                 if self.finished:
                     pipeline.close()
                     self.times["survey"] = time.monotonic() - started
+                    timeline.mark(timeline.LAST_RECEIPT)
                     watch.forget([GPU, LIDAR])
             if self._trials is not None and "planning" not in self.times:
                 moved |= self._trials.step()
                 if self._trials.finished:
                     self.times["planning"] = time.monotonic() - started
+                    timeline.mark(timeline.PLANNED)
                     watch.forget([OTHER])
             now_s = time.monotonic()
             if now_s - saved_at >= SAVE_EVERY_S:

@@ -15,6 +15,7 @@ from lidarsim.base.errors import LidarError
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
+from ...base import timeline
 from ...scenario.build import Job
 from ..options import RunOptions
 from ..pipeline.names import GPU, LIDAR, OTHER
@@ -73,6 +74,7 @@ class Cluster:
             options.cluster.require(required_slots)
         waiting = Waiting(options.wait_s, screen.tell)
         self.client = client = enter(client_of(options, required_slots, waiting, screen))
+        timeline.mark(timeline.WORKERS)
         self.options = options
         self._screen = screen
         # For errors about a lost cluster; a client that was never connected is refused below.
@@ -110,6 +112,7 @@ class Cluster:
         if note := gpu_note(self._pool, self._casting, self.backend):
             store.notes.append(note)
         self._callers_error: BaseException | None = None
+        timeline.mark(timeline.CHECKED)
 
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]

@@ -1,0 +1,128 @@
+"""When the steps of a command end, from the start of its process to its exit.
+
+`mark` costs a microsecond, so that steps are marked whether the timeline is shown or not.
+"""
+
+from __future__ import annotations
+
+import atexit
+import sys
+import time
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+
+# Names of steps, which the documentation explains.
+COMMAND = "command imported"
+SCENE = "scene read"
+WORKERS = "workers started"
+CHECKED = "cluster checked"
+FIRST_BATCH = "first batch offered"
+FIRST_RECEIPT = "first receipt"
+LAST_RECEIPT = "last receipt"
+PLANNED = "paths planned"
+STOPPED = "workers stopped"
+CLOUD_WRITTEN = "cloud written"
+REPORT_WRITTEN = "report written"
+IN_PLACE = "result in place"
+SUMMARY = "summary printed"
+EXIT = "exit"
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>Timeline of a run</title><style>
+body {{ font: 15px/1.4 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+  color: #1c2733; background: #fff }}
+table {{ border-collapse: collapse; width: 100% }}
+td, th {{ padding: .2rem .6rem; text-align: right; white-space: nowrap }}
+td:first-child, th:first-child {{ text-align: left }}
+td:last-child {{ width: 60% }}
+svg {{ display: block; width: 100%; height: 1rem }}
+rect {{ fill: #2a6fb0 }}
+@media (prefers-color-scheme: dark) {{ body {{ color: #dde5ee; background: #10161d }}
+  rect {{ fill: #6fb0ee }} }}
+</style></head><body><h1>Timeline of a run</h1><p><code>{command}</code>, begun {begun}</p>
+<table><thead><tr><th>step</th><th>takes, s</th><th>ends at, s</th><th></th></tr></thead><tbody>
+{rows}
+</tbody></table></body></html>
+"""
+_ROW = (
+    '<tr><td>{name}</td><td>{takes:.2f}</td><td>{end:.2f}</td><td><svg viewBox="0 0 1000 16" '
+    'preserveAspectRatio="none"><rect x="{x:.1f}" width="{width:.1f}" height="16"/></svg></td></tr>'
+)
+
+
+class Step(NamedTuple):
+    """A step of a command: it starts when the step before ends."""
+
+    name: str
+    end_s: float  # seconds since the start of the process
+
+
+class Timeline:
+    """Steps of this process in the order in which they ended."""
+
+    def __init__(self) -> None:
+        self._started = psutil.Process().create_time()  # seconds since 1970, in steps of 10 ms
+        self.steps: list[Step] = []
+
+    def mark(self, name: str) -> None:
+        """Note that a step ends now; a step that has ended before is not noted again."""
+        if all(step.name != name for step in self.steps):
+            self.steps.append(Step(name, time.time() - self._started))
+
+    def table(self) -> str:
+        """Return a line for each step: its name, its duration and its end, in seconds."""
+        lines = [f"{'step':<22}{'takes':>9}{'ends at':>9}"]
+        start_s = 0.0
+        for step in self.steps:
+            lines.append(f"{step.name:<22}{step.end_s - start_s:>7.2f} s{step.end_s:>7.2f} s")
+            start_s = step.end_s
+        return "\n".join(lines) + "\n"
+
+    def page(self, command: str) -> str:
+        """Return the steps of a command as an HTML page with a bar for each."""
+        total_s = max(self.steps[-1].end_s, 1e-9) if self.steps else 1.0
+        rows = []
+        start_s = 0.0
+        for step in self.steps:
+            takes_s = step.end_s - start_s
+            scale = 1000 / total_s
+            rows.append(
+                _ROW.format(
+                    name=escape(step.name),
+                    takes=takes_s,
+                    end=step.end_s,
+                    x=start_s * scale,
+                    width=max(1.0, takes_s * scale),
+                )
+            )
+            start_s = step.end_s
+        begun = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self._started))
+        return _PAGE.format(command=escape(command), begun=begun, rows="\n".join(rows))
+
+    def show_at_exit(self, path: Path) -> None:
+        """When the process ends, write the page to a file and print the table on stderr.
+
+        Functions that are registered later are called earlier: call this first.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        command = " ".join(["lidarpool", *sys.argv[1:]])
+        path.touch()
+
+        def show() -> None:
+            self.mark(EXIT)
+            path.write_text(self.page(command), encoding="utf-8")
+            if sys.stderr is not None:
+                sys.stderr.write(self.table())
+
+        atexit.register(show)
+
+
+timeline = Timeline()
+mark = timeline.mark
