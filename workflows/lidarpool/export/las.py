@@ -205,7 +205,7 @@ class _Packets:
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> _Packets | None:
         """Return the packets of a cloud, or None without waveforms; reads the cloud once."""
-        if not getattr(cloud, "recorded", False):  # clouds in files never have any
+        if not getattr(cloud, "has_waveforms", False):  # clouds in files never have any
             return None
         kinds: set[tuple[int, int]] = set()
         samples = 0
