@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
-from .crossing import Crossing, Nearest, Swept, strike
+from .crossing import Crossing, Nearest, TimedBodies, cast_crossing
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, Part, ScanReturns, join_hits
 from .instances import Scene
@@ -96,13 +96,13 @@ class Backend(ABC):
             parts.append((ray, distance, hits.triangle, hits.instance))
         return join_hits(parts)
 
-    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        strike(self.nearest, crossing, nearest)
+        cast_crossing(self.nearest, crossing, nearest)
 
-    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
-        raise BackendUnavailable(f"Backend {self.name!r} has no device: use strike.")
+        raise BackendUnavailable(f"Backend {self.name!r} has no device: use cast_crossing.")
 
     def cast(self, rays: Rays) -> Hits:
         """Return the closest hit of every ray, misses included."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
 from .backend import Backend
-from .crossing import Crossing, Nearest, Swept
+from .crossing import Crossing, Nearest, TimedBodies
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, nested_scene
@@ -150,16 +150,16 @@ class RayCaster:
         """Number of instances."""
         return len(self._scene.mesh)
 
-    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        self.engine.strike(crossing, nearest)
+        self.engine.cast_crossing(crossing, nearest)
 
-    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`.
 
         BackendUnavailable if this backend has no device.
         """
-        self.engine.sweep(sweep, nearest)
+        self.engine.cast_bodies(bodies, nearest)
 
     def move(self, number: int, transform: ArrayLike) -> None:
         """Set another transform of an instance, for all later casts.

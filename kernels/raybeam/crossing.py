@@ -53,7 +53,7 @@ class Crossing(NamedTuple):
         )
 
 
-class Swept(NamedTuple):
+class TimedBodies(NamedTuple):
     """Rays and bodies of a common shape, with the poses of the bodies at all times of the rays.
 
     Attributes
@@ -82,7 +82,7 @@ class Swept(NamedTuple):
     limits: tuple[float, float]
 
 
-SPAN = 32  # times of a box of `Swept`; as in intersect.cu
+SPAN = 32  # times of a box of `TimedBodies`; as in intersect.cu
 
 
 class Nearest(NamedTuple):
@@ -116,7 +116,7 @@ class Nearest(NamedTuple):
         return Nearest(distance[span], body[span], instance[span], triangle[span])
 
 
-def strike(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
+def cast_crossing(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
     """Cast the rays of a crossing in the bodies' axes, and write nearer hits to `nearest`."""
     rays = _in_body_axes(crossing)
     ray, distance, triangle, instance = cast(rays)

@@ -13,7 +13,7 @@ import numpy as np
 
 from .arrays import AnyArray, Ints
 from .backend import Backend, ClosestHits
-from .crossing import Nearest, Swept
+from .crossing import Nearest, TimedBodies
 from .device import DeviceHits, OtherHits, to_device
 from .hits import Counted, Part, ScanReturns, join_hits
 from .instances import Scene
@@ -188,14 +188,14 @@ class CudaBackend(Backend):
                 use(DeviceHits(*packed, cp, partial(self._rays, start, rays)))
             return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
-    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         cp = self._cupy
-        n = len(sweep.time_index)
+        n = len(bodies.time_index)
         columns = cast(tuple[AnyArray, ...], nearest)
-        limits = (np.float64(t * self._scene.frame.scale) for t in sweep.limits)
+        limits = (np.float64(t * self._scene.frame.scale) for t in bodies.limits)
         with self._device:
-            rays, time_index, body, poses, boxes = map(cp.asarray, sweep[:5])
+            rays, time_index, body, poses, boxes = map(cp.asarray, bodies[:5])
             hits = [cp.asarray(column) for column in columns]
             self._run(
                 "cast_bodies", n, *self._meshes, *self._instance_tables, rays, time_index,
@@ -265,10 +265,10 @@ class CudaBackend(Backend):
         The flags say whether there are rotations, and whether there are origins.
         """
         poses = scan.poses
-        first_count = poses.rays - start % poses.rays
+        first_count = poses.rays_per_pose - start % poses.rays_per_pose
         has_rotations = poses.rotations is not None
         has_origins = scan.pattern.origins is not None
-        counts = (min(first_count, _MAX_INT), min(poses.rays, _MAX_INT))
+        counts = (min(first_count, _MAX_INT), min(poses.rays_per_pose, _MAX_INT))
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
     def _motion(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
@@ -348,7 +348,7 @@ class CudaBackend(Backend):
 
 def _pose_span(poses: Poses, start: int, stop: int) -> slice:
     """Return the range of the poses of rays `start` to `stop`."""
-    return slice(start // poses.rays, -(-stop // poses.rays))
+    return slice(start // poses.rays_per_pose, -(-stop // poses.rays_per_pose))
 
 
 def source() -> str:

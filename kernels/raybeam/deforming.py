@@ -48,14 +48,14 @@ class Deforming:
         """Lower and upper corner of the box around all frames: (2, 3), metres."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`.
 
         Of equally close triangles the lowest is hit.
         """
         from . import deforming_loops as loops
 
-        loops.strike(crossing.contiguous(), self._tree, nearest)
+        loops.cast_crossing(crossing.contiguous(), self._tree, nearest)
 
     @cached_property
     def _tree(self) -> DeformingTree:

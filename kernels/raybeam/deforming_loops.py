@@ -124,7 +124,7 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
 
 
 @compiled(types.void(CROSSING, _TREE, NEAREST))
-def strike(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Cast the pairs of a `Crossing` on a deforming mesh, and write nearer hits to a `Nearest`."""
     rays = crossing.rays
     poses = crossing.poses

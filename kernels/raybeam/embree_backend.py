@@ -107,8 +107,8 @@ class EmbreeBackend(Backend):
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
         self._plans: dict[tuple[int, int], _Plan] = {}
-        # Seconds a ray of calls of `strike`: in packets, and ray by ray.
-        self._strike_times: tuple[list[float], list[float]] = [], []
+        # Seconds a ray of calls of `cast_crossing`: in packets, and ray by ray.
+        self._crossing_times: tuple[list[float], list[float]] = [], []
         self._loops = embree_packets
         self._memory = embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
@@ -175,16 +175,16 @@ class EmbreeBackend(Backend):
         t = distance * self._scene.frame.scale  # a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
-    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        from .embree_bodies import strike
+        from .embree_bodies import cast_crossing
 
         record = self._base.copy()
         scale = self._scene.frame.scale
         record["t_min"], record["t_max"] = (limit * scale for limit in crossing.limits)
         record["scratch"], _ = self._memory.thread_memory.addresses(0)
         # Threads may time calls at the same time: each list has enough, whatever the order.
-        packets, single = self._strike_times
+        packets, single = self._crossing_times
         decided = min(len(packets), len(single)) >= _TRIALS
         use_single = len(single) < len(packets)
         if decided:  # by the medians
@@ -192,10 +192,10 @@ class EmbreeBackend(Backend):
         record["coherence"] = 2.0 if use_single else _COHERENCE
         pairs = crossing.contiguous()
         start = time.perf_counter()
-        strike(record, pairs, nearest)
+        cast_crossing(record, pairs, nearest)
         count = len(crossing.row)
         if not decided and count >= _TRIAL_RAYS:
-            self._strike_times[bool(use_single)].append((time.perf_counter() - start) / count)
+            self._crossing_times[bool(use_single)].append((time.perf_counter() - start) / count)
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
         """Yield start and stop of each part of a scan, and its hits, numbered from start."""
@@ -264,7 +264,7 @@ class EmbreeBackend(Backend):
 
     def _plan(self, scan: Scan) -> _Plan:
         """Return the plan of similar scans, with their fastest groupings, or a new plan."""
-        rays_per_pose = scan.poses.rays if len(scan.poses) > 1 else 0
+        rays_per_pose = scan.poses.rays_per_pose if len(scan.poses) > 1 else 0
         key = (len(scan.pattern), rays_per_pose)
         plan = self._plans.get(key)
         if plan is None or not plan.fits(scan):

@@ -1,4 +1,4 @@
-"""The loop that casts rays at moving bodies with Embree, as `strike` of crossing.py."""
+"""The loop that casts rays at moving bodies with Embree, as `cast_crossing` of crossing.py."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
 
 
 @compiled(types.void(memory.CASTS, CROSSING, NEAREST))
-def strike(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`."""
     cast = casts[0]
     scratch = cast.scratch

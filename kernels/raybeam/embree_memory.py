@@ -203,7 +203,7 @@ class Cast:
             record["rates"] = self.address_of(motion.rates.T)
         record["rows"] = len(directions)
         record["poses"] = len(poses)
-        record["rays_per_pose"] = poses.rays
+        record["rays_per_pose"] = poses.rays_per_pose
         record["first"] = first
         record["subrays"] = 1
         record["shares_origin"] = len(poses) == 1 and origins is None and motion is None

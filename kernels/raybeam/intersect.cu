@@ -213,7 +213,7 @@ struct BodyRays {
         c = (x * r[2] + y * r[5]) + z * r[8];
     }
 
-    // Compute a ray; return the length of its direction, as `strike` of crossing.py.
+    // Compute a ray; return the length of its direction, as `cast_crossing` of crossing.py.
     __device__ __forceinline__ double make(const Scene& scene, Count i, Ray& ray) const
     {
         double at[3];
@@ -707,7 +707,7 @@ KERNEL cast_pattern(
 #undef BLOCKS
 #define BLOCKS (NESTED ? 3 : 4)
 
-// Nearer hits of rays on bodies of the scene's shape, which move, as `strike` of crossing.py. Ray i
+// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of crossing.py. Ray i
 // meets the bodies at time when[i], if below `times`: the pose of body k at time t, 12 doubles, is
 // at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
 // during SPAN times: lower and upper corner. `nearest_...` are read and written.

@@ -21,7 +21,7 @@ import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints
 from .caster import RayCaster
-from .crossing import SPAN, Crossing, Nearest, Swept
+from .crossing import SPAN, Crossing, Nearest, TimedBodies
 from .deforming import Deforming
 from .scan import Scan
 
@@ -216,7 +216,7 @@ class _Chunk:
         bodies = np.flatnonzero((first <= self._times.max()) & (last >= self._times.min()))
         on_device = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
         if on_device.any():
-            self._sweep(bodies[on_device])
+            self._cast_on_device(bodies[on_device])
             bodies = bodies[~on_device]
         if len(bodies):
             self._cast_near_cells(bodies)
@@ -238,7 +238,7 @@ class _Chunk:
             pairs = slice(start, start + _PAIRS)
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
-    def _sweep(self, bodies: Ints) -> None:
+    def _cast_on_device(self, bodies: Ints) -> None:
         """Write the nearest hits on bodies whose shapes are on a device."""
         moving = self._moving
         limits = (self._scan.t_min, self._scan.t_max)
@@ -251,14 +251,14 @@ class _Chunk:
             for start in range(0, len(times), step):
                 rows = np.flatnonzero((time_index >= start) & (time_index < start + step))
                 span = slice(int(rows[0]), int(rows[-1]) + 1)
-                poses, boxes = self._swept(number, shape_bodies, times[start : start + step])
+                poses, boxes = self._timed_poses(number, shape_bodies, times[start : start + step])
                 rays = np.ascontiguousarray(self._rays[:, span])
                 row_times = (time_index[span] - start).astype(np.int32)
-                swept = Swept(rays, row_times, shape_bodies, poses, boxes, limits)
-                shape.sweep(swept, self._nearest.part(span.start, span.stop))
+                timed = TimedBodies(rays, row_times, shape_bodies, poses, boxes, limits)
+                shape.cast_bodies(timed, self._nearest.part(span.start, span.stop))
 
-    def _swept(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-        """Return poses (t, b, 12) and boxes of bodies of a shape at times (t,), see `Swept`."""
+    def _timed_poses(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+        """Return poses and boxes of bodies of a shape at times (t,), see `TimedBodies`."""
         from .moving_loops import PADS_M
 
         moving = self._moving
@@ -334,7 +334,7 @@ class _Chunk:
             crossing = Crossing(
                 self._rays, row, body, pairs.pose[rows], pairs.poses, boxes[number], limits, frame
             )
-            caster.strike(crossing, self._nearest)
+            caster.cast_crossing(crossing, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
         """Return the pose of each body (m,) at the first time of a cell (m,), and its margin."""

@@ -46,15 +46,15 @@ class Poses:
     rotations
         float64 (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are the same. Each
         matrix entry is contiguous over the poses, as are the components of positions and motion.
-    rays
-        Rays of a pose, at least 1: ray i belongs to pose ``i // rays``.
+    rays_per_pose
+        Rays of a pose, at least 1: ray i belongs to pose ``i // rays_per_pose``.
     motion
         Motion within each pose; None if the lidar stands still during the rays of a pose.
     """
 
     positions: Floats
     rotations: Floats | None
-    rays: int
+    rays_per_pose: int
     motion: PoseMotion | None = None
 
     def __len__(self) -> int:
@@ -62,12 +62,12 @@ class Poses:
 
     def look_up(self, ray: Ints, room: Floats) -> RayPoses:
         """Look up the poses of rays (m,), into the memory `room`, float64 (18, m)."""
-        pose = ray // self.rays
+        pose = ray // self.rays_per_pose
         delay = np.zeros(1)
         rates = None
         velocities = None
         if self.motion is not None:
-            delay = self.motion.delays.take(ray - pose * self.rays)
+            delay = self.motion.delays.take(ray - pose * self.rays_per_pose)
             velocities = self._per_ray(self.motion.velocities, pose, room[12:15])
             if self.motion.rates.any():
                 rates = self._per_ray(self.motion.rates, pose, room[15:])

@@ -207,13 +207,13 @@ def test_most_rays_are_not_looked_at(monkeypatch):
     scan, times, _ = scans("fan")
     moving = Bodies(24, 1).moving("numpy")
     asked = []
-    strike = RayCaster.strike
+    cast_crossing = RayCaster.cast_crossing
 
     def noted(caster, crossing, nearest):
         asked.append(len(crossing.row))
-        strike(caster, crossing, nearest)
+        cast_crossing(caster, crossing, nearest)
 
-    monkeypatch.setattr(RayCaster, "strike", noted)
+    monkeypatch.setattr(RayCaster, "cast_crossing", noted)
     hits = hits_on(moving, scan, lambda ray: times[ray])
     assert len(rays_of(hits)) <= sum(asked) < 12 * len(rays_of(hits))
 
