@@ -173,7 +173,7 @@ class _Packets:
     @classmethod
     def of(cls, cloud: CloudLike) -> _Packets | None:
         """Look for all kinds of waveforms of a cloud; None if it has no waveforms."""
-        if not getattr(cloud, "recorded", False):  # clouds in files never have any
+        if not getattr(cloud, "has_waveforms", False):  # clouds in files never have any
             return None
         kinds: set[tuple[int, int]] = set()
         samples = 0
