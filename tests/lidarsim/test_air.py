@@ -281,6 +281,15 @@ def test_spray_lies_where_the_car_was():
     assert angle.max() < 1.5 and angle.min() < 0.8, "the car is at 1.5 rad and later"
 
 
+def test_spray_outlasts_a_car_that_left_the_scene():
+    """The car leaves 0.1 s before the beams: its last box is older."""
+    turn = [0, 0, math.sqrt(0.5), math.sqrt(0.5)]
+    ends = [(8.0, 5.0, -0.7), (8.0, 5.0 + 0.15 * SPEED, -0.7)]
+    gone = car(Track([0, 0.15], ends, [turn, turn], beyond="absent"))
+    found = sprayed(gone, sensor=replace(beams(20_000), start_ns=0.25e9))
+    assert (found["cause"] == SPRAY).sum() > 100
+
+
 @pytest.mark.parametrize("options", [{"speed": 2.0}, {"spray": False}])
 def test_no_spray_behind_who_walks_or_raises_none(options):
     dry = sprayed(car(**options), [wall("W", 20)], spray_g_m3=0.0)

@@ -218,6 +218,8 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
     run = hits.run
     stored = tables.stored
     deformed = tables.deformed
+    matrices = tables.instances
+    poses = tables.poses
     normals = output.normals
     cosines = output.cosines
     back = output.back
@@ -237,9 +239,9 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
         y = np.float64(y)
         z = np.float64(z)
         if i >= 0:
-            x, y, z = _instance_normal(tables.instances, i, x, y, z)
+            x, y, z = _instance_normal(matrices, i, x, y, z)
         if len(run) and run[k] >= 0:
-            x, y, z = _actor_normal(tables.poses, run[k], x, y, z)
+            x, y, z = _actor_normal(poses, run[k], x, y, z)
         cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
         normals[0, k] = x
         normals[1, k] = y

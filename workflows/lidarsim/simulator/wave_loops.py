@@ -640,44 +640,20 @@ def search(light, parts, sampling, starts, peaks, scratch):  # noqa: PLR0914 - a
         first_number += count
 
 
-@inlined
-def _write_return(hits, begin, stop, sigma_m, subrays, row, output):
-    """Write the return of hits `begin` to `stop`, a Gaussian with their mean and variance."""
-    energy = hits.energy
-    velocity = hits.velocity
-    distance = hits.pulses.distance
-    best = begin
-    sum_energy = 0.0
-    mean_m = 0.0
-    sum_velocity = 0.0
-    spread = 0.0
-    for hit in range(begin, stop):
-        sum_energy += energy[hit]
-        mean_m += energy[hit] * distance[hit]
-        if len(velocity):
-            sum_velocity += energy[hit] * velocity[hit]
-        if energy[hit] > energy[best]:
-            best = hit
-    mean_m /= sum_energy
-    for hit in range(begin, stop):
-        offset = (distance[hit] - mean_m) / sigma_m
-        spread += energy[hit] * (offset * offset)
-    output.beam[row] = hits.beam[begin]
-    output.row[row] = hits.pulses.row[best, 0]
-    output.distance[row] = mean_m
-    output.energy[row] = sum_energy / subrays
-    output.velocity[row] = sum_velocity / sum_energy
-    output.width[row] = math.sqrt(1 + spread / sum_energy)
-
-
 @compiled()
-def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):
+def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Write the returns of the waveforms of beams to `output`, see `waveform.returns_in`.
 
     `hits` are `WaveHits`, `peaks` `WavePeaks`, and `output` is a `WaveReturnArrays`; `sigma_m` is
-    the standard deviation of the system waveform in range. Returns the number of returns.
+    the standard deviation of the system waveform in range. Hits of a return are one Gaussian with
+    their mean and variance. Returns the number of returns.
+
+    The arrays are taken from their tuples once: in each return, numba would count them again.
     """
     beam = hits.beam
+    energy = hits.energy
+    velocity = hits.velocity
+    distance = hits.pulses.distance
     number = peaks.number
     starts = hits.marks.starts
     surface_marks = SurfaceMarks(hits.marks.solid, starts, starts)
@@ -693,7 +669,28 @@ def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):
         for k in range(begin + 1, end + 1):
             if k < end and not starts[k]:
                 continue
-            _write_return(hits, begin, k, sigma_m, neighbours.subrays, count, output)
+            best = begin
+            sum_energy = 0.0
+            mean_m = 0.0
+            sum_velocity = 0.0
+            spread = 0.0
+            for hit in range(begin, k):
+                sum_energy += energy[hit]
+                mean_m += energy[hit] * distance[hit]
+                if len(velocity):
+                    sum_velocity += energy[hit] * velocity[hit]
+                if energy[hit] > energy[best]:
+                    best = hit
+            mean_m /= sum_energy
+            for hit in range(begin, k):
+                offset = (distance[hit] - mean_m) / sigma_m
+                spread += energy[hit] * (offset * offset)
+            output.beam[count] = beam[begin]
+            output.row[count] = hits.pulses.row[best, 0]
+            output.distance[count] = mean_m
+            output.energy[count] = sum_energy / neighbours.subrays
+            output.velocity[count] = sum_velocity / sum_energy
+            output.width[count] = math.sqrt(1 + spread / sum_energy)
             # A peak whose hits are all in the return replaces the Gaussian of the hits.
             if number[begin] >= 0 and number[begin] == number[k - 1]:
                 output.distance[count] = peaks.shapes[0, begin] / samples_per_m
