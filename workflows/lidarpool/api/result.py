@@ -141,7 +141,7 @@ class Result(RunResult):
         from ..live.opened import downloads
 
         with ExitStack() as stack:
-            file = CloudFile(self._cloud_file, self._pictured.own)
+            file = CloudFile(self._cloud_file, self._pictured.extra_columns)
             sweeps = None if self.points.sweeps is None else self.points.sweeps()
             view = View(file, self._pictured, sweeps, downloads=downloads())
             stack.enter_context(result_page(view, port=port, browser=browser))

@@ -87,13 +87,12 @@ class RecordedPoints:
         """Concatenate parts of the same recording, which have the same columns."""
         if not parts:
             return cls(np.empty((0, 3)))
-        names = ("points", "rings", "intensities")
-        columns = {name: [getattr(part, name) for part in parts] for name in names}
+        rings = [part.rings for part in parts if part.rings is not None]
+        intensities = [part.intensities for part in parts if part.intensities is not None]
         return cls(
-            **{
-                name: None if arrays[0] is None else np.concatenate(arrays)
-                for name, arrays in columns.items()
-            }
+            np.concatenate([part.points for part in parts]),
+            np.concatenate(rings) if rings else None,
+            np.concatenate(intensities) if intensities else None,
         )
 
 

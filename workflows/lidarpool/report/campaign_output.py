@@ -383,8 +383,8 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     for name, value in campaign.identity.items():
         if record["identity"].get(name) != value:
             raise LidarError(
-                f"{storage} is of another campaign: its {name} differs. Make the job in a folder of "
-                "its own with --out."
+                f"{storage} is of another campaign: its {name} differs. Make the job in a folder "
+                "of its own with --out."
             )
     return record
 
