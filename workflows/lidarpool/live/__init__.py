@@ -7,7 +7,7 @@ from ..run.run_page import RunPage
 
 
 def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[RunPage]:
-    """Show jobs in the browser, or nothing: Matplotlib is imported only if it is wanted."""
+    """Show jobs in the browser if wanted; Matplotlib is imported only then."""
     if not wanted:
         return nullcontext(RunPage())
     from .live_page import live_page

@@ -135,7 +135,7 @@ class LivePage(RunPage):
         if self.stopped.is_set():
             raise KeyboardInterrupt
         self._progress = progress
-        now = time.monotonic()
+        time_s = time.monotonic()
         counts = (progress.collected, progress.scans)
         unit = ""
         if progress.jobs:
@@ -149,21 +149,21 @@ class LivePage(RunPage):
             self._rate = f"{in_words(rate)}{unit}/{period}"
             self._time_left = self._pace.left(progress.seconds, *counts)
         over = 0 < progress.jobs == progress.jobs_done
-        if now >= self._list_at or over:
-            self._list_at = now + LIST_EVERY_S
+        if time_s >= self._list_at or over:
+            self._list_at = time_s + LIST_EVERY_S
             self._under_way = under_way()
         if over:
             self._state = "writing the table and the card"
         elif progress.cast or any(job["stored"] for job in self._under_way):
             self._state = "running"
-        if now >= self._ask_at:
-            self._ask_at = now + ASK_EVERY_S
+        if time_s >= self._ask_at:
+            self._ask_at = time_s + ASK_EVERY_S
             with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
                 stats = {name: part.stats() for name, part in self._partitions.items()}
-                self._loads.append((now, stats))
+                self._loads.append((time_s, stats))
 
     def ended(self, row: JobRow) -> None:
-        """Count a job, and list it among the last jobs."""
+        """Count a job, and add an entry to the last jobs."""
         entry = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
         entry |= {"number": row.number, "opens": row.done and self._written is not None}
         entry["values"] = self._words(row.values)
@@ -173,7 +173,7 @@ class LivePage(RunPage):
         self._charts.add(row)
 
     def look(self, row: JobRow, job: JobUnderWay) -> None:
-        """Read points of a job, if a browser shows the points and the share of a core allows it."""
+        """Read points of a job, if a browser shows the points and reading is due."""
         watched = time.monotonic() - self._looked_for <= WATCHED_S and self._reading.due
         if self._count > 1 and self._jobs and not watched:
             return
@@ -239,7 +239,7 @@ class LivePage(RunPage):
             self._results[number] = open_result(file.parent, downloads())
         return self._results[number]
 
-    def _answer_of_only_job(self, job: LiveJob, question: str, *asked: Any) -> Answer:
+    def _answer_of_only_job(self, job: LiveJob, question: str, *arguments: Any) -> Answer:
         """Answer a question of the viewer of the only job, also while the job is under way."""
         points = {"points": (self._progress and self._progress.points) or self._sums["points"]}
         if question == "news":
@@ -248,7 +248,7 @@ class LivePage(RunPage):
                     job.gather()
             header, arrays = job.news()
             return self._news() | header | points, arrays
-        header, arrays = job.view.answer(question, *asked)
+        header, arrays = job.view.answer(question, *arguments)
         if question == "state":
             header |= {"live": True, "sampled": not isinstance(job.view.points, CloudFile)} | points
         return header, arrays
@@ -341,7 +341,7 @@ class CpuShare:
 
 
 class Charts:
-    """Charts of varied quantities and of results, drawn again while a browser asks for them.
+    """Charts of varied quantities and of results, drawn again while a browser shows the charts.
 
     A few numbers of each job are kept. At the end the run draws its pictures first, since
     Matplotlib draws in one thread only.
@@ -365,8 +365,8 @@ class Charts:
         """Return the number of jobs in `drawn`, which draws again only if due."""
         with self._lock:
             jobs = self._figures.jobs
-            done = self._figures.done
-        is_due = self._share.due and done
+            done_count = self._figures.done
+        is_due = self._share.due and done_count
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
     def drawn(self, over: bool) -> str:
@@ -434,7 +434,7 @@ class LiveJob:
     # -- the run's side ------------------------------------------------------------------
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Record parts that are in storage, without reading them."""
+        """Record parts that are in storage, without reading."""
         with self._lock:
             self._waiting += [part.name for part in receipts]
             while len(self._waiting) > MAX_WAITING_PARTS:
@@ -518,7 +518,7 @@ class LiveJob:
                 self._view.show(HeldPoints(self.cloud))
 
     def news(self) -> Answer:
-        """Return the news of the job while it is under way, and at its end."""
+        """Return the news of the job, under way or at its end."""
         view = self.view
         frames = [] if self._end_version else list(self.frames)
         planning = self._job.planning

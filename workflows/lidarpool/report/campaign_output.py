@@ -111,7 +111,7 @@ class DataSetOutput(Output[CampaignRun]):
         return self._finished(run)
 
     def _check_shards(self, shards: Sequence[str]) -> None:
-        """Raise LidarError if a finished data set has other shards than this run."""
+        """Raise LidarError unless a finished data set has the shards of this run."""
         if shards != [str(self.campaign.shard)]:
             held = listed([*map(shard_in_words, shards)]) or "no shard"
             raise LidarError(
@@ -346,7 +346,7 @@ def _is_indexed(storage: Storage, jobs: int) -> bool:
 
 
 def verify(storage: Storage, number: int | None = None) -> str:
-    """Compare each file of a finished data set, or of a job in it, with its checksum.
+    """Compare the files of a finished data set, or of a job in the data set, with their checksums.
 
     Returns a line; LidarError names damaged files, or the missing data set.
     """

@@ -144,7 +144,7 @@ class _JobDots(NamedTuple):
 
 
 def _dot_colours(informative: Varied | None, count: int) -> Floats:
-    """Return the colours (jobs, 3) of dots, by the labels of a quantity if it is not None."""
+    """Return the colours (jobs, 3) of dots, by the labels of a quantity, if any."""
     colours = np.tile(theme.rgb(DOT), (count, 1))
     if informative is not None:
         label_colours = theme.object_colours(len(informative.labels))

@@ -192,7 +192,7 @@ def _read_part(storage: Storage) -> _Part:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
-    """Read a data set of shards; a complete data set counts as all of `shard_count` shards."""
+    """Read a data set of shards; a complete data set has the `shard_count` shards."""
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
@@ -246,8 +246,8 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
         if differs := [
             name for name in expected if common.get(name, expected[name]) != expected[name]
         ]:
-            told = f"{part.storage} and {first} differ in {differs[0]}"
-            mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
+            message = f"{part.storage} and {first} differ in {differs[0]}"
+            mistakes.lines.append(f"{message}: merge shards of one run and of the same software.")
         elif len(common) > len(expected):
             expected = common
             first = str(part.storage)
@@ -259,12 +259,14 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
     notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
     if not (missing := _missing(parts)):
         return notes
-    told = f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], MAX_NAMED)}"
+    message = (
+        f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], MAX_NAMED)}"
+    )
     if not partial:
         grown = any(shard in part.shards for part in parts for shard in missing)
         give = f"give them, too{', run again with the larger count and --resume' * grown}"
-        raise LidarError(f"{told}: {give}, or merge what there is with --partial.")
-    return [*notes, told]
+        raise LidarError(f"{message}: {give}, or merge what there is with --partial.")
+    return [*notes, message]
 
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:

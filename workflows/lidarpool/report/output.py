@@ -158,9 +158,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         _, earlier = _earlier(destination)
         further = _further_files(result.survey, self.formats)
         sweeps = Sweeps.of(result.survey, result.scene)
-        advice = "make room or give another folder with --out"
         with (
-            explained(f"The result cannot be written to {self.target}", advice),
+            explained(
+                f"The result cannot be written to {self.target}",
+                "make room or give another folder with --out",
+            ),
             staging(folder, self.target) as staged,
         ):
             refuse_strangers(destination, _rows({*further, *earlier}))
@@ -214,12 +216,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
     """Return the points of a result, whose reading is shown as the progress of a file."""
     count = len(result.points)
-    done = 0
+    read_count = 0
 
     def tell(increment: int) -> None:
-        nonlocal done
-        done = min(done + increment, count)  # points may be read twice
-        show(file, done, count, "points")
+        nonlocal read_count
+        read_count = min(read_count + increment, count)  # points may be read twice
+        show(file, read_count, count, "points")
 
     tell(0)
     return replace(result.points, tell=tell)

@@ -270,7 +270,7 @@ class _OpenScene(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """Remark on the shown part, for a caption; empty if all of the scene is shown."""
+        """Remark on the shown part, for a caption; empty if the scene is shown completely."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)

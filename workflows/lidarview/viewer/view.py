@@ -237,7 +237,7 @@ class View:
         return answers[question](arguments, abandoned)
 
     def _state(self) -> Answer:
-        """Return all of the view but points and surfaces."""
+        """Return the state of the view, without points and surfaces."""
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
@@ -537,12 +537,12 @@ def range_image(
     """
     downwards = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
     azimuth = np.arctan2(points[:, 1], -points[:, 2] if downwards else points[:, 0])
-    left = float(azimuth.max())
-    right = float(azimuth.min())
-    if left - right > _MAX_FIELD_RAD:
-        left = math.pi
-        right = -math.pi
-    field = left - right
+    azimuth_left = float(azimuth.max())
+    azimuth_right = float(azimuth.min())
+    if azimuth_left - azimuth_right > _MAX_FIELD_RAD:
+        azimuth_left = math.pi
+        azimuth_right = -math.pi
+    field = azimuth_left - azimuth_right
     if downwards:
         row_count = 1
         row = np.zeros(len(points), np.int64)
@@ -551,7 +551,7 @@ def range_image(
     fullest = azimuth[row == np.bincount(row).argmax()]
     spacing = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider
     width = int(np.clip(_COLUMN_SHARE * field / max(spacing, 1e-9), 32, _IMAGE_WIDTH))
-    column = ((left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
+    column = ((azimuth_left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
     image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]

@@ -203,11 +203,11 @@ class _TimeAxis(NamedTuple):
         """Draw spans of time as a path, wide enough to be visible, with close spans joined."""
         spans = []
         for start, stop in times:
-            left = min((start - self.start) * WIDTH / self.length, WIDTH - _THIN)
-            right = max((stop - self.start) * WIDTH / self.length, left + _THIN)
-            spans.append((left, right))
+            x_start = min((start - self.start) * WIDTH / self.length, WIDTH - _THIN)
+            x_stop = max((stop - self.start) * WIDTH / self.length, x_start + _THIN)
+            spans.append((x_start, x_stop))
         joined = union(spans, _GAP)
-        return "".join(f"M{left:.1f} {ROW / 2:g}H{right:.1f}" for left, right in joined)
+        return "".join(f"M{x_start:.1f} {ROW / 2:g}H{x_stop:.1f}" for x_start, x_stop in joined)
 
     def row(self, label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
         """Return a row of the template."""
@@ -239,7 +239,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
 
 
 def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
-    """Return a row for each worker and stage of a partition, the busiest ones at most."""
+    """Return rows for the busiest pairs of a worker and a stage of a partition."""
     busy_s = {key: sum(task.seconds for task in records) for key, records in tasks.items()}
     rows = []
     for worker, stage in sorted(
@@ -267,7 +267,7 @@ def markdown(text: str) -> str:
 
 
 def code(text: str) -> Markup:
-    """Return a name as code of Markdown; as text if it has letters that end code or a cell."""
+    """Return a name as code of Markdown, or as text if letters would end code or a cell."""
     is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
     return Markup(f"`{text}`" if is_plain else markdown(text))
 
