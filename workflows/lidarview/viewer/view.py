@@ -71,9 +71,9 @@ from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # more rays would hide the surfaces
-_SAMPLE = 100_000  # points that colour scales and limits are taken from
+_SAMPLE = 100_000  # points from which colour scales and limits are computed
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
-_HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
+_HITS_SAMPLE = 500_000  # points whose density is shown on large triangles
 _MAX_NAMES = 2000  # in a menu
 # most columns; rows of sensors with few or many channels
 _IMAGE_WIDTH = 1024
@@ -82,15 +82,15 @@ _COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps 
 _MIN_CHANNELS = 4
 _MAX_CHANNELS = 512
 _MAX_DOWNWARD_SINE = -0.7  # sine of the elevation
-_MAX_FIELD_RAD = math.radians(300)  # a sensor that sees less is no spinning one
+_MAX_FIELD_RAD = math.radians(300)  # a spinning sensor sees more
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
-MAX_TRIANGLES = 300_000  # 50 bytes each, whenever their colours have changed
-MAX_PIECES = 60_000  # that large ones are divided into, where hits are shown
+MAX_TRIANGLES = 300_000  # 50 bytes each, sent again when colours change
+MAX_PIECES = 60_000  # of large triangles, where hits are shown
 _INWARD_SHARE = 1e-4  # of the scene's diagonal
-_MAX_SIZE_M = 200.0  # metres: some centimetres are enough for any scene
+_MAX_SIZE_M = 200.0  # of a scene: a shift of 2 cm is enough for any scene
 MAX_LABELS = 1000  # in a legend
-Legend = dict[str, Any]  # what the page is told of it
+Legend = dict[str, Any]  # for the JSON of the page
 CLOUD = "cloud.ply"
 
 
@@ -112,7 +112,7 @@ class View:
     points: Points
     pictured: PictureContent | None = None
     sweeps: Sweeps | None = None
-    note: str = ""  # a remark on what is shown
+    note: str = ""  # a remark for the user
     title: str = "lidarpool"
     results: Sequence[str] = ()  # names, if the points are of several results
     # Returns the hits of each triangle, of actors' triangles last; by default as pictured.
@@ -307,9 +307,8 @@ class View:
             arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": positions}
             arrays[f"actor{k}_turns"] = rotations
             arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
-            if (
-                animation := actor.mesh.animation
-            ) is not None:  # after the last pose, pages begin again
+            animation = actor.mesh.animation
+            if animation is not None:  # after the last pose, pages start again
                 frames = actor.seconds(times)[0] / animation.step_s
                 last = len(animation.vertices) - 1 - 1e-6
                 arrays[f"actor{k}_frames"] = frames if animation.repeat else frames.clip(0, last)
