@@ -108,9 +108,9 @@ class Recording:
     point_count: int | None = None  # if known before the points are read
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
-    thinned: bool = False  # whether hits were left out, so that gaps say nothing
+    thinned: bool = False  # whether hits were left out: gaps are no lost returns
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
-    energies: bool = False  # whether intensities are energies, as those of results
+    energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
 

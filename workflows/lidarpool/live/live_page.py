@@ -61,7 +61,7 @@ LOOK_EVERY_S = 5.0  # at most, for the points of another job
 LIST_EVERY_S = 0.5  # jobs under way
 ASK_EVERY_S = 1.0  # how busy the partitions are
 MAX_LOADS = 6  # answers to that, over which it is averaged
-WATCHED_S = 10.0  # after a question somebody looks at the page
+WATCHED_S = 10.0  # after a question, in which the page counts as watched
 # rows of the table
 MAX_ENDED = 10
 MAX_FAILED = 6
@@ -424,8 +424,8 @@ class LiveJob:
         self._counts = np.zeros(self._job.scene.counters, np.int64)
         self._hits = 0  # of the parts that were read
         self.cloud = replace(self._points, names=(), rows=()).load()  # no points, with the columns
-        self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # the last ones
-        self._view: View | None = None  # until somebody asks
+        self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # the last frames
+        self._view: View | None = None  # None before the first question
         self._making = threading.Lock()
         self._all_read = False  # all parts were read
         self._end_version = 0  # changes at the end of the run that the page must ask for

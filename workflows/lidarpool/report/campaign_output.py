@@ -42,7 +42,7 @@ _RECORDED: dict[str, type] = {
     "notes": list,
 }
 
-# With what `write_shared` writes, CAMPAIGN_FILE first.
+# Files of jobs, and the files of `write_shared`, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
@@ -75,7 +75,7 @@ class DataSetOutput(Output[CampaignRun]):
         with result_folder(self.target):
             yield
 
-    # -- what is there -----------------------------------------------------------------------
+    # -- existing files -----------------------------------------------------------------------
 
     def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
         """Refuse, remove or check a finished data set; return its sums if no job is left to do."""

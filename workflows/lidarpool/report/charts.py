@@ -42,7 +42,7 @@ SLANTED_HEIGHT = 56  # more below slanted labels
 ROW_GAP = 76  # from one row of charts to the next
 PERCENTILES = (10, 50, 90)  # percentiles of the points of jobs with near values
 MAX_COLOURS = 6  # labels that have colours of their own
-# of jobs, by value, whose medians are drawn: so many, of at least so many
+# groups of jobs with similar values, whose medians are drawn; jobs of a group
 _MAX_GROUPS = 12
 _MIN_GROUP = 8
 SWEEP_SIZE = (1600, 1000)

@@ -44,7 +44,7 @@ _PORTS_TRIED = 100
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable of a hub's kernels: the user's path
 
 MAX_SLOW = 2  # slow answers of a kind that are computed or sent at a time
-MAX_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
+MAX_WAITING = 16  # slow questions of a kind that wait; further questions get status 503
 LARGE_POINTS = 1_000_000  # an answer of more points is large
 LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
 STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed

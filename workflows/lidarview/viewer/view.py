@@ -75,13 +75,13 @@ _SAMPLE = 100_000  # points from which colour scales and limits are computed
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points whose density is shown on large triangles
 _MAX_NAMES = 2000  # in a menu
-# most columns; rows of sensors with few or many channels
+# maximum of columns; rows for sensors with few or many channels
 _IMAGE_WIDTH = 1024
 _IMAGE_ROWS = 128
 _COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _MIN_CHANNELS = 4
 _MAX_CHANNELS = 512
-_MAX_DOWNWARD_SINE = -0.7  # sine of the elevation
+_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation of a sensor that looks down
 _MAX_FIELD_RAD = math.radians(300)  # a spinning sensor sees more
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
@@ -98,7 +98,7 @@ CLOUD = "cloud.ply"
 class Downloads:
     """Formats in which a page offers points as files, and the function that writes a file."""
 
-    formats: Sequence[str]  # endings of files, such as "las"
+    formats: Sequence[str]  # suffixes of files without a dot, such as "las"
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
 
 
@@ -151,7 +151,7 @@ class View:
         self._colourings: dict[tuple[str, Filter], Colouring] = {}
         self.version += 1
 
-    # -- what is known of the survey -----------------------------------------------------
+    # -- properties of the survey ---------------------------------------------------------
 
     @cached_property
     def sensors(self) -> Sequence[SensorPositions]:
@@ -469,7 +469,7 @@ class View:
         pictured = self.pictured
         if pictured is None:
             raise KeyError("surface")
-        with self._lock:  # one browser after the other: it may take long, once
+        with self._lock:  # browsers wait for the first, which may take long
             surface = self._surface = self._surface or ShownSurface(
                 pictured.scene, pictured.reflectance, self.triangles
             )
