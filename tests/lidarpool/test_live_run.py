@@ -20,9 +20,9 @@ from tests.shapes import box
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.live.live_page import (
-    ENDED_MOST,
-    FAILED_MOST,
-    UNDER_WAY_MOST,
+    MAX_ENDED,
+    MAX_FAILED,
+    MAX_UNDER_WAY,
     LiveJob,
     LivePage,
     busy_slots,
@@ -80,7 +80,7 @@ def displayed(live: LivePage) -> int:
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     store = RunStore(make_job(100))
-    live = LiveJob(store.only_job, most=500)
+    live = LiveJob(store.only_job, max_points=500)
     for scan in range(100):
         commit(store, scan, [33], [scan % 10], [165])
         live.add([store.only_job.parts.part_of(scan)])
@@ -272,10 +272,10 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert (told["points"], told["rays"]) == (4950 * 50, 4950 * 100)
         assert (told["rate"], told["left"]) == ("20 jobs/s", "4 min")
         assert told["names"] == ["height", "side"]
-        assert [job["name"] for job in told["ended"]] == [f"{4999 - k}" for k in range(ENDED_MOST)]
+        assert [job["name"] for job in told["ended"]] == [f"{4999 - k}" for k in range(MAX_ENDED)]
         assert told["ended"][0]["values"] == ["1.235", "left"]
-        assert [job["error"] for job in told["failures"]] == ["no surface"] * FAILED_MOST
-        assert len(told["under_way"]) == UNDER_WAY_MOST
+        assert [job["error"] for job in told["failures"]] == ["no surface"] * MAX_FAILED
+        assert len(told["under_way"]) == MAX_UNDER_WAY
         assert [told["under_way"][4][name] for name in ("stored", "scans")] == [4, 40]
         assert told["under_way"][4]["values"] == ["2", "left"]
         assert told["under_way"][4]["points"] == 40

@@ -19,7 +19,7 @@ from PIL import Image
 from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.rendering import ROWS_MOST, put_picture, write_page
+from lidarpool.report.page.rendering import MAX_ROWS, put_picture, write_page
 from lidarpool.report.report import CountedCloud, make_report
 from lidarpool.run.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.placement import TaskRecord
@@ -338,7 +338,7 @@ def test_the_timeline_shows_who_worked_when_and_is_bounded(write):
         assert [float(x) for x in bar] == pytest.approx([1000 / 9.95, 5000 / 9.95], abs=0.1)
     text, _ = write(tasks=records(workers=200, tasks=10_000))
     assert len(text) < 2_000_000
-    assert len(lanes(text)) == 5 + 3 + 2 * ROWS_MOST
+    assert len(lanes(text)) == 5 + 3 + 2 * MAX_ROWS
     assert "; the busiest 24 of 200 rows" in text and f"{20_004:,} tasks in" in text
 
 

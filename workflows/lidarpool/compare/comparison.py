@@ -401,10 +401,10 @@ class _Comparing:
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
         """Return figures of the distances of A's points to B, and of B's to A, metres."""
-        f_scores = []
+        f_scores: list[dict[str, float | None]] = []
         for distance in self.distances_m:
             scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
-            f_scores.append({"distance_m": distance} | scores)
+            f_scores.append({"distance_m": distance, **scores})
         return {
             "a_to_b": _distance_quantiles(to_b),
             "b_to_a": _distance_quantiles(to_a),
@@ -561,7 +561,7 @@ def _range_scale(images: RangeImages) -> LogNorm:
 
 def _range_colours(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     """Return the colours (r, c, …) of the ranges of A (0) or B (1)."""
-    ranges = np.nan_to_num(images.ranges[index], nan=scale.vmin)
+    ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colours = theme.mapped(RANGE_COLOURS, scale(ranges).filled(0))
     colours[~images.returned[index]] = NO_RETURN
     return colours
@@ -651,7 +651,7 @@ def _draw_ring_residuals(
     axes.axvline(0, color=theme.MUTED, lw=0.7 * page.unit)
     size = _marker_size(page, rings)
     axes.plot(median, elevation, "o", color=A_COLOUR, ms=size, mew=0, label="median")
-    mean_style = {"color": theme.SENSOR, "ms": 2 * size, "mew": 0.8 * page.unit}
+    mean_style: dict[str, Any] = {"color": theme.SENSOR, "ms": 2 * size, "mew": 0.8 * page.unit}
     axes.plot(mean, elevation, "|", label="mean", **mean_style)
     axes.set_xlim(-limit, limit)
     _draw_legend(page, axes)
@@ -661,7 +661,7 @@ def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) 
     """Draw the share of cells without a return of each ring, in A and in B."""
     elevation = np.array([ring["elevation_deg"] for ring in rings])
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
-    style = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
+    style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
     for colour, state, label in ((A_COLOUR, 1, "A"), (B_COLOUR, 2, "B")):
         share = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)
         axes.plot(share, elevation, "o-", color=colour, label=label, **style)

@@ -94,7 +94,7 @@ _MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static
 # growth of changes over many sweeps from which on ranges drift
 _DRIFT_FACTOR = 1.5
 _DRIFT_M = 0.002
-_CALM_SHARE = 0.8  # share of the changes, the smallest ones, of which the scatter is the mean
+_CALM_SHARE = 0.8  # share of the changes, the smallest, whose mean is the scatter
 _MIN_EXPLAINED_SHARE = 0.5  # of the rays that a motion changes
 _SWEEP_PAIRS = 8  # pairs of sweeps whose motion is fitted
 _YAW_ARM_M = 10.0  # distance at which yaw is expressed in metres
@@ -106,7 +106,7 @@ _ASSUMED_SHIFT_M = 0.5
 _INITIAL_AIM_RAD = 0.002  # scatter of directions before its estimate, for the choice of outliers
 _MAX_SIGMAS = 6.0  # a return beyond is of something that moves
 _MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
-_MIN_REFLECTANCE = 1 / 400  # reflectance of what is reported as 0
+_MIN_REFLECTANCE = 1 / 400  # reflectance of surfaces that are reported as 0
 # chances of a variance above which a ray is left out: outliers only, and the upper tail
 _OUTLIER_CHANCE = 1e-4
 _TAIL_CHANCE = 0.1
@@ -861,7 +861,7 @@ def sensor_motion(stack: SweepStack, first: int, second: int) -> SensorMotion:
         return SensorMotion(0.0, 0.0)
     change = changes[chosen]
     distance = stack.ranges[first].astype(np.float64)[chosen]
-    # Normals are of points two columns away on either side: those of close points are inexact.
+    # Normals are of points two columns away on either side: normals of close points are inexact.
     column_count = stack.ranges.shape[2]
     normal_error = _ASSUMED_NOISE_M / (np.sqrt(10) * distance * 2 * np.pi / column_count)
     noise = np.hypot(_ASSUMED_NOISE_M + _MAX_KINK_PER_M * distance, _ASSUMED_SHIFT_M * normal_error)
@@ -1291,7 +1291,7 @@ def alarm_share(stack: SweepStack) -> Estimate | None:
     from scipy.stats import binomtest
 
     count = np.isfinite(stack.ranges).sum(axis=0)
-    # Weak surfaces, which return seldom, are beside those that return more often.
+    # Weak surfaces, which return seldom, are beside surfaces that return more often.
     size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
     repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
     sky = ~repeated & (stack.trials > 2)

@@ -87,13 +87,12 @@ class RecordedPoints:
         """Concatenate parts of the same recording, which have the same columns."""
         if not parts:
             return cls(np.empty((0, 3)))
-        names = ("points", "rings", "intensities")
-        columns = {name: [getattr(part, name) for part in parts] for name in names}
+        rings = [part.rings for part in parts if part.rings is not None]
+        intensities = [part.intensities for part in parts if part.intensities is not None]
         return cls(
-            **{
-                name: None if arrays[0] is None else np.concatenate(arrays)
-                for name, arrays in columns.items()
-            }
+            np.concatenate([part.points for part in parts]),
+            np.concatenate(rings) if rings else None,
+            np.concatenate(intensities) if intensities else None,
         )
 
 
@@ -109,9 +108,9 @@ class Recording:
     point_count: int | None = None  # if known before the points are read
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
-    thinned: bool = False  # whether hits were left out, so that gaps say nothing
+    thinned: bool = False  # whether hits were left out: gaps are no lost returns
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
-    energies: bool = False  # whether intensities are energies, as those of results
+    energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
 

@@ -6,9 +6,9 @@ from ..run.job_source import Jobs
 from ..run.run_page import RunPage
 
 
-def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[RunPage]:
-    """Show jobs in the browser, or nothing: Matplotlib is imported only if it is wanted."""
-    if not wanted:
+def page_of(jobs: Jobs, enabled: bool) -> AbstractContextManager[RunPage]:
+    """Show jobs in the browser if enabled; Matplotlib is imported only then."""
+    if not enabled:
         return nullcontext(RunPage())
     from .live_page import live_page
 

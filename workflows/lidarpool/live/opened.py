@@ -21,9 +21,9 @@ def downloads() -> Downloads:
 
 
 def open_finished(paths: Sequence[Path]) -> View:
-    """Open results of a place as a view whose points can be downloaded; see `open_results`.
+    """Open results of the same scene as a view whose points can be downloaded.
 
-    LidarError as of `open_results`, or if a folder holds an unfinished run.
+    LidarError if a folder holds an unfinished run, or `open_results` cannot open it.
     """
     for path in paths:
         refuse_unfinished(path)

@@ -34,7 +34,7 @@ _CAPTIONS = {
 
 
 def write_card(
-    place: Storage,
+    storage: Storage,
     campaign: Mapping[str, Any],
     run: CampaignRun,
     jobs: Iterable[JobRow],
@@ -47,10 +47,10 @@ def write_card(
 
     Parameters
     ----------
-    place
+    storage
         Folder of the data set, which must exist.
     campaign, run
-        What the jobs are of; the first as `CampaignSpec.described` has it.
+        The campaign as in `CampaignSpec.described`, and the sums of its run.
     jobs
         Rows in order, such as `lidarpool.datasets.job_table.read_table` gives.
     versions
@@ -67,15 +67,15 @@ def write_card(
     LidarError
         If a file cannot be written, or a split cannot be the name of a file.
     """
-    with explained(f"The data set's card cannot be written to {place}", "make room"):
-        place.remove([LAST_FILE])
-        figures = Figures(campaign["names"], _with_splits(place, jobs))
+    with explained(f"The data set's card cannot be written to {storage}", "make room"):
+        storage.remove([LAST_FILE])
+        figures = Figures(campaign["names"], _with_splits(storage, jobs))
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
         for name, drawing in drawn.items():
-            with place.writing(f"{PICTURES}/{name}.png") as file:
+            with storage.writing(f"{PICTURES}/{name}.png") as file:
                 file.write(drawing.png())
-        place.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
+        storage.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
         report = campaign_report(campaign, run, versions, figures)
         values: dict[str, Any] = {
             "report": report,
@@ -91,15 +91,15 @@ def write_card(
             **values,
             stages=run.stages,
         )
-        place.write(PAGE, page.encode())
+        storage.write(PAGE, page.encode())
         card = rendered("card.md", drawn=[*drawn], **values)
-        place.write(CARD, card.encode("utf-8", "backslashreplace"))
+        storage.write(CARD, card.encode("utf-8", "backslashreplace"))
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-        place.write(LAST_FILE, text.encode())
+        storage.write(LAST_FILE, text.encode())
     return report
 
 
-def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
+def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
     """Yield rows, and write the names of done jobs into the files of their splits."""
     with ExitStack() as stack:
         files: dict[str, Any] = {}
@@ -111,7 +111,7 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
                             f"A split cannot be called {row.split!r}: use letters and digits."
                         )
                     name = f"{SPLITS}/{row.split}.txt"
-                    files[row.split] = stack.enter_context(place.writing(name))
+                    files[row.split] = stack.enter_context(storage.writing(name))
                 files[row.split].write(f"{row.name}\n".encode())
             yield row
 
@@ -154,9 +154,10 @@ def campaign_report(
     }
 
 
-def _job_entry(row: JobRow, what: str) -> dict[str, Any]:
+def _job_entry(row: JobRow, field: str) -> dict[str, Any]:
+    """Return a job with its values and a field of its row, for JSON."""
     values = {
         name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in row.values.items()
     }
-    return {"number": row.number, "name": row.name, "values": values, what: getattr(row, what)}
+    return {"number": row.number, "name": row.name, "values": values, field: getattr(row, field)}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from lidarsim.base.arrays import Bools, Floats
+from lidarsim.base.arrays import Bools, Floats, Indices
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import plural, shortened
 from lidarsim.columns.table import TABLE, Z, value_names
@@ -23,122 +23,170 @@ from ..datasets.sweep_data import Sweep
 from .page.rendering import NARROW
 
 WIDTH = 1600
-MOST_VARIED = 8  # quantities in a picture
-ACROSS = 4  # of them side by side
-MOST_DOTS = 5_000
+MAX_VARIED = 8  # quantities in a picture
+MAX_COLUMNS = 4  # of them side by side
+MAX_DOTS = 5_000
 DOT = "#5b8fd0"
 BAR = "#7aa5d8"
 # pixels around the charts
 LEFT = 118
 RIGHT = 40
 TOP = 186
-BETWEEN = 78  # columns of charts
+COLUMN_GAP = 78  # columns of charts
 # heights: histogram, dots, and labels under them
-COUNTS = 120
+COUNTS_HEIGHT = 120
 GAP = 20
-AGAINST = 340
-BELOW = 60
-SLANTED = 56  # more below slanted labels
-ABOVE = 76  # from one row of charts to the next
-MIDDLE = (10, 50, 90)  # percentiles of the points of jobs with near values
-MOST_COLOURS = 6  # labels that have colours of their own
-# of jobs, by value, whose medians are drawn: so many, of at least so many
-_GROUPS = 12
-_GROUP = 8
+DOTS_HEIGHT = 340
+LABEL_HEIGHT = 60
+SLANTED_HEIGHT = 56  # more below slanted labels
+ROW_GAP = 76  # from one row of charts to the next
+PERCENTILES = (10, 50, 90)  # percentiles of the points of jobs with near values
+MAX_COLOURS = 6  # labels that have colours of their own
+# groups of jobs with similar values, whose medians are drawn; jobs of a group
+_MAX_GROUPS = 12
+_MIN_GROUP = 8
 SWEEP_SIZE = (1600, 1000)
 SWEEP_DOTS = 150_000
 SWEEP_FRAME = (90, 60, 1210, 750)  # left, bottom, width, height of the drawing, pixels
 SWEEP_SHARE = 0.97  # of the points that are within the drawing
-SWEEP_VALUES = 4  # that are named
+MAX_VALUES = 4  # that are named
 
 
 def draw_varied(figures: Figures) -> Page | None:
-    """Draw a histogram of each varied quantity above the points of each job against it.
+    """Draw a histogram of each varied quantity above a plot of the points of jobs by value.
 
-    Jobs have the colours of the quantity of few labels that tells most about their points. None
-    where nothing was varied or no job has run.
+    Jobs have the colours of the quantity of few labels whose groups differ most in points. None
+    without varied quantities or jobs.
     """
-    there = [varied for varied in figures.varied if len(varied.known_values)]
-    if not there:
+    drawable = [varied for varied in figures.varied if len(varied.known_values)]
+    if not drawable:
         return None
-    scales = [varied.folded() for varied in there[:MOST_VARIED]]
-    rows = -(-len(scales) // ACROSS)
-    across = -(-len(scales) // rows)
-    wide = (WIDTH - LEFT - RIGHT - BETWEEN * (across - 1)) / across
-    below = BELOW + SLANTED * any(scale.slanted(wide) for scale in scales)
-    high = COUNTS + GAP + AGAINST + below
-    page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
+    scales = [varied.folded() for varied in drawable[:MAX_VARIED]]
+    layout = _Layout.for_scales(scales)
+    page = Page((WIDTH, layout.page_height))
     points = figures.per_job("points")
     failures = figures.failures
     limits = _limits(points[~failures])
-    telling = _most_telling(scales, points, ~failures)
-    colours = np.tile(theme.rgb(DOT), (len(points), 1))
-    if telling is not None:
-        some = theme.object_colours(len(telling.labels))
-        known = np.isfinite(telling.values)
-        colours[known] = some[telling.values[known].astype(np.intp)]
+    informative = _most_informative(scales, points, ~failures)
+    colours = _dot_colours(informative, len(points))
     for number, scale in enumerate(scales):
-        row, column = divmod(number, across)
-        left = LEFT + column * (wide + BETWEEN)
-        top = TOP + row * (high + ABOVE)
-        upper = _chart(page, left, top, wide, COUNTS)
-        lower = _chart(page, left, top + COUNTS + GAP, wide, AGAINST)
-        bars = some if scale is telling else [BAR]
+        upper, lower = layout.add_charts(page, number)
+        bars: Iterable[Any] = [BAR]
+        if scale is informative:
+            bars = theme.object_colours(len(scale.labels))
         _draw_counts(upper, scale, failures, bars)
-        _draw_points(page, lower, scale, points, failures, colours)
+        _draw_points(page, lower, scale, _JobDots(points, failures, colours))
         lower.set_ylim(limits)
-        for axes, quantity in ((upper, "jobs"), (lower, "points of a job")):
-            _set_labels(page, axes, scale, wide)
-            if column == 0:
-                axes.set_ylabel(quantity)
-                axes.yaxis.set_label_coords(-78 / wide, 0.5)
-        upper.tick_params(which="both", labelbottom=False, bottom=False)
-        lower.tick_params(labelleft=column == 0)
-        name = shortened(scale.name, int(wide / 13.8))
-        page.heading(upper, name, weight="bold", pad=4 * page.unit)
+        layout.label_charts(page, number, scale, upper, lower)
     page.title(
         "What was varied, and the points that came of it",
         "Above, the jobs by value. Below, a dot for each job; the median of jobs with near values, "
         "and the range of their middle 80%.",
-        _remarks(figures, telling, len(there) - len(scales)),
+        _remarks(figures, informative, len(drawable) - len(scales)),
     )
     return page
 
 
-def _remarks(figures: Figures, telling: Varied | None, more: int) -> str:
-    """Sentence about colours, failures and `more` quantities that are not drawn."""
-    told = []
-    if telling is not None:
-        told.append(f"coloured by {shortened(telling.name, 40)}")
+class _Layout(NamedTuple):
+    """Rows and columns of charts, in pixels."""
+
+    rows: int
+    columns: int
+    width: float  # of a chart
+    row_height: int
+
+    @classmethod
+    def for_scales(cls, scales: Sequence[Varied]) -> _Layout:
+        """Lay out two charts for each quantity."""
+        rows = -(-len(scales) // MAX_COLUMNS)
+        columns = -(-len(scales) // rows)
+        width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (columns - 1)) / columns
+        is_slanted = any(scale.slanted(width) for scale in scales)
+        label_height = LABEL_HEIGHT + SLANTED_HEIGHT * is_slanted
+        return cls(rows, columns, width, COUNTS_HEIGHT + GAP + DOTS_HEIGHT + label_height)
+
+    @property
+    def page_height(self) -> int:
+        """Height of the page, pixels."""
+        return TOP + self.rows * self.row_height + (self.rows - 1) * ROW_GAP
+
+    def add_charts(self, page: Page, number: int) -> tuple[Axes, Axes]:
+        """Add the upper and the lower chart of a quantity."""
+        row, column = divmod(number, self.columns)
+        x = LEFT + column * (self.width + COLUMN_GAP)
+        y = TOP + row * (self.row_height + ROW_GAP)
+        upper = _chart(page, x, y, self.width, COUNTS_HEIGHT)
+        lower = _chart(page, x, y + COUNTS_HEIGHT + GAP, self.width, DOTS_HEIGHT)
+        return upper, lower
+
+    def label_charts(
+        self, page: Page, number: int, scale: Varied, upper: Axes, lower: Axes
+    ) -> None:
+        """Label the axes of the charts of a quantity, and write its name above."""
+        is_first = number % self.columns == 0
+        for axes, quantity in ((upper, "jobs"), (lower, "points of a job")):
+            _set_labels(page, axes, scale, self.width)
+            if is_first:
+                axes.set_ylabel(quantity)
+                axes.yaxis.set_label_coords(-78 / self.width, 0.5)
+        upper.tick_params(which="both", labelbottom=False, bottom=False)
+        lower.tick_params(labelleft=is_first)
+        name = shortened(scale.name, int(self.width / 13.8))
+        page.heading(upper, name, weight="bold", pad=4 * page.unit)
+
+
+class _JobDots(NamedTuple):
+    """Jobs as dots, (jobs,) each."""
+
+    points: Floats
+    failures: Bools
+    colours: Floats  # (jobs, 3)
+
+
+def _dot_colours(informative: Varied | None, count: int) -> Floats:
+    """Return the colours (jobs, 3) of dots, by the labels of a quantity, if any."""
+    colours = np.tile(theme.rgb(DOT), (count, 1))
+    if informative is not None:
+        label_colours = theme.object_colours(len(informative.labels))
+        has_label = np.isfinite(informative.values)
+        colours[has_label] = label_colours[informative.values[has_label].astype(np.intp)]
+    return colours
+
+
+def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
+    """Return a sentence about colours, failures and the number of hidden quantities."""
+    remarks = []
+    if informative is not None:
+        remarks.append(f"coloured by {shortened(informative.name, 40)}")
     if failed := int(figures.failures.sum()):
-        told.append(f"red: {plural(failed, 'failed job')}")
-    if figures.done > MOST_DOTS:
-        told.append(f"{MOST_DOTS:,} of {figures.done:,} jobs have dots")
-    if more:
-        told.append(f"{plural(more, 'more quantity', 'more quantities')} in jobs.csv")
-    text = "; ".join(told)
+        remarks.append(f"red: {plural(failed, 'failed job')}")
+    if figures.done > MAX_DOTS:
+        remarks.append(f"{MAX_DOTS:,} of {figures.done:,} jobs have dots")
+    if hidden:
+        remarks.append(f"{plural(hidden, 'more quantity', 'more quantities')} in jobs.csv")
+    text = "; ".join(remarks)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _most_telling(scales: Sequence[Varied], points: Floats, done: Bools) -> Varied | None:
-    """Quantity of few labels whose groups have the most different points; None without any."""
-    between = {}  # {quantity: variance of the means of its groups}
+def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) -> Varied | None:
+    """Return the quantity of few labels whose groups differ most in points; None without any."""
+    variances = {}  # {quantity: variance of the means of its groups}
     for scale in scales:
-        known = done & np.isfinite(scale.values)
-        if 2 <= len(scale.labels) <= MOST_COLOURS and known.any():
-            groups = scale.values[known].astype(np.intp)
-            means = np.bincount(groups, points[known]) / np.bincount(groups).clip(1)
-            between[scale] = float(np.var(means[groups]))
-    return max(between, key=lambda scale: between[scale], default=None)
+        is_known = is_done & np.isfinite(scale.values)
+        if 2 <= len(scale.labels) <= MAX_COLOURS and is_known.any():
+            groups = scale.values[is_known].astype(np.intp)
+            means = np.bincount(groups, points[is_known]) / np.bincount(groups).clip(1)
+            variances[scale] = float(np.var(means[groups]))
+    return max(variances, key=lambda scale: variances[scale], default=None)
 
 
 def draw_results(figures: Figures) -> Page | None:
     """Draw how points, hits and seconds of casting are distributed over jobs; None without any."""
-    done = ~figures.failures
-    if not done.any():
+    is_done = ~figures.failures
+    if not is_done.any():
         return None
     points, rays, hits, seconds = (
-        figures.per_job(name)[done] for name in ("points", "rays", "hits", "seconds")
+        figures.per_job(name)[is_done] for name in ("points", "rays", "hits", "seconds")
     )
     with np.errstate(invalid="ignore"):
         quantities = (
@@ -146,14 +194,14 @@ def draw_results(figures: Figures) -> Page | None:
             Varied("rays that hit, per cent", 100 * hits / rays),
             Varied("casting a job, all its tasks, s", seconds),
         )
-    high = 250
+    height = 250
     top = 128
-    page = Page((WIDTH, top + high + 92))
-    wide = (WIDTH - LEFT - RIGHT - BETWEEN * 2) / 3
+    page = Page((WIDTH, top + height + 92))
+    width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * 2) / 3
     for column, quantity in enumerate(quantities):
-        axes = _chart(page, LEFT + column * (wide + BETWEEN), top, wide, high)
+        axes = _chart(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
         _draw_counts(axes, quantity, np.zeros(len(points), np.bool_), [BAR])
-        _set_labels(page, axes, quantity, wide)
+        _set_labels(page, axes, quantity, width)
         axes.set_xlabel(quantity.name)
         if len(quantity.known_values):
             axes.axvline(
@@ -164,11 +212,15 @@ def draw_results(figures: Figures) -> Page | None:
     return page
 
 
-def _chart(page: Page, left: float, top: float, wide: float, high: float) -> Axes:
-    """Axes at a place in pixels, with a quiet frame."""
+def _chart(page: Page, x: float, y: float, chart_width: float, chart_height: float) -> Axes:
+    """Add axes at a position and of a size in pixels, with an unobtrusive frame."""
     width, height = page.size
-    axes = page.chart((left / width, 1 - (top + high) / height, wide / width, high / height))
-    axes.yaxis.set_major_locator(MaxNLocator(4 if high > COUNTS else 2, integer=True))
+    axes = page.chart(
+        (x / width, 1 - (y + chart_height) / height, chart_width / width, chart_height / height)
+    )
+    axes.yaxis.set_major_locator(
+        MaxNLocator(4 if chart_height > COUNTS_HEIGHT else 2, integer=True)
+    )
     axes.yaxis.set_major_formatter(_tick)
     axes.xaxis.grid(visible=False)
     axes.tick_params(which="both", color=theme.LINE)
@@ -184,102 +236,108 @@ def _tick(value: float, _: object = None) -> str:
 
 
 def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colours: Iterable[Any]) -> None:
-    """Draw a histogram, its bars in `colours`, and in front of it that of failed jobs."""
-    wide = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
+    """Draw a histogram with bars in `colours`, behind a histogram of failed jobs."""
+    bar_width = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
     edges = scale.edges.tolist()
     failed = scale.values[failures & np.isfinite(scale.values)]
-    counts, *_ = axes.hist(scale.known_values, edges, rwidth=wide)
+    counts, *_ = axes.hist(scale.known_values, edges, rwidth=bar_width)
     for bar, colour in zip(axes.patches, cycle(colours)):
         bar.set_facecolor(colour)
-    axes.hist(failed, edges, rwidth=wide, color=theme.SENSOR)
+    axes.hist(failed, edges, rwidth=bar_width, color=theme.SENSOR)
     axes.set_ylim(0, 1.1 * max(1, np.max(counts)))
 
 
-def _draw_points(
-    page: Page, axes: Axes, scale: Varied, points: Floats, failures: Bools, colours: Floats
-) -> None:
-    """Draw a dot for each job, the failed ones at the bottom, and percentiles."""
+def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
+    """Draw a dot for each job, with failed jobs at the bottom, and percentiles."""
     unit = page.unit
-    known = np.isfinite(scale.values)
-    done = np.flatnonzero(known & ~failures)
-    some = done[even_indices(len(done), MOST_DOTS)]
-    places = scale.values.copy()
+    is_known = np.isfinite(scale.values)
+    done_jobs = np.flatnonzero(is_known & ~dots.failures)
+    drawn = done_jobs[even_indices(len(done_jobs), MAX_DOTS)]
+    x = scale.values.copy()
     if scale.labels:  # spread over the bar, the same in each picture of the same jobs
-        places += 0.5 * (np.arange(len(places)) * 0.618034 % 1 - 0.5)
-    size = float(np.clip(300 / np.sqrt(max(len(some), 1)), 4, 30)) * unit**2
-    alpha = float(np.clip(16 / np.sqrt(max(len(some), 1)), 0.25, 0.85))
+        x += 0.5 * (np.arange(len(x)) * 0.618034 % 1 - 0.5)
+    size = float(np.clip(300 / np.sqrt(max(len(drawn), 1)), 4, 30)) * unit**2
+    alpha = float(np.clip(16 / np.sqrt(max(len(drawn), 1)), 0.25, 0.85))
     axes.scatter(
-        places[some], points[some], s=size, c=colours[some], alpha=alpha, linewidths=0,
+        x[drawn], dots.points[drawn], s=size, c=dots.colours[drawn], alpha=alpha, linewidths=0,
         clip_on=False, rasterized=True,
     )  # fmt: skip
-    if scale.labels:  # a bar for each
-        bins = np.unique(scale.values[done])
-        groups = [done[scale.values[done] == number] for number in bins]
-        middles = (bins[:, None] + [-0.35, 0.35, np.nan]).ravel()
-    else:
-        count = min(_GROUPS, len(done) // _GROUP)
-        ordered = done[np.argsort(places[done], kind="stable")]
-        groups = np.array_split(ordered, count) if count > 1 else []
-        middles = np.array([np.median(places[group]) for group in groups])
-    if groups:
-        percentiles = [np.percentile(points[group], MIDDLE) for group in groups]
-        lows, medians, highs = np.repeat(percentiles, len(middles) // len(groups), axis=0).T
-        axes.fill_between(middles, lows, highs, color=theme.MUTED, alpha=0.18, lw=0)
-        axes.plot(middles, medians, color=theme.INK, lw=1.6 * unit, solid_joinstyle="round")
-    failed = np.flatnonzero(known & failures)
-    failed = failed[even_indices(len(failed), MOST_DOTS)]
+    _draw_percentiles(axes, scale, x, dots.points, done_jobs, 1.6 * unit)
+    failed = np.flatnonzero(is_known & dots.failures)
+    failed = failed[even_indices(len(failed), MAX_DOTS)]
     axes.scatter(
-        places[failed], np.zeros(len(failed)), marker="x", s=18 * unit**2, color=theme.SENSOR,
+        x[failed], np.zeros(len(failed)), marker="x", s=18 * unit**2, color=theme.SENSOR,
         linewidths=0.9 * unit, clip_on=False, zorder=5, rasterized=len(failed) > 200,
         transform=axes.get_xaxis_transform(),
     )  # fmt: skip
 
 
+def _draw_percentiles(
+    axes: Axes, scale: Varied, x: Floats, points: Floats, done_jobs: Indices, line_width: float
+) -> None:
+    """Draw the percentiles of points (jobs,) of jobs with the same label, or similar x (jobs,)."""
+    if scale.labels:  # a bar for each label
+        bins = np.unique(scale.values[done_jobs])
+        groups = [done_jobs[scale.values[done_jobs] == number] for number in bins]
+        middles = (bins[:, None] + [-0.35, 0.35, np.nan]).ravel()
+    else:
+        count = min(_MAX_GROUPS, len(done_jobs) // _MIN_GROUP)
+        ordered = done_jobs[np.argsort(x[done_jobs], kind="stable")]
+        groups = np.array_split(ordered, count) if count > 1 else []
+        middles = np.array([np.median(x[group]) for group in groups])
+    if groups:
+        percentiles = [np.percentile(points[group], PERCENTILES) for group in groups]
+        lower, median, upper = np.repeat(percentiles, len(middles) // len(groups), axis=0).T
+        axes.fill_between(middles, lower, upper, color=theme.MUTED, alpha=0.18, lw=0)
+        axes.plot(middles, median, color=theme.INK, lw=line_width, solid_joinstyle="round")
+
+
 def _limits(points: Floats) -> tuple[float, float]:
-    """Limits of an axis of points: from 0, unless all jobs have nearly the same."""
+    """Return the limits of an axis of points: from 0, unless all jobs have similar numbers."""
     if not len(points):
         return 0.0, 1.0
-    low = float(points.min())
-    high = float(points.max())
-    if low > 0.6 * high:
-        aside = 0.2 * (high - low) or 0.5 * high
-        return low - aside, high + aside
-    return 0.0, 1.06 * max(high, 1.0)
+    lower = float(points.min())
+    upper = float(points.max())
+    if lower > 0.6 * upper:
+        margin = 0.2 * (upper - lower) or 0.5 * upper
+        return lower - margin, upper + margin
+    return 0.0, 1.06 * max(upper, 1.0)
 
 
-def _set_labels(page: Page, axes: Axes, scale: Varied, wide: float) -> None:
+def _set_labels(page: Page, axes: Axes, scale: Varied, width: float) -> None:
     """Set the limits of the axis of values, and name its bins or numbers."""
-    axis, (low, high) = axes.xaxis, scale.edges[[0, -1]].tolist()
+    axis = axes.xaxis
+    lower, upper = scale.edges[[0, -1]].tolist()
     if scale.labels:
-        axes.set_xlim(low, high)
+        axes.set_xlim(lower, upper)
         style: dict[str, Any] = {"parse_math": False, "fontsize": 6.8 * page.unit, "family": FONT}
-        if scale.slanted(wide):
+        if scale.slanted(width):
             style |= {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
         axis.set_ticks(range(len(scale.labels)), scale.short_labels, **style)
         return
     if scale.is_log:
         axes.set_xscale("log")
-        axes.set_xlim(low * (low / high) ** 0.02, high * (high / low) ** 0.02)
-        label_logarithms(axis, high < 1000 * low)
+        axes.set_xlim(lower * (lower / upper) ** 0.02, upper * (upper / lower) ** 0.02)
+        label_logarithms(axis, upper < 1000 * lower)
     else:
-        axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
-        whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
-        few = max(2, min(6, int(wide / 90)))
-        axis.set_major_locator(MaxNLocator(few, integer=whole, min_n_ticks=1))
+        axes.set_xlim(lower - 0.02 * (upper - lower), upper + 0.02 * (upper - lower))
+        is_integer = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
+        max_ticks = max(2, min(6, int(width / 90)))
+        axis.set_major_locator(MaxNLocator(max_ticks, integer=is_integer, min_n_ticks=1))
     axis.set_major_formatter(_tick)
 
 
 def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
-    """Draw the points of a sweep in the sensor's axes, coloured by class, or else by height."""
+    """Draw the points of a sweep in the sensor frame, coloured by class, or else by height."""
     page = Page(SWEEP_SIZE)
     frame = np.divide(SWEEP_FRAME, SWEEP_SIZE * 2)
     axes = page.chart((frame[0], frame[1], frame[2], frame[3]))
-    some = slice(None, None, max(1, -(-len(sweep) // SWEEP_DOTS)))
-    points = sweep.points[some]
-    classes = None if sweep.classes is None else sweep.classes[some]
+    rows = slice(None, None, max(1, -(-len(sweep) // SWEEP_DOTS)))
+    points = sweep.points[rows]
+    classes = None if sweep.classes is None else sweep.classes[rows]
     values = [
         f"{name} {f'{value:.4g}' if isinstance(value, float) else shortened(str(value))}"
-        for name, value in list(sweep.values.items())[:SWEEP_VALUES]
+        for name, value in list(sweep.values.items())[:MAX_VALUES]
     ]
     page.title(
         f"A sweep of job {sweep.job}",

@@ -45,22 +45,22 @@ from ..scenario.scenario import Scenario
 from .campaign_output import CAMPAIGN_FILE, dataset_files, read_record, write_record, write_shared
 from .output import SurveyOutput
 
-NAMED = 20  # shards or files in a message
+MAX_NAMED = 20  # shards or files in a message
 _MISSING = "missing: "  # begins a note
 _AGAIN = "run their shards again with --resume (of a campaign --verify), and merge again"
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Some shards of a run, in one place; `record` has what is in CAMPAIGN_FILE of a data set.
+    """Shards of a run in a folder; `record` is the content of CAMPAIGN_FILE of a data set.
 
-    `whole` are the jobs or scans of the run in all; parts and trials are of a survey.
+    `run_size` is the number of all jobs or scans of the run; points and trials are of a survey.
     """
 
-    place: Storage
+    storage: Storage
     record: Mapping[str, Any]
     shards: Sequence[Shard]
-    whole: int
+    run_size: int
     points: Sequence[Receipt] = ()
     trials: Sequence[Trial] = ()
 
@@ -73,19 +73,19 @@ class _Part:
             if not note.startswith(_MISSING) and NO_POINTS not in note  # of an earlier merge
         ]
 
-    def done(self, shard: Shard) -> range:
+    def numbers(self, shard: Shard) -> range:
         """Return the numbers of the jobs or scans of a shard."""
-        return (shard.jobs if "campaign" in self.record else shard.scans)(self.whole)
+        return (shard.jobs if "campaign" in self.record else shard.scans)(self.run_size)
 
     @property
     def common(self) -> dict[str, Any]:
-        """What all parts must have in common."""
+        """Properties that all parts must have in common, {name: value}."""
         record = self.record
-        found = {"kind": [*record["identity"]]} | record["identity"]
-        found |= {f"the file {name}": digest for name, digest in record["files"]}
-        if record["casting"]:  # else it has cast nothing
-            found |= {f"{name} of workers": value for name, value in record["casting"].items()}
-        return found | ({"the number of shards": self.shards[0].total} if self.shards else {})
+        properties = {"kind": [*record["identity"]]} | record["identity"]
+        properties |= {f"the file {name}": digest for name, digest in record["files"]}
+        if record["casting"]:  # empty if the shard has cast no rays
+            properties |= {f"{name} of workers": value for name, value in record["casting"].items()}
+        return properties | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
 @checked
@@ -97,10 +97,10 @@ def merge(
     scenario: str | Path | None = None,
     screen: Screen | None = None,
 ) -> dict[str, Any]:
-    """Merge shards into the data set or result that one run would have made.
+    """Merge shards into the data set or result that a single run would have written.
 
-    Every byte is compared with what its shard says of it. The rows of jobs are those of their
-    manifests, which have checksums. After a kill, the same call goes on.
+    Every byte is compared with the checksums of its shard. The rows of jobs are those of their
+    manifests, which have checksums. After a kill, the same call continues.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ def merge(
         Folders or URLs of the shards of one campaign or survey, and of the data set or result.
         Shards can be added to a data set later. `out` may neither be in a shard nor hold one.
     partial
-        Merge what there is; a note says what is missing.
+        Merge the shards at hand; a note lists missing shards.
     scenario
-        Of a survey: its scenario or mesh file, if that is not where it was when the shards ran.
+        Of a survey: its scenario or mesh file, if moved since the shards ran.
     screen
-        To be told what goes on; by default the log.
+        Shows the progress; by default the log.
 
     Returns
     -------
@@ -121,87 +121,89 @@ def merge(
     Raises
     ------
     LidarError
-        If shards are missing, damaged, given twice, unfinished, of another run or other software:
-        it names them.
+        If shards are missing, damaged, given twice, unfinished, of another run or other software;
+        the error names the shards.
     """
-    place = output_place(str(out))
+    target = output_place(str(out))
     screen = screen or Screen()
-    places = {_real(one): one for one in map(Storage.at, shards)}
-    _check_apart(Storage.at(place), places)
+    shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
+    _check_apart(Storage.at(target), shard_storages)
     parts = list[_Part]()
     mistakes = Mistakes()
-    for one in places.values():
+    for storage in shard_storages.values():
         with mistakes.noted():
-            parts.append(_read(one))
-    mistakes.lines += [] if places else ["there is nothing to merge: give the folders of shards."]
+            parts.append(_read_part(storage))
+    mistakes.lines += (
+        [] if shard_storages else ["there is nothing to merge: give the folders of shards."]
+    )
     with suppress(LidarError):  # the result would have the place of the shard's points
-        if "made_of" in _read(Storage.at(place)).record:
-            told = f"{place} holds a shard of a survey: give another folder with --out."
+        if "made_of" in _read_part(Storage.at(target)).record:
+            message = f"{target} holds a shard of a survey: give another folder with --out."
             parts = []
-            mistakes.lines = [told]
+            mistakes.lines = [message]
     if not (partial and parts):
         mistakes.tell()
     if "made_of" in parts[0].record:
-        return _merge_survey(parts, place, partial, scenario, screen)
-    with result_folder(place), screen.status("merging the data set"):
-        return _merge_dataset(parts, Storage.at(place), partial, screen)
+        return _merge_survey(parts, target, partial, scenario, screen)
+    with result_folder(target), screen.status("merging the data set"):
+        return _merge_dataset(parts, Storage.at(target), partial, screen)
 
 
-def _real(place: Storage) -> str:
-    """Return the same for a folder by whatever path or URL, which may lead through links."""
-    scheme, separator, path = place.url.partition("://")
+def _real_path(storage: Storage) -> str:
+    """Return the same path for a folder by any path or URL, which may lead through links."""
+    scheme, separator, path = storage.url.partition("://")
     if separator and scheme not in ("file", "local"):
-        return place.url
-    return str(Path(path or place.url).resolve())
+        return storage.url
+    return str(Path(path or storage.url).resolve())
 
 
-def _check_apart(out: Storage, places: Mapping[str, Storage]) -> None:
-    """Check that `out` is apart from all places of shards, {as of `_real`: place}."""
-    path = _real(out)
-    for real, place in places.items():
+def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
+    """Check that `target` is apart from all places of shards, {as of `_real`: place}."""
+    path = _real_path(target)
+    for real, storage in shard_storages.items():
         relation = ""
         if path == real:
             relation = "is one of the shards"
         elif f"{path}/".startswith(f"{real.rstrip('/')}/"):
-            relation = f"lies in the shard {place}"
+            relation = f"lies in the shard {storage}"
         elif f"{real}/".startswith(f"{path.rstrip('/')}/"):
-            relation = f"holds the shard {place}"
+            relation = f"holds the shard {storage}"
         if relation:
             raise LidarError(
-                f"--out {out} {relation}, which stays as it is: give another folder with --out, or "
-                "name the shards without that one."
+                f"--out {target} {relation}, which stays as it is: give another folder with --out, "
+                "or name the shards without that one."
             )
 
 
-def _read(place: Storage) -> _Part:
-    """Read a finished shard, or data set of several; LidarError if it is none, or damaged."""
-    with explained(f"{place} cannot be read"):
-        files = place.sizes()
-        run = place.below(RUN_FOLDER)
+def _read_part(storage: Storage) -> _Part:
+    """Read a finished shard, or data set of several shards; LidarError if damaged or unfinished."""
+    with explained(f"{storage} cannot be read"):
+        files = storage.sizes()
+        run = storage.below(RUN_FOLDER)
         if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= files.keys():
-            return _of_dataset(place)
+            return _read_dataset(storage)
         if FILE in run.sizes():
             with suppress(LookupError):
-                return _of_survey(place, run)
+                return _read_survey(storage, run)
     raise LidarError(
-        f"{place} holds no finished shard: give a folder of lidarpool run --shard; --resume "
+        f"{storage} holds no finished shard: give a folder of lidarpool run --shard; --resume "
         "finishes an unfinished one."
     )
 
 
-def _of_dataset(place: Storage, of: int = 1) -> _Part:
-    """Read a data set of some shards; one that has all has each of so many."""
-    record = read_record(place)
+def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
+    """Read a data set of shards; a complete data set has the `shard_count` shards."""
+    record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
-        shards = [Shard(number, of) for number in range(1, of + 1)]
-    return _Part(place, record, shards, record["campaign"]["count"])
+        shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
+    return _Part(storage, record, shards, record["campaign"]["count"])
 
 
-def _of_survey(place: Storage, run: Storage) -> _Part:
-    """Read a shard of a survey; LookupError if it is none or not finished.
+def _read_survey(storage: Storage, run: Storage) -> _Part:
+    """Read a shard of a survey; LookupError for an unfinished shard or another run.
 
-    LidarError if its database is damaged.
+    LidarError if the database is damaged.
     """
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
         path = Path(folder, FILE)
@@ -219,7 +221,7 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
                 if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
-                return _Part(place, record, [shard], scan_count, parts, job.trials)
+                return _Part(storage, record, [shard], scan_count, parts, job.trials)
         except DamagedError as error:
             raise LidarError(
                 f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
@@ -227,101 +229,113 @@ def _of_survey(place: Storage, run: Storage) -> _Part:
             ) from error
 
 
-def _check(parts: Sequence[_Part], partial: bool, own: _Part | None = None) -> list[str]:
-    """Check that all are of one run, and none is missing but with `partial`; returns all notes.
+def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) -> list[str]:
+    """Check that parts are of the same run and, unless `partial`, complete; return all notes.
 
-    Others may have what is in `own`, too. LidarError names the parts that are wrong.
+    Shards of the `earlier` data set may be in further parts, too. LidarError names wrong parts.
     """
     mistakes = Mistakes()
-    wanted = software()
+    expected = software()
     first = "the software here"
-    seen = dict[int, _Part]()
+    parts_by_shard = dict[int, _Part]()
     for part in sorted(parts, key=lambda part: not part.record["casting"]):
         common = part.common
-        if part.shards == [ALL] and part is not own and len(parts) > 1 + bool(own):
-            mistakes.lines.append(f"{part.place} is a whole run: give it alone, or leave it out.")
+        if part.shards == [ALL] and part is not earlier and len(parts) > 1 + bool(earlier):
+            mistakes.lines.append(f"{part.storage} is a whole run: give it alone, or leave it out.")
             continue
-        if differs := [name for name in wanted if common.get(name, wanted[name]) != wanted[name]]:
-            told = f"{part.place} and {first} differ in {differs[0]}"
-            mistakes.lines.append(f"{told}: merge shards of one run and of the same software.")
-        elif len(common) > len(wanted):
-            wanted = common
-            first = str(part.place)
-        for shard in part.shards if part is not own else ():
-            if (other := seen.setdefault(shard.number, part)) is not part:
-                twice = f"shard {shard} is in {other.place} and in {part.place}"
+        if differs := [
+            name for name in expected if common.get(name, expected[name]) != expected[name]
+        ]:
+            message = f"{part.storage} and {first} differ in {differs[0]}"
+            mistakes.lines.append(f"{message}: merge shards of one run and of the same software.")
+        elif len(common) > len(expected):
+            expected = common
+            first = str(part.storage)
+        for shard in part.shards if part is not earlier else ():
+            if (first_part := parts_by_shard.setdefault(shard.number, part)) is not part:
+                twice = f"shard {shard} is in {first_part.storage} and in {part.storage}"
                 mistakes.lines.append(f"{twice}: give one of them.")
     mistakes.tell()
     notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
     if not (missing := _missing(parts)):
         return notes
-    told = f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], NAMED)}"
+    message = (
+        f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], MAX_NAMED)}"
+    )
     if not partial:
         grown = any(shard in part.shards for part in parts for shard in missing)
         give = f"give them, too{', run again with the larger count and --resume' * grown}"
-        raise LidarError(f"{told}: {give}, or merge what there is with --partial.")
-    return [*notes, told]
+        raise LidarError(f"{message}: {give}, or merge what there is with --partial.")
+    return [*notes, message]
 
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
-    """List the shards that are not there, or lack jobs by which the campaign has grown."""
-    of = parts[-1].shards[0].total
-    parts = sorted(parts, key=lambda part: part.whole)
-    have = {shard.number: len(part.done(shard)) for part in parts for shard in part.shards}
+    """List the shards that are missing, or lack jobs by which the campaign has grown."""
+    shard_count = parts[-1].shards[0].total
+    parts = sorted(parts, key=lambda part: part.run_size)
+    have = {shard.number: len(part.numbers(shard)) for part in parts for shard in part.shards}
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
-    every = (Shard(number, of) for number in range(1, of + 1))
-    return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].done(shard))]
+    every = (Shard(number, shard_count) for number in range(1, shard_count + 1))
+    return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].numbers(shard))]
 
 
 def _merge_dataset(
-    parts: Sequence[_Part], out: Storage, partial: bool, screen: Screen
+    parts: Sequence[_Part], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
-    """Take the jobs of all parts into a data set, and write what all jobs share."""
-    begun = CAMPAIGN_FILE in out.sizes()
-    dataset_files(out, begun=begun)
-    own = _of_dataset(out, of=parts[0].shards[0].total) if begun else None
-    known = [own, *parts] if own else parts
-    notes = _check(known, partial, own)
-    sensors = dict[str, str]()
-    for part in known:
-        sensors = with_sensors(sensors, part.record["sensors"].items())
-    cast = next((part for part in known if part.record["casting"]), parts[0])
-    campaign = max(known, key=lambda part: part.whole).record["campaign"]
-    record = {**cast.record, "sensors": sensors, "campaign": campaign, "notes": notes}
-    dataset = DataSet(replace(out, durable=False), **campaign["keep"])
+    """Take the jobs of all parts into a data set, and write its shared files."""
+    begun = CAMPAIGN_FILE in target.sizes()
+    dataset_files(target, begun=begun)
+    earlier = _read_dataset(target, shard_count=parts[0].shards[0].total) if begun else None
+    all_parts = [earlier, *parts] if earlier else parts
+    notes = _check(all_parts, partial, earlier)
+    record = _merged_record(all_parts, parts[0]) | {"notes": notes}
+    dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
-    if own is None:  # from now on it is known whose files these are
-        write_record(out, record | {"shards": []})
+    if earlier is None:  # from now on the files belong to the campaign
+        write_record(target, record | {"shards": []})
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        files = [_RowFile(Path(folder, str(index))) for index in range(len(known))]
+        files = [_RowFile(Path(folder, str(index))) for index in range(len(all_parts))]
         damaged = list[str]()
-        with explained(f"{out} cannot be merged"):
+        with explained(f"{target} cannot be merged"):
             for part, file in zip(parts, files[-len(parts) :], strict=True):
-                file.write(part, _taken(part, dataset, damaged), _seconds(part, notes))
-            if own:
-                # A killed merge leaves a table that is not that of its index: no news.
-                files[0].write(own, _rows_of(own, dataset), _seconds(own, []))
+                file.write(part, _take_jobs(part, dataset, damaged), _seconds(part, notes))
+            if earlier:
+                # A killed merge leaves a table that differs from its index: no note.
+                files[0].write(earlier, _rows_of(earlier, dataset), _seconds(earlier, []))
         if not damaged:
-            damaged += _lacking(known, _merged(files))
+            damaged += _lacking(all_parts, _merged(files))
         if damaged:
-            raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
-        lacking = _missing(known)
-        there = {shard for part in known for shard in part.shards}
-        record["shards"] = [*map(str, sorted(there.difference(lacking)) if lacking else [ALL])]
+            raise LidarError(f"missing or damaged: {listed(damaged, MAX_NAMED)}; {_AGAIN}.")
+        lacking = _missing(all_parts)
+        shards = {shard for part in all_parts for shard in part.shards}
+        record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in _merged(files) if row.done and not row.points]:
             notes.append(empty_jobs_warning(empty, ""))
             screen.warn(notes[-1])
         record["notes"] = notes
-        more = {"sensors": sensors, "notes": tuple(notes)}
-        run = CampaignRun.from_rows(_merged(files), 0.0, 0, **more)
+        fields = {"sensors": record["sensors"], "notes": tuple(notes)}
+        run = CampaignRun.from_rows(_merged(files), 0.0, 0, **fields)
         report = write_shared(dataset, record, run, lambda: _merged(files))[1]
-    if own:  # a run with failed jobs, which would go on with what it knows of them
-        remove_run(out.below(RUN_FOLDER))
+    if earlier:  # a run with failed jobs would continue with its knowledge of these jobs
+        remove_run(target.below(RUN_FOLDER))
     return report
 
 
+def _merged_record(parts: Sequence[_Part], fallback: _Part) -> dict[str, Any]:
+    """Return the content of CAMPAIGN_FILE for a data set of parts.
+
+    The software is that of a part which has cast rays, else of the fallback.
+    """
+    sensors = dict[str, str]()
+    for part in parts:
+        sensors = with_sensors(sensors, part.record["sensors"].items())
+    cast = next((part for part in parts if part.record["casting"]), fallback)
+    campaign = max(parts, key=lambda part: part.run_size).record["campaign"]
+    return {**cast.record, "sensors": sensors, "campaign": campaign}
+
+
 class _RowFile:
-    """Rows of the jobs of a part in a temporary file: manifests are read once, one at a time."""
+    """Rows of the jobs of a part in a temporary file, so that manifests are read only once."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -334,15 +348,15 @@ class _RowFile:
 
         LidarError if the part cannot have such a job, or two manifests are of one job.
         """
-        ranges = [part.done(shard) for shard in part.shards]
+        ranges = [part.numbers(shard) for shard in part.shards]
         with self._path.open("wb") as file:
             for row in rows:
-                path = part.place.path(manifest_file(row.name))
+                path = part.storage.path(manifest_file(row.name))
                 number = row.number
                 if not any(number in numbers for numbers in ranges):
                     raise LidarError(
                         f"{path} is of job {number}, which is not in shard "
-                        f"{listed([*map(str, part.shards)])} of {part.whole:,} jobs: move it "
+                        f"{listed([*map(str, part.shards)])} of {part.run_size:,} jobs: move it "
                         "elsewhere, and merge again."
                     )
                 if number in self._offsets:
@@ -364,17 +378,17 @@ class _RowFile:
                     yield JobRow.from_json(json.loads(file.readline()))
 
 
-def _taken(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
-    """Take the jobs of a part into a data set; yields their rows, adds files to `damaged`."""
-    for _, row, wrong in dataset.take(part.place, fingerprint(dict(part.record["identity"]))):
+def _take_jobs(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
+    """Take the jobs of a part into a data set; yield their rows, add files to `damaged`."""
+    for _, row, wrong in dataset.take(part.storage, fingerprint(dict(part.record["identity"]))):
         damaged += [wrong] if wrong else []
         if row is not None:
             yield row
 
 
-def _rows_of(own: _Part, dataset: DataSet) -> Iterator[JobRow]:
-    """Yield the rows of the shards that the data set had before."""
-    ranges = [own.done(shard) for shard in own.shards]
+def _rows_of(earlier: _Part, dataset: DataSet) -> Iterator[JobRow]:
+    """Yield the rows of the shards that a data set had before the merge."""
+    ranges = [earlier.numbers(shard) for shard in earlier.shards]
     for row, _ in dataset.rows():
         if any(row.number in numbers for numbers in ranges):
             yield row
@@ -388,12 +402,12 @@ def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
     if not part.shards:
         return {}
     try:
-        finished = INDEX_FILE in part.place.sizes()  # else an earlier merge was killed
-        table = read_table(part.place, read_index(part.place)["table"] if finished else None)
+        finished = INDEX_FILE in part.storage.sizes()  # else an earlier merge was killed
+        table = read_table(part.storage, read_index(part.storage)["table"] if finished else None)
         return {row.number: (row.sha256, row.seconds) for row in table}
     except LidarError:
         notes.append(
-            f"{part.place.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
+            f"{part.storage.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
             "of their manifests, without seconds"
         )
     return {}
@@ -403,16 +417,16 @@ def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
     """List the jobs of parts that have no row, as a folder and a number."""
     numbers = {row.number for row in rows}
     return [
-        f"the manifest of job {number} in {part.place}"
+        f"the manifest of job {number} in {part.storage}"
         for part in parts
         for shard in part.shards
-        for number in part.done(shard)
+        for number in part.numbers(shard)
         if number not in numbers
     ]
 
 
 def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number; of a job of several parts, one that is done."""
+    """Yield the rows of all jobs by number; of a job in several parts, a row that is done."""
     number = attrgetter("number")
     tables = [file.rows() for file in files]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
@@ -426,29 +440,29 @@ def _merge_survey(
     scenario: str | Path | None,
     screen: Screen,
 ) -> dict[str, Any]:
-    """Make the survey again, and write its result from the points of all parts."""
+    """Build the survey again, and write its result from the points of all parts."""
     notes = _check(parts, partial)
     record = parts[0].record
-    told = record["made_of"]
-    path = Path(scenario or told["path"])
+    made_of = record["made_of"]
+    path = Path(scenario or made_of["path"])
     if not path.exists():
         raise LidarError(f"{path}, of which these shards are, does not exist: give --scenario.")
     with screen.status("reading the scene"):
-        built = build(Scenario.load(path, told["options"]), plans=told["plans"])
+        built = build(Scenario.load(path, made_of["options"]), plans=made_of["plans"])
         job = built.job()
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         raise LidarError(f"{path} has another {differs[0]} than these shards: give --scenario.")
-    own: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
-    output = _Merged(out, job.survey, job.outputs, told["extent"], **own)
+    fields: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
+    output = _Merged(out, job.survey, job.outputs, made_of["extent"], **fields)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     return Run(jobs, options, output, screen, RunPage()).execute()[1]
 
 
 @dataclass(eq=False)
 class _Merged(SurveyOutput):
-    """The result of a survey whose points are those of parts."""
+    """The result of a survey whose points are in parts."""
 
     parts: Sequence[_Part] = ()
     notes: Sequence[str] = ()
@@ -462,15 +476,21 @@ class _Merged(SurveyOutput):
         mark = store.db.meta["mark"]
         assert only is not None, "of a survey"
 
-        def take(source: Storage, one: Receipt) -> Receipt | None:
-            """Return the receipt of a file that is taken; None if it is missing or damaged."""
-            own = part_name(mark, 0, one.first, one.stop)
-            with explained(f"{source.path(one.name)} cannot be taken"), suppress(FileNotFoundError):
-                store.storage.take(source, one.name, own)
-                receipt = only.receipt(own)
-                if receipt is not None and replace(receipt, name=one.name, summaries=b"") == one:
+        def take(source: Storage, part_file: Receipt) -> Receipt | None:
+            """Take a file and return its receipt; None if the file is missing or damaged."""
+            name = part_name(mark, 0, part_file.first, part_file.stop)
+            with (
+                explained(f"{source.path(part_file.name)} cannot be taken"),
+                suppress(FileNotFoundError),
+            ):
+                store.storage.take(source, part_file.name, name)
+                receipt = only.receipt(name)
+                if (
+                    receipt is not None
+                    and replace(receipt, name=part_file.name, summaries=b"") == part_file
+                ):
                     return receipt
-                store.storage.remove([own])
+                store.storage.remove([name])
             return None
 
         for part in self.parts:
@@ -478,13 +498,17 @@ class _Merged(SurveyOutput):
                 store.cast_with(part.record["backend"], casting)
             if part.trials and not only.trials:
                 store.db.add_trials(only, part.trials)
-            source = parts_of(part.place.below(RUN_FOLDER), part.record["parts"])
-            left = (one for one in part.points if only.parts.missing(one.first, one.stop))
-            for one, receipt in read_ahead(partial(take, source), left):
+            source = parts_of(part.storage.below(RUN_FOLDER), part.record["parts"])
+            missing = (
+                receipt
+                for receipt in part.points
+                if only.parts.missing(receipt.first, receipt.stop)
+            )
+            for expected, receipt in read_ahead(partial(take, source), missing):
                 if receipt is None or not store.db.commit([(only, receipt)]):
-                    damaged.append(source.path(one.name))
+                    damaged.append(source.path(expected.name))
         if damaged:
-            raise LidarError(f"missing or damaged: {listed(damaged, NAMED)}; {_AGAIN}.")
+            raise LidarError(f"missing or damaged: {listed(damaged, MAX_NAMED)}; {_AGAIN}.")
         if not only.trials:  # the first shard, which plans, is missing
             only.job = replace(only.job, planning=None)
         only.frames = only.scans.stop

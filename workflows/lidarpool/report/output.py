@@ -39,19 +39,19 @@ PAGE = "report.html"
 REPORT = LAST_FILE
 _DRAWN = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
-_SURVEY = ("scene", "survey")  # what tells one from another
+_SURVEY = ("scene", "survey")  # entries of the identity that distinguish surveys
 _OF_FORMATS = {row.file: row for row in FORMATS.values() if row.file != CLOUD}
 
 
 @dataclass(eq=False)
 class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
-    """The result of a survey in its folder or storage, `place`; gives it with its report.
+    """The result of a survey in a folder or storage; the run returns the result and its report.
 
-    `formats` are written beside the cloud. `extent` is how much: the "cloud", the "page", too, with
-    what pictures are drawn from, or "pictures", too. `judge` returns a note on the result.
+    `formats` are written beside the cloud. `extent` is "cloud"; "page" for the page and the content
+    of pictures, too; or "pictures" for the pictures, too. `judge` returns a note on the result.
     """
 
-    place: Path | Storage
+    target: Path | Storage
     survey: Survey
     formats: Sequence[Format]
     extent: str = "page"
@@ -59,15 +59,17 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     judge: Callable[[RunResult], str] = lambda result: ""
 
     def __post_init__(self) -> None:
-        self.formats = [one for one in self.formats if one.format != "ply"]
+        self.formats = [
+            output_format for output_format in self.formats if output_format.format != "ply"
+        ]
 
     @contextmanager
     def held(self) -> Iterator[None]:
         """Lock the folder while the body runs."""
-        for one in self.formats:
-            one.check_installed()
-        load_open3d()  # what writes the cloud in the end
-        with result_folder(self.place) as self._folder:
+        for output_format in self.formats:
+            output_format.check_installed()
+        load_open3d()  # which writes the cloud in the end
+        with result_folder(self.target) as self._folder:
             yield
 
     def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
@@ -76,31 +78,31 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             self.refuse(lambda: run.jobs.identity, overwrite=run.options.overwrite)
 
     def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:
-        """Refuse a place that holds the result of another survey, or files of no result.
+        """Refuse a target that holds the result of another survey, or files of no result.
 
-        `identity` returns that of this result, see `RunResult.identity`: large scenes take a
-        moment. LidarError if there is a result of another scene or survey, or one that cannot
-        be read, or a file that this result would replace and that no report there lists, each
-        unless `overwrite`; or a folder that would be replaced and holds files of others.
+        `identity` returns `RunResult.identity` of this result, which takes a moment for large
+        scenes. LidarError if there is a result of another scene or survey, a damaged result, or a
+        file that this result would replace and that no report there lists, each unless
+        `overwrite`; or a folder that would be replaced and holds foreign files.
         """
-        place = self.place
-        storage = Storage.at(self.place)
+        target = self.target
+        storage = Storage.at(target)
         advice = "give another folder with --out, or replace it with --overwrite (in Python "
         advice += "overwrite=True)."
-        with explained(f"{place} cannot be read"):
+        with explained(f"{target} cannot be read"):
             try:
-                there = set(storage.entries())
+                entries = set(storage.entries())
             except NotADirectoryError:
                 return
         earlier, listed = _earlier(storage)
-        if REPORT in there and not overwrite:
-            here = identity()
-            if earlier != {name: here[name] for name in _SURVEY}:
-                raise LidarError(f"{place} holds the result of another survey: {advice}")
+        if REPORT in entries and not overwrite:
+            expected = identity()
+            if earlier != {name: expected[name] for name in _SURVEY}:
+                raise LidarError(f"{target} holds the result of another survey: {advice}")
         further = _further_files(self.survey, self.formats)
-        foreign = [name for name in (*FILES, *further) if name in there and name not in listed]
+        foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
-            lists = f"{place} holds {foreign[0]}, which no result there lists"
+            lists = f"{target} holds {foreign[0]}, which no result there lists"
             raise LidarError(f"{lists}: {advice}")
         refuse_strangers(storage, _rows({*further, *listed}))
 
@@ -109,7 +111,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result, and remove the run."""
         result = run.result()
-        in_pieces = any(one.row.in_pieces for one in self.formats)
+        in_pieces = any(output_format.row.in_pieces for output_format in self.formats)
         workers = None
         if not in_pieces:
             run.cluster_stack.close()
@@ -121,99 +123,82 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             result = replace(result, notes=(*result.notes, note))
 
         def in_place() -> None:
-            run.result_is_in(self.place)
+            run.result_is_in(self.target)
             run.store.remove()
 
-        more = {"cloud": "", "page": " and the report", "pictures": ", the report and the pictures"}
-        with run.screen.writing(f"writing the cloud{more[self.extent]}") as show:
+        extents = {
+            "cloud": "",
+            "page": " and the report",
+            "pictures": ", the report and the pictures",
+        }
+        with run.screen.writing(f"writing the cloud{extents[self.extent]}") as show:
             return result, self.write(result, in_place, workers, show)
 
     def write(
         self,
         result: RunResult,
-        then: Callable[[], object] = lambda: None,
+        on_written: Callable[[], object] = lambda: None,
         workers: LidarWorkers | None = None,
         show: WritingProgress = lambda *_: None,
     ) -> dict[str, Any]:
-        """Write cloud, pictures and report into the held place, and return the report.
+        """Write cloud, pictures and report into the held target, and return the report.
 
-        They are made in a temporary folder within the folder and moved into place once all are on
-        the disk, so that an earlier result stays whole if one cannot be written. Pictures of an
-        earlier result that this one does not make are removed. `then` is called when all are in
-        place, before a pending interrupt is raised. `workers` write formats of many files, and
-        `show` is told what is being written, and how far it is.
+        Files are written to a temporary folder within the folder and moved into place once all are
+        on the disk, so that an earlier result stays intact if a file cannot be written. Pictures of
+        an earlier result that this result lacks are removed. `on_written` is called when all files
+        are in place, before a pending interrupt is raised. `workers` write formats of many files,
+        and `show` shows the progress of each file.
 
-        Where `place` is a storage, all is put into it, report.json last. Files of workers go there
-        directly, and an earlier result is removed before.
+        If `target` is a storage, all files are put into it, report.json last. Files of workers go
+        there directly, and an earlier result is removed before.
 
         LidarError if a file cannot be written.
         """
-        place = self.place
         folder = self._folder
-        formats = self.formats
-        storage = place if isinstance(place, Storage) else None
-        target = Storage.at(storage or folder)
-        _, earlier = _earlier(target)
-        further = _further_files(result.survey, formats)
+        storage = self.target if isinstance(self.target, Storage) else None
+        destination = Storage.at(storage or folder)
+        _, earlier = _earlier(destination)
+        further = _further_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
-
-        def points(file: str) -> StoredCloud:
-            """Return the points, which tell how far a file is while they are read."""
-            count = len(result.points)
-            done = 0
-
-            def tell(more: int) -> None:
-                nonlocal done
-                done = min(done + more, count)  # some may be read twice
-                show(file, done, count, "points")
-
-            tell(0)
-            return replace(result.points, tell=tell)
-
-        advice = "make room or give another folder with --out"
         with (
-            explained(f"The result cannot be written to {place}", advice),
-            staging(folder, place) as staged,
+            explained(
+                f"The result cannot be written to {self.target}",
+                "make room or give another folder with --out",
+            ),
+            staging(folder, self.target) as staged,
         ):
-            refuse_strangers(target, _rows({*further, *earlier}))
-            clear = cache(partial(_clear, target, further, earlier))  # once
-            sweeps.save(staged / SWEEPS_FILE)
-            if (instruments := sweeps.instruments) is not None:
-                write_instruments(staged, result.survey, result.scene.origin)
-                sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
-            scene = result.scene
-            sizes = len(scene.all_names), len(scene.material_names)
-            cloud = CountedCloud(points(CLOUD), *sizes)
+            refuse_strangers(destination, _rows({*further, *earlier}))
+            clear = cache(partial(_clear, destination, further, earlier))  # at most once
+            sweeps = _write_sweeps(staged, result, sweeps)
+            sizes = len(result.scene.all_names), len(result.scene.material_names)
+            cloud = CountedCloud(_shown_points(result, CLOUD, show), *sizes)
             Format("ply").write(staged / CLOUD, cloud, sweeps)
             timeline.mark(timeline.CLOUD_WRITTEN)
-            for one in sorted(formats, key=lambda one: one.row.in_pieces):
-                file = one.row.file
-                if storage and workers and one.row.in_pieces:
+            for output_format in sorted(self.formats, key=lambda entry: entry.row.in_pieces):
+                file = output_format.row.file
+                points = _shown_points(result, file, show)
+                if storage and workers and output_format.row.in_pieces:
                     clear()
-                    one.write_to_storage(storage, points(file), sweeps, workers)
+                    output_format.write_to_storage(storage, points, sweeps, workers)
                 else:
-                    there = None if storage else workers
-                    one.write(staged / file, points(file), sweeps, workers=there)
+                    format_workers = None if storage else workers
+                    output_format.write(staged / file, points, sweeps, workers=format_workers)
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, cloud)
-            report["notes"] += [n for one in formats for n in one.notes(result.points, sweeps)]
+            for output_format in self.formats:
+                report["notes"] += output_format.notes(result.points, sweeps)
             if self.extent != "cloud":
                 self._report(result, report, cloud, staged, show)
-            made = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
-            report["files"] = [CLOUD, *further, *made]
-            text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-            (staged / REPORT).write_text(text, encoding="utf-8")
+            _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
             if storage is None:
-                _move(staged, folder, report["files"], earlier, then)
+                _move(staged, folder, report["files"], earlier, on_written)
             else:
                 clear()
-                for name in (*_known_further(further), *FILES):
-                    if (staged / name).exists():
-                        storage.put(staged / name, name)
+                _put(staged, storage, further)
                 with deferred_interrupts():
-                    then()
+                    on_written()
         timeline.mark(timeline.IN_PLACE)
         return report
 
@@ -221,7 +206,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         self, result: RunResult, report: dict[str, Any], cloud: CountedCloud, staged: Path,
         show: WritingProgress,
     ) -> None:  # fmt: skip
-        """Write the page, what pictures are drawn of, and the pictures if they are wanted."""
+        """Write the page, the content of pictures, and the pictures if in the extent."""
         from .page.rendering import write_page  # jinja2
 
         shown = picture_content(result)
@@ -233,29 +218,68 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             list(draw_pictures(shown, staged, staged, show=show))
 
 
+def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
+    """Return the points of a result, whose reading is shown as the progress of a file."""
+    count = len(result.points)
+    read_count = 0
+
+    def tell(increment: int) -> None:
+        nonlocal read_count
+        read_count = min(read_count + increment, count)  # points may be read twice
+        show(file, read_count, count, "points")
+
+    tell(0)
+    return replace(result.points, tell=tell)
+
+
+def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
+    """Write the sweeps, and instruments if any; return sweeps that refer to these files."""
+    sweeps.save(staged / SWEEPS_FILE)
+    instruments = sweeps.instruments
+    if instruments is None:
+        return sweeps
+    write_instruments(staged, result.survey, result.scene.origin)
+    return replace(sweeps, instruments=replace(instruments, folder=staged))
+
+
+def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) -> None:
+    """Add the names of all files to a report, and write the report."""
+    present = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
+    report["files"] = [CLOUD, *further, *present]
+    text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+    (staged / REPORT).write_text(text, encoding="utf-8")
+
+
+def _put(staged: Path, storage: Storage, further: Collection[str]) -> None:
+    """Put the files of a result into a storage, the report last."""
+    for name in (*_known_further(further), *FILES):
+        if (staged / name).exists():
+            storage.put(staged / name, name)
+
+
 def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
-    """Name the files that a result has besides those that all have."""
+    """Name the files of a result beyond the files that all results have."""
     instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
-    return [*(one.row.file for one in formats), *measured]
+    return [*(output_format.row.file for output_format in formats), *measured]
 
 
 def _rows(names: Collection[str]) -> list[FormatRow]:
-    """Return the rows of the formats whose file or folder is among some names of a result."""
+    """Return the rows of the formats whose file or folder is among the names of a result."""
     unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_OF_FORMATS}
     return [row for file, row in _OF_FORMATS.items() if file in names] + plugin_rows(unknown)
 
 
 def _known_further(names: Collection[str]) -> list[str]:
-    """Return those names that are files or folders of formats or instruments, in order."""
+    """Return the names that are files or folders of formats or instruments, in order."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
     return [row.file for row in _rows(names)] + measured
 
 
 def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
-    """Identity of the result in a folder, and its files, which alone may be removed there.
+    """Return the identity of the result in a folder, and its files, which may be removed.
 
-    Both are empty if there is no result, or none that can be read.
+    Both are empty if there is no result, or a damaged result.
     """
     try:
         report = json.loads(storage.read(REPORT))
@@ -271,9 +295,9 @@ def _move(
     folder: Path,
     files: Collection[str],
     earlier: Collection[str],
-    then: Callable[[], object],
+    on_written: Callable[[], object],
 ) -> None:
-    """Move a whole result into place, its report last.
+    """Move all files of a result into place, the report last.
 
     If the process is killed in between, --resume continues from the run's folder.
     """
@@ -285,17 +309,17 @@ def _move(
             if name in files:
                 (staged / name).replace(folder / name)
         flush(folder)
-        then()
+        on_written()
 
 
 def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
-    """Remove what is in the place of a result of `files`, its report first: that tells a result.
+    """Remove the files that a result of `files` replaces, first the report, which marks a result.
 
-    Folders and files of formats only if they are replaced, or the earlier result lists them. If a
+    Folders and files of formats are removed only if replaced, or listed by the earlier result. If a
     killed run has removed the earlier report, they stay.
     """
     further = _known_further({*files, *earlier})
-    # A path of an earlier run would look like this one's.
+    # A path of an earlier run would look like a path of this run.
     for name in (REPORT, PAGE, *further, *(name for name in FILES if name not in files)):
         target.discard(name)
         if name == PAGE and target.is_local:

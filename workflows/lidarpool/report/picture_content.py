@@ -1,4 +1,4 @@
-"""What pictures show of a run: its planning and its result, as the values that are drawn."""
+"""Converts the planning and the result of a run to the content of pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def picture_content(result: RunResult) -> PictureContent:
 def planning_picture(
     planning: Planning | None, plan: Plan | None = None, trials: Sequence[Trial] = ()
 ) -> PlanningPicture | None:
-    """Return how pictures show a planning, with its plan and its trials at the end of these."""
+    """Return a planning for pictures, with its plan and trials once all trials have ended."""
     if planning is None:
         return None
     best = None

@@ -31,7 +31,7 @@ from ..run.run_result import RunResult
 from ..run.trials import TRIAL
 
 _CELLS = 64  # along an axis of the grid in which points are counted, a power of two
-_ENOUGH = 12  # points in a cell from which a density is estimated
+_MIN_POINTS = 12  # points in a cell from which a density is estimated
 ELEVATION_RAYS = 20_000  # whose elevations are examined
 # {stage: its name on pages}, in the order of the pipeline
 STAGES = {
@@ -55,12 +55,12 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
 class CountedCloud:
-    """A cloud that computes its statistics while its points are read for something else.
+    """A cloud that computes statistics while its points are read for another purpose.
 
-    `by_object`, `by_class` and `by_material` are the points of each, `no_surface` those of no
-    object, `limits` are {column: minimum and maximum}, `bounds` (2, 3) the lowest and highest
-    coordinates in the world, and `above` (rows, columns) points seen from above, the first row in
-    the south.
+    `by_object`, `by_class` and `by_material` are the numbers of points of each object, class and
+    material, `no_surface` the points of no object, `limits` are {column: minimum and maximum},
+    `bounds` (2, 3) the lowest and highest coordinates in the world, and `above` (rows, columns) the
+    numbers of points seen from above, the first row in the south.
     """
 
     def __init__(self, cloud: CloudLike, objects: int, materials: int = 0) -> None:
@@ -100,10 +100,10 @@ class CountedCloud:
                 self.by_material += np.bincount(numbers, minlength=len(self.by_material))
             for name in (column.name for column in chunk.table):
                 values = chunk[name]
-                low, high = self.limits.get(name, (np.inf, -np.inf))
+                lower, upper = self.limits.get(name, (np.inf, -np.inf))
                 self.limits[name] = (
-                    min(low, np.fmin.reduce(values).item()),
-                    max(high, np.fmax.reduce(values).item()),
+                    min(lower, np.fmin.reduce(values).item()),
+                    max(upper, np.fmax.reduce(values).item()),
                 )
             cell = ((chunk.positions - self.bounds[0]) / self._side).astype(np.int64)
             x, y, z = cell.clip(0, _CELLS - 1).T
@@ -117,29 +117,29 @@ class CountedCloud:
 
     @property
     def density(self) -> float | None:
-        """Points per square metre of what was read, the median over the surfaces; None without."""
+        """Points per square metre, the median over the surfaces; None before points are read."""
         if not self._cells.any():
             return None
         cells = self._cells.reshape(3 * (_CELLS,))
         side = self._side
-        while (median := float(np.median(cells[cells > 0]))) < _ENOUGH and len(cells) > 1:
-            half = len(cells) // 2  # larger cells: those without points between sparse ones count
+        while (median := float(np.median(cells[cells > 0]))) < _MIN_POINTS and len(cells) > 1:
+            half = len(cells) // 2  # in larger cells, gaps between sparse points count
             cells = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5))
             side = 2 * side
         return median / side**2
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package, of Python and of the main dependencies."""
-    found = {"lidarpool": __version__, "python": platform.python_version()}
+    """Return the versions of this package, of Python and of the main dependencies."""
+    result = {"lidarpool": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            result[name] = version(name)
+    return result
 
 
 def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
-    """Report of a run, ready for JSON.
+    """Return the report of a run, ready for JSON.
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
     """
@@ -188,7 +188,7 @@ def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
 
 
 def _points_by_material(scene: Scene, cloud: CountedCloud) -> dict[str, Any]:
-    """Points of each material, if the cloud has the column `material`."""
+    """Return the points of each material, if the cloud has the column `material`."""
     if not any(column.name == "material" for column in cloud.table):
         return {}
     counts = cloud.by_material.tolist()
@@ -196,7 +196,7 @@ def _points_by_material(scene: Scene, cloud: CountedCloud) -> dict[str, Any]:
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
-    """Return what `--json` prints: main figures of a report, and where its files are."""
+    """Return the main figures of a report and the paths of its files, for `--json`."""
     planning = report["planning"]
     return {
         "folder": str(folder),
@@ -207,6 +207,7 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+    """Describe the scene, the sensors and the options of a survey."""
     options = declared(survey, CloudOptions) | declared(survey, Weather)
     del options["columns"]  # which have a table of their own
     sensors = [
@@ -231,7 +232,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),
-        **({"faults": [one.words() for one in survey.faults]} if survey.faults else {}),
+        **({"faults": [fault.words() for fault in survey.faults]} if survey.faults else {}),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }
@@ -247,11 +248,11 @@ def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
             "unit": column.unit,
             "meaning": column.meaning,
             "kind": column.kind,
-            "lowest": _finite(low),
-            "highest": _finite(high),
+            "lowest": _finite(lower),
+            "highest": _finite(upper),
         }
         for column in cloud.table
-        for low, high in [cloud.limits.get(column.name, (0, 0))]
+        for lower, upper in [cloud.limits.get(column.name, (0, 0))]
     ]
 
 
@@ -277,7 +278,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
 
 
 def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
-    """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
+    """Return tasks, items, seconds of work, and the span from first start to last stop by stage."""
     return {
         stage.stage: {
             "partition": stage.partition,
@@ -292,12 +293,12 @@ def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
 
 
 def in_order(totals: Iterable[StageTotals]) -> list[StageTotals]:
-    """Sort stages as the pipeline has them."""
+    """Sort stages in the order of the pipeline."""
     return sorted(totals, key=lambda stage: [*STAGES].index(stage.stage))
 
 
 def overlap_seconds(totals: Iterable[StageTotals]) -> float:
-    """Time during which stage 2 and planning trials were both under way."""
+    """Return the seconds during which casting and planning trials were both under way."""
     busy = {stage.stage: union(stage.busy) for stage in totals}
     casting, planning = (busy.get(stage, []) for stage in (INTERSECT, TRIAL))
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
@@ -328,4 +329,5 @@ def _planning(result: RunResult) -> dict[str, Any] | None:
 
 
 def _finite(value: float) -> float | None:
+    """Return a number, or None if infinite or NaN."""
     return value if math.isfinite(value) else None

@@ -36,13 +36,13 @@ from lidarview.render.stage import make_axis, nice_step
 from ..plan.stations import Sight, StationPlan
 from .page.rendering import put_picture
 
-# letters need some pixels; a pixel takes 0.4 kB of memory
-SIDE_LEAST = 480
-SIDE_MOST = 4096
-_LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, the better first
-SIDES_RATIO = 2  # longer side to shorter, at most, or legends do not fit
+# small letters are illegible; a pixel takes 0.4 kB of memory
+MIN_SIDE = 480
+MAX_SIDE = 4096
+_LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, by preference
+MAX_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
-MOST_TRIALS = 1000
+MAX_TRIALS = 1000
 PATH_COLOUR = "#d6336c"
 TRIAL_COLOUR = "#5b8fd0"
 COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
@@ -59,25 +59,26 @@ def draw_pictures(
     colour: str = Z.name,
     show: WritingProgress = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw pictures of a result, those in `only`, into a folder, which is made, and into its page.
+    """Draw all pictures of a result, or `only` named pictures, into a folder and into its page.
 
-    All have the same viewpoint, and the cloud the colours of the column `colour`. There is none of
-    a path that was not planned, nor of points in the axes of their sensors: the scene is in others.
+    The folder is created. All pictures have the same viewpoint, and the cloud has the colours of
+    the column `colour`. There is no picture of a path without planning, nor of points in the frames
+    of their sensors, which differ from the scene's.
     """
     cloud = result / "cloud.ply"
     page = Path(folder) / "report.html"
-    least = min(size)
-    most = max(size)
-    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
+    shorter = min(size)
+    longer = max(size)
+    if shorter < MIN_SIDE or longer > MAX_SIDE or longer > MAX_RATIO * shorter:
         raise LidarError(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
-            f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
+            f"{MIN_SIDE} to {MAX_SIDE} each, one at most twice the other, such as 1600 x 1000."
         )
     makers = _picture_makers(shown, cloud, size, colour)
     for name in only:
         if name not in PICTURES:
-            there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
-            raise LidarError(f"There is no picture {name!r}.{there}")
+            advice = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
+            raise LidarError(f"There is no picture {name!r}.{advice}")
         if name not in makers:
             why = f"the cloud has no column {' or '.join(_LIGHT)}"
             if name == "path":
@@ -102,7 +103,7 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], colour: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures; the file `cloud` is read when it is drawn."""
+    """Return functions that draw pictures; the file `cloud` is read on demand."""
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
@@ -110,12 +111,12 @@ def _picture_makers(
     @cache
     def shot() -> SurfaceView:
         # A moving sensor has a marker at half time, and a line for its trajectory.
-        places = [w.position_at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        positions = [w.position_at(middle)[None] if w.moves else w.positions for w in shown.sensors]
         scene = shown.scene
         return take_shot(
             scene.solid(middle),
-            np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
-            paths=[way.positions for way in shown.sensors if way.moves],
+            np.concatenate([np.empty((0, 3)), *positions]) + scene.origin,
+            paths=[sensor.positions for sensor in shown.sensors if sensor.moves],
             trajectories=moving_positions(shown.sensors, scene.actors, shown.duration_ns),
             actors=len(scene.actors),
             caption=shown.caption,
@@ -128,19 +129,21 @@ def _picture_makers(
         return CloudFile(cloud, shown.extra_columns).choose(MAX_POINTS)
 
     def draw_counts() -> Page:
-        places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
-        return draw_hits(shot(), shown.hit_counts, places, shown.sample_rays)
+        hit_points = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
+        return draw_hits(shot(), shown.hit_counts, hit_points, shown.sample_rays)
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
-        known = with_rgb({name: c for c in (Z, *file.table) for name in (c.name, c.in_files)})
-        if colour not in known:
-            there = list(dict.fromkeys(c.name for c in known.values()))
+        columns_by_name = with_rgb(
+            {name: c for c in (Z, *file.table) for name in (c.name, c.in_files)}
+        )
+        if colour not in columns_by_name:
+            available = list(dict.fromkeys(c.name for c in columns_by_name.values()))
             raise LidarError(
                 f"{cloud} has no column {colour!r}."
-                + (did_you_mean(colour, known) or f" There are {', '.join(there)}.")
+                + (did_you_mean(colour, columns_by_name) or f" There are {', '.join(available)}.")
             )
-        column = known[colour]
+        column = columns_by_name[colour]
         return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
 
     makers: dict[str, Callable[[], Page]] = {
@@ -173,96 +176,107 @@ def draw_path(
     page = Page(size)
     unit = page.unit
     best = path.corners
-    every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
-    others = [every[k] for k in even_indices(len(every), MOST_TRIALS)]
-    (x0, y0), (x1, y1) = _limits(best, others, planning, size).tolist()
-    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
-    step = nice_step((x1 - x0) / 8)
-    for side, name, low, high, start in (
-        (axes.xaxis, "x", x0, x1, origin[0]),
-        (axes.yaxis, "y", y0, y1, origin[1]),
-    ):
-        ticks = make_axis(name, low, high, step, float(start))
-        side.set_ticks(ticks.ticks, ticks.labels)
-        side.set_label_text(ticks.title)
+    trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
+    drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
+    axes = _path_axes(page, _limits(best, drawn_trials, planning, size), origin)
     circles = zip(planning.centres, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
         facecolor=theme.UNSEEN, edgecolor=theme.MUTED, linewidth=0.6 * unit,
     )  # fmt: skip
     axes.add_collection(discs)
-    alpha = float(np.clip(6 / max(len(others), 1), 0.08, 0.6))
+    alpha = float(np.clip(6 / max(len(drawn_trials), 1), 0.08, 0.6))
     axes.add_collection(
-        LineCollection(others, colors=TRIAL_COLOUR, linewidths=0.8 * unit, alpha=alpha)
+        LineCollection(drawn_trials, colors=TRIAL_COLOUR, linewidths=0.8 * unit, alpha=alpha)
     )
     axes.plot(*best.T, color=PATH_COLOUR, lw=2.0 * unit, solid_joinstyle="round", zorder=4)
     axes.plot(*best[1:-1].T, "o", color=PATH_COLOUR, ms=2.6 * unit, zorder=5)
-    _ends(axes, page, planning)
-    key = [Line2D([], [], color=PATH_COLOUR, lw=2 * unit, label="Best path")]
-    if others:
-        label = plural(len(others), "trial")
-        key.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
-    if len(planning.radii):
-        key.append(
-            Line2D([], [], ls="", marker="o", color=theme.UNSEEN, mec=theme.MUTED,
-                   mew=0.6 * unit, ms=7 * unit, label="Obstacle")
-        )  # fmt: skip
-    page.key(key, 7.4)
-    page.title("Planned path", _verdict(path, every))
+    _draw_ends(axes, page, planning)
+    page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
+    page.title("Planned path", _verdict(path, trials))
     return page
 
 
+def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
+    """Add axes in world coordinates with local limits (2, 2); `origin` (2,) is the local origin."""
+    (x0, y0), (x1, y1) = limits.tolist()
+    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    step = nice_step((x1 - x0) / 8)
+    for side, name, lower, upper, start in (
+        (axes.xaxis, "x", x0, x1, origin[0]),
+        (axes.yaxis, "y", y0, y1, origin[1]),
+    ):
+        ticks = make_axis(name, lower, upper, step, float(start))
+        side.set_ticks(ticks.ticks, ticks.labels)
+        side.set_label_text(ticks.title)
+    return axes
+
+
+def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
+    """Return the handles of the legend of a planned path."""
+    handles = [Line2D([], [], color=PATH_COLOUR, lw=2 * unit, label="Best path")]
+    if trial_count:
+        label = plural(trial_count, "trial")
+        handles.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
+    if obstacle_count:
+        handles.append(
+            Line2D([], [], ls="", marker="o", color=theme.UNSEEN, mec=theme.MUTED,
+                   mew=0.6 * unit, ms=7 * unit, label="Obstacle")
+        )  # fmt: skip
+    return handles
+
+
 def _verdict(best: PlannedPath, trials: Sequence[Floats]) -> str:
-    """Return the caption: length, shortest possible length, collisions, and the other trials."""
+    """Return the caption: length, shortest possible length, collisions, and the longest trial."""
     shortest = "discs cut the target off"
     if math.isfinite(best.shortest_m) and best.shortest_m > 0:
         shortest = f"shortest possible {best.shortest_m:.2f} m ({best.excess:+.2%})"
     length = f"length {best.length_m:.2f} m · {shortest}"
     state = "collision-free" if best.clearance_m >= 0 else "enters a disc"
     best_of = f"best of {plural(len(trials), 'trial')}"
-    if len(trials) > 1:  # equal paths are hidden by the best one
+    if len(trials) > 1:  # equal paths are hidden by the best path
         longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
         best_of += f", the longest {longest:.2f} m"
     return f"{length.replace('-', '−')} · {state} · {best_of}"
 
 
 def _limits(
-    best: Floats, others: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
+    best: Floats, trials: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
 ) -> Floats:
-    """Lowest and highest corner (2, 2) of the plot, in the page's proportions."""
+    """Return the lowest and highest corner (2, 2) of the plot, in the page's proportions."""
     reach = planning.radii[:, None]
-    shown = np.concatenate([best, *others, planning.centres - reach, planning.centres + reach])
-    low = shown.min(axis=0)
-    high = shown.max(axis=0)
-    width = np.maximum(high - low, 1e-3) * 1.1
-    room = np.array([FRAME[2] * size[0], FRAME[3] * size[1]])
-    half = room * (width / room).max() / 2
-    middle = (low + high) / 2
+    shown = np.concatenate([best, *trials, planning.centres - reach, planning.centres + reach])
+    lower = shown.min(axis=0)
+    upper = shown.max(axis=0)
+    width = np.maximum(upper - lower, 1e-3) * 1.1
+    plot_pixels = np.array([FRAME[2] * size[0], FRAME[3] * size[1]])
+    half = plot_pixels * (width / plot_pixels).max() / 2
+    middle = (lower + upper) / 2
     return np.stack([middle - half, middle + half])
 
 
-def _ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
+def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
     """Mark and name start and target."""
     halo = [withStroke(linewidth=2.2 * page.unit, foreground=theme.GROUND)]
     middle = sum(axes.get_xlim()) / 2
-    for name, place, marker, size in (
+    for name, position, marker, size in (
         ("start", planning.start, "o", 6),
         ("target", planning.target, "*", 10),
     ):
         axes.plot(
-            *place, marker, color=theme.INK, ms=size * page.unit, mec=theme.GROUND,
+            *position, marker, color=theme.INK, ms=size * page.unit, mec=theme.GROUND,
             mew=0.8 * page.unit, zorder=6,
         )  # fmt: skip
-        left = place[0] > middle  # names are towards the middle, inside the plot
+        is_right = position[0] > middle  # names are towards the middle, inside the plot
         axes.annotate(
-            name, place, xytext=(-8 * page.unit if left else 8 * page.unit, 0),
-            textcoords="offset points", ha="right" if left else "left", va="center",
+            name, position, xytext=(-8 * page.unit if is_right else 8 * page.unit, 0),
+            textcoords="offset points", ha="right" if is_right else "left", va="center",
             fontsize=7.6 * page.unit, color=theme.INK, family=FONT, path_effects=halo, zorder=7,
         )  # fmt: skip
 
 
 def draw_stations(scene: Scene, plan: StationPlan) -> Page:
-    """Draw the scene of a plan by what its stations see: exactly, in each pixel, with shadows.
+    """Draw the scene of a plan, coloured in each pixel by the visibility from its stations.
 
     Actors are left out.
     """
@@ -272,10 +286,10 @@ def draw_stations(scene: Scene, plan: StationPlan) -> Page:
     page.numbers(axes, shot)
     names = ("covered", "not covered", "out of sight")
     page.legend([*zip(names, COLOURS, strict=True)], "station")
-    places = plural(len(plan.candidates), "place")
+    candidates = plural(len(plan.candidates), "place")
     page.title(
         plural(len(plan.stations), "station").capitalize(),
-        f"{plan.coverage[-1]:.1%} covered of what can be seen from {places}",
+        f"{plan.coverage[-1]:.1%} covered of what can be seen from {candidates}",
         plan.sight.sensor.model,
     )
     return page
@@ -283,40 +297,53 @@ def draw_stations(scene: Scene, plan: StationPlan) -> Page:
 
 def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     """Return the shot with COVERED, UNCOVERED or HIDDEN in place of triangles."""
-    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
-    stations, places = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
-    width = shot.camera.size[0]
+    # The shot's scene has been moved a little.
+    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
+    stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     kinds = np.full(shot.pixel_samples.triangle.size, HIDDEN)
     surface = np.flatnonzero(shot.pixel_samples.triangle >= 0)
-    covered = _seen(sight, stations, shot.pixel_samples, surface)
+    covered = _visible_from(sight, stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
-    # Of each triangle one pixel in a block is asked: to ask all would take minutes.
-    left = surface[~covered]
-    block = left // width // _BLOCK * width + left % width // _BLOCK
-    key = block * np.int64(len(shot.scene.faces)) + shot.pixel_samples.triangle[left]
-    _, asked, alike = np.unique(key, return_index=True, return_inverse=True)
-    visible = _seen(sight, places, shot.pixel_samples, left[asked])
-    kinds[left[visible[alike]]] = UNCOVERED
-    edges = shot.edge_samples.triangle.size // max(len(shot.edges), 1)
-    finer = np.repeat(np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges]), edges)
-    some = np.flatnonzero(shot.edge_samples.triangle >= 0)
-    finer[some[_seen(sight, stations, shot.edge_samples, some)]] = COVERED
+    uncovered = surface[~covered]
+    # Of each triangle one pixel in a block is tested: to test all would take minutes.
+    tested, group = _pixels_of_blocks(shot, uncovered)
+    visible = _visible_from(sight, candidates, shot.pixel_samples, uncovered[tested])
+    kinds[uncovered[visible[group]]] = UNCOVERED
+    samples_per_edge = shot.edge_samples.triangle.size // max(len(shot.edges), 1)
+    pixel_kinds = np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges])
+    edge_kinds = np.repeat(pixel_kinds, samples_per_edge)
+    edge_surface = np.flatnonzero(shot.edge_samples.triangle >= 0)
+    is_covered = _visible_from(sight, stations, shot.edge_samples, edge_surface)
+    edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
         shot,
         pixel_samples=_painted(shot.pixel_samples, kinds),
-        edge_samples=_painted(shot.edge_samples, finer),
+        edge_samples=_painted(shot.edge_samples, edge_kinds),
     )
 
 
+def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
+    """Choose a pixel of each triangle in each block of pixels.
+
+    Returns indices into `pixels` (k,), and for each pixel (k,) the number of the chosen pixel.
+    """
+    width = shot.camera.size[0]
+    block = pixels // width // _BLOCK * width + pixels % width // _BLOCK
+    key = block * np.int64(len(shot.scene.faces)) + shot.pixel_samples.triangle[pixels]
+    _, chosen, group = np.unique(key, return_index=True, return_inverse=True)
+    return chosen, group
+
+
 def _painted(samples: Samples, kinds: Ints) -> Samples:
+    """Return samples with kinds (n,) in place of triangles."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
-def _seen(sight: Sight, places: Floats, samples: Samples, which: Ints) -> Bools:
-    """Whether any of places (p, 3) sees the side of the samples that the camera sees: (k,)."""
-    points = samples.position[which].astype(np.float64)
-    normals = samples.normal[which].astype(np.float64)
-    hidden = np.arange(len(which))
-    for place in places:
-        hidden = hidden[sight.sides(place, points[hidden], normals[hidden]) <= 0]
-    return ~np.isin(np.arange(len(which)), hidden)
+def _visible_from(sight: Sight, positions: Floats, samples: Samples, indices: Ints) -> Bools:
+    """Mark samples (k,) whose visible side can be seen from any of the positions (p, 3)."""
+    points = samples.position[indices].astype(np.float64)
+    normals = samples.normal[indices].astype(np.float64)
+    hidden = np.arange(len(indices))
+    for position in positions:
+        hidden = hidden[sight.sides(position, points[hidden], normals[hidden]) <= 0]
+    return ~np.isin(np.arange(len(indices)), hidden)

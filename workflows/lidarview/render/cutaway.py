@@ -13,7 +13,7 @@ from .surface import Surface, dot, spiral
 MAX_SENSORS = 8  # sensors whose surroundings are tested
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall
 ENCLOSED = 0.7  # share of horizontal rays from indoor sensors that hit the scene
-HIDDEN = 0.65  # the camera sees less than this share of what the sensors see
+HIDDEN = 0.65  # share of the sensors' hits; below, the camera sees too few of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Cutaway:
         core[:, 1, :2] -= 0.06 * width[:, :2]
         # The roof and things under it: all above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-        # Hills are no walls: what only faces up, from below the sensors, is ground.
+        # Hills are no walls: objects below the sensors that only face up are ground.
         facing = np.full(len(core), np.inf)
         np.minimum.at(facing, surface.scene.face_object, surface.face_normals[:, 2])
         ground = (facing > 0) & (core[:, 0, 2] < sensors[:, 2].min())

@@ -33,7 +33,7 @@ _HEADING_SHARE = 0.12  # of the film, before and after, over which the heading i
 # of a camera that circles: its distance, times the size, and its rise for a metre of distance
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
-# times the focus: closer surfaces are left out; more distant ones fade
+# times the focus: closer surfaces are left out, distant surfaces fade
 _MIN_FOCUS = 0.3
 _HAZE_FOCUS = 6.0
 # brightness of old points; frames in which new points fade to it
@@ -52,12 +52,12 @@ class _Shape(NamedTuple):
 
 
 class _Sights(NamedTuple):
-    """Where the camera is and looks in each frame, metres."""
+    """Positions and targets of the camera in all frames, metres."""
 
     eyes: Floats  # (k, 3)
     targets: Floats  # (k, 3)
     carrier: Floats  # (k, 3), or (0, 3) without a carrier
-    focus: float  # distance from the eye to what the film shows
+    focus: float  # distance from the eye to the middle of the scene, or to the carrier
 
     def camera(self, number: int) -> Camera:
         """Return the camera of a frame."""
@@ -99,7 +99,7 @@ class Film:
     scene_triangles: AnyFloats  # (f, 3, 3): triangles of the scene
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
-    box: Floats  # (2, 3), that the camera circles around if it follows nothing
+    box: Floats  # (2, 3), around which the camera circles without a carrier
     carrier_trajectory: tuple[Floats, Floats] | None = None  # times (w,), ns, and positions (w, 3)
     range_m: float = 1.0  # typical range of the carrier's points
 

@@ -184,7 +184,7 @@ class Page:
         )
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
         pixels, is_visible = shot.visible(tops)
-        for k in np.argsort(-pixels[:, 1]).tolist():  # those in front first
+        for k in np.argsort(-pixels[:, 1]).tolist():  # the front first
             pixel = pixels[k]
             name = names[k]
             colour = theme.INK if is_visible[k] else theme.LINE
@@ -207,7 +207,7 @@ class Page:
     def numbers(self, axes: Axes, shot: SurfaceView) -> None:
         """Write numbers from 1 on the sensors' markers; hidden sensors have white markers."""
         pixels, is_visible = shot.visible(shot.sensors)
-        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
+        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # the front last
             x = float(pixels[k, 0])
             y = float(pixels[k, 1])
             above = 8 + rank / len(pixels)
@@ -293,7 +293,7 @@ class Page:
             handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
             prop={"family": FONT, "size": size * self.unit}, **style,
         )  # fmt: skip
-        # Names come from files: matplotlib leaves out those that begin with an underscore,
+        # Names come from files: matplotlib leaves out names that start with an underscore,
         # and fails on texts that only look like a formula ("$\\frac{x$").
         for text, handle in zip(legend.get_texts(), handles, strict=True):
             text.set_parse_math(False)

@@ -264,13 +264,13 @@ class _OpenScene(NamedTuple):
     part: ShownPart
     surface: Surface  # of the part
     uncut: Scene  # the part before it was cut open
-    bounds: Floats  # (2, 3) of what is shown
+    bounds: Floats  # (2, 3) of the part
     box: Floats | None  # (2, 3) around trajectories; None if all of the scene is shown
     cut_height: float | None  # None if the part is not cut open
 
     @property
     def remark(self) -> str:
-        """Remark on the shown part, for a caption; empty if all of the scene is shown."""
+        """Remark on the shown part, for a caption; empty if the scene is shown completely."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)

@@ -151,7 +151,7 @@ class Eye:
 
     @classmethod
     def read(cls, text: str) -> Eye:
-        """Read 16 numbers in the order of WebGL, column by column; ValueError for other text."""
+        """Read 16 numbers in the order of WebGL, column by column; else raise ValueError."""
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:

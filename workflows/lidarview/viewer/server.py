@@ -44,7 +44,7 @@ _PORTS_TRIED = 100
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable of a hub's kernels: the user's path
 
 MAX_SLOW = 2  # slow answers of a kind that are computed or sent at a time
-MAX_WAITING = 16  # slow questions of a kind that wait; further ones get status 503
+MAX_WAITING = 16  # slow questions of a kind that wait; further questions get status 503
 LARGE_POINTS = 1_000_000  # an answer of more points is large
 LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
 STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
@@ -84,7 +84,7 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes
 
 
 def is_large(question: str, arguments: Arguments) -> bool:
-    """Return True if an answer may have millions of points, and holds memory until it is read.
+    """Return True if an answer may have millions of points, and hold memory until read.
 
     ValueError if the number of points is no number.
     """
@@ -113,7 +113,7 @@ class SlowQuestions:
 
     @asynccontextmanager
     async def slot(self) -> AsyncIterator[None]:
-        """Wait for a slot and hold it during the body; HTTPError if too many questions wait."""
+        """Hold a slot during the body, after waiting; HTTPError if too many questions wait."""
         if self._waiting >= MAX_WAITING:
             raise HTTPError(503, "too many slow questions wait")
         self._waiting += 1
@@ -290,7 +290,7 @@ def page_server(
 
 
 def _open_socket(port: int) -> socket.socket:
-    """Listen on a port, or a higher port that is free; on any port if it is 0 or none is free."""
+    """Listen on a port, or the next free port; on any port for 0, or if no port is free."""
     for candidate in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
         with suppress(OSError):
             return socket.create_server((HOST, candidate), backlog=128)

@@ -43,7 +43,7 @@ _FRAME_POINTS = 200_000  # that a frame adds
 _PAGE_BYTES = 25_000_000
 _PAGE_POINTS = 1_000_000
 _PAGE_TRIANGLES = 60_000
-_SAMPLE_POINTS = 5_000_000  # points from which those of a page are chosen
+_SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
 _CELLS = 300  # along the diagonal of the points, in which their density is counted
 
 

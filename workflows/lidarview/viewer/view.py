@@ -71,26 +71,26 @@ from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # more rays would hide the surfaces
-_SAMPLE = 100_000  # points that colour scales and limits are taken from
+_SAMPLE = 100_000  # points from which colour scales and limits are computed
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
-_HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
+_HITS_SAMPLE = 500_000  # points whose density is shown on large triangles
 _MAX_NAMES = 2000  # in a menu
-# most columns; rows of sensors with few or many channels
+# maximum of columns; rows for sensors with few or many channels
 _IMAGE_WIDTH = 1024
 _IMAGE_ROWS = 128
 _COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _MIN_CHANNELS = 4
 _MAX_CHANNELS = 512
-_MAX_DOWNWARD_SINE = -0.7  # sine of the elevation
-_MAX_FIELD_RAD = math.radians(300)  # a sensor that sees less is no spinning one
+_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation of a sensor that looks down
+_MAX_FIELD_RAD = math.radians(300)  # a spinning sensor sees more
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
-MAX_TRIANGLES = 300_000  # 50 bytes each, whenever their colours have changed
-MAX_PIECES = 60_000  # that large ones are divided into, where hits are shown
+MAX_TRIANGLES = 300_000  # 50 bytes each, sent again when colours change
+MAX_PIECES = 60_000  # of large triangles, where hits are shown
 _INWARD_SHARE = 1e-4  # of the scene's diagonal
-_MAX_SIZE_M = 200.0  # metres: some centimetres are enough for any scene
+_MAX_SIZE_M = 200.0  # of a scene: a shift of 2 cm is enough for any scene
 MAX_LABELS = 1000  # in a legend
-Legend = dict[str, Any]  # what the page is told of it
+Legend = dict[str, Any]  # for the JSON of the page
 CLOUD = "cloud.ply"
 
 
@@ -98,7 +98,7 @@ CLOUD = "cloud.ply"
 class Downloads:
     """Formats in which a page offers points as files, and the function that writes a file."""
 
-    formats: Sequence[str]  # endings of files, such as "las"
+    formats: Sequence[str]  # suffixes of files without a dot, such as "las"
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
 
 
@@ -112,7 +112,7 @@ class View:
     points: Points
     pictured: PictureContent | None = None
     sweeps: Sweeps | None = None
-    note: str = ""  # a remark on what is shown
+    note: str = ""  # a remark for the user
     title: str = "lidarpool"
     results: Sequence[str] = ()  # names, if the points are of several results
     # Returns the hits of each triangle, of actors' triangles last; by default as pictured.
@@ -151,7 +151,7 @@ class View:
         self._colourings: dict[tuple[str, Filter], Colouring] = {}
         self.version += 1
 
-    # -- what is known of the survey -----------------------------------------------------
+    # -- properties of the survey ---------------------------------------------------------
 
     @cached_property
     def sensors(self) -> Sequence[SensorPositions]:
@@ -237,7 +237,7 @@ class View:
         return answers[question](arguments, abandoned)
 
     def _state(self) -> Answer:
-        """Return all of the view but points and surfaces."""
+        """Return the state of the view, without points and surfaces."""
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
@@ -307,9 +307,8 @@ class View:
             arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": positions}
             arrays[f"actor{k}_turns"] = rotations
             arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
-            if (
-                animation := actor.mesh.animation
-            ) is not None:  # after the last pose, pages begin again
+            animation = actor.mesh.animation
+            if animation is not None:  # after the last pose, pages start again
                 frames = actor.seconds(times)[0] / animation.step_s
                 last = len(animation.vertices) - 1 - 1e-6
                 arrays[f"actor{k}_frames"] = frames if animation.repeat else frames.clip(0, last)
@@ -470,7 +469,7 @@ class View:
         pictured = self.pictured
         if pictured is None:
             raise KeyError("surface")
-        with self._lock:  # one browser after the other: it may take long, once
+        with self._lock:  # browsers wait for the first, which may take long
             surface = self._surface = self._surface or ShownSurface(
                 pictured.scene, pictured.reflectance, self.triangles
             )
@@ -537,12 +536,12 @@ def range_image(
     """
     downwards = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
     azimuth = np.arctan2(points[:, 1], -points[:, 2] if downwards else points[:, 0])
-    left = float(azimuth.max())
-    right = float(azimuth.min())
-    if left - right > _MAX_FIELD_RAD:
-        left = math.pi
-        right = -math.pi
-    field = left - right
+    azimuth_left = float(azimuth.max())
+    azimuth_right = float(azimuth.min())
+    if azimuth_left - azimuth_right > _MAX_FIELD_RAD:
+        azimuth_left = math.pi
+        azimuth_right = -math.pi
+    field = azimuth_left - azimuth_right
     if downwards:
         row_count = 1
         row = np.zeros(len(points), np.int64)
@@ -551,7 +550,7 @@ def range_image(
     fullest = azimuth[row == np.bincount(row).argmax()]
     spacing = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider
     width = int(np.clip(_COLUMN_SHARE * field / max(spacing, 1e-9), 32, _IMAGE_WIDTH))
-    column = ((left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
+    column = ((azimuth_left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
     image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]

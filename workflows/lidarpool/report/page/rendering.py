@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from functools import cache
 from heapq import nlargest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -38,9 +38,9 @@ from ..report import STAGES, CountedCloud, in_order
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 WIDTH = 1000  # units of the drawing, which the page scales
 ROW = 18  # height of a row
-ROWS_MOST = 24  # rows of a partition; the busiest are drawn
-_THIN = 1.2  # least width of a bar, in units
-_GAP = 0.6  # bars nearer than this are drawn as one
+MAX_ROWS = 24  # rows of a partition; the busiest are drawn
+_THIN = 1.2  # smallest width of a bar, in units
+_GAP = 0.6  # bars closer than this are drawn as one
 TimeSpan = tuple[float, float]
 WorkerTasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): their tasks}
 MINUS = "\N{MINUS SIGN}"
@@ -55,14 +55,14 @@ def write_page(
     cloud: CountedCloud,
     scenario: Scenario | None = None,
 ) -> None:
-    """Write a report as one HTML file that needs no other files and no network.
+    """Write a report as a single HTML file, which needs no further files and no network.
 
     Most numbers are those of `report`, from `make_report`. `put_picture` adds pictures.
 
     Raises
     ------
     OSError
-        If it cannot be written.
+        If the file cannot be written.
     """
     text = rendered(
         "page.html",
@@ -78,13 +78,13 @@ def write_page(
 
 
 def put_picture(page: Path, name: str, svg: str) -> None:
-    """Put a picture in its place in a page that `write_page` wrote; other pages stay as they are.
+    """Insert a picture into a page of `write_page`; a page without room for the picture stays.
 
-    LidarError if it cannot be written.
+    LidarError if the page cannot be written.
     """
-    place = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
+    pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explained(f"{page} cannot be written"):
-        text = place.sub(lambda found: f"{found[1]}>{svg}", page.read_text(encoding="utf-8"))
+        text = pattern.sub(lambda match: f"{match[1]}>{svg}", page.read_text(encoding="utf-8"))
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
@@ -120,7 +120,7 @@ def rendered(
     )
 
 
-@cache  # compiling one takes longer than filling it
+@cache  # compiling a template takes longer than filling
 def _template(name: str) -> Template:
     escaped = markdown if name.endswith(".md") else printable
     environment = Environment(
@@ -138,7 +138,7 @@ def _template(name: str) -> Template:
         ratio, plural,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
-    environment.filters["shortened"] = lambda name, most=60: shortened(name, most)
+    environment.filters["shortened"] = lambda name, length=60: shortened(name, length)
     environment.filters["one_line"] = lambda text: type(text)(re.sub("[ \n]+", " ", text).strip())
     environment.filters["labels"] = lambda names: dict(
         zip(names, without_common_prefix([*names]), strict=True)
@@ -147,7 +147,7 @@ def _template(name: str) -> Template:
 
 
 def _written(scenario: Scenario) -> str:
-    """Return a scenario as YAML that can be loaded, unless it is so long that it is cut."""
+    """Return a scenario as YAML, cut if too long to be shown."""
     data = scenario.model_dump(mode="json", exclude_defaults=True, by_alias=True)
     data |= {"classes": dict(scenario.classes)} if scenario.classes else {}  # JSON has no numbers
     text = yaml.safe_dump(
@@ -158,108 +158,132 @@ def _written(scenario: Scenario) -> str:
 
 
 def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
-    """Name and value of each field of a dataclass that differs from its default."""
+    """Return the names and values of fields of a dataclass that differ from their defaults."""
     usual = declared(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
 
 
 def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
-    """Lay out the tasks of a run, of which some have records; None if nothing ran.
+    """Lay out the tasks of a run, as far as there are records; return None if no task ran.
 
-    The template gets groups of rows on one axis, which begins with the first task: the stages, then
-    each partition's workers. A row is of one stage, on one worker or on all; its bars are a path of
-    thick lines for SVG, and its detail is a tooltip. Ticks are per cent of the width, and labels.
+    The template gets groups of rows on a common axis, which starts with the first task: the stages,
+    then each partition's workers. A row is of one stage, on one worker or on all; its bars are a
+    path of thick lines for SVG, and its detail is a tooltip. Ticks are per cent of the width, and
+    labels.
     """
     if not stages:
         return None
     stages = in_order(stages)
-    begin = min(stage.start for stage in stages)
-    seconds = max(1e-6, max(stage.stop for stage in stages) - begin)
-
-    def bars(times: Iterable[TimeSpan]) -> str:
-        """Draw spans of time, each wide enough to see, near ones joined."""
-        wide = []
-        for start, stop in times:
-            low = min((start - begin) * WIDTH / seconds, WIDTH - _THIN)
-            wide.append((low, max((stop - begin) * WIDTH / seconds, low + _THIN)))
-        return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in union(wide, _GAP))
-
-    def row(label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
-        text = f"{label}: {detail}"
-        return {"label": label, "detail": text, "stage": stage, "bars": bars(times)}
-
+    start = min(stage.start for stage in stages)
+    seconds = max(1e-6, max(stage.stop for stage in stages) - start)
+    axis = _TimeAxis(start, seconds)
     overview = []
-    for one in stages:
-        work = f"{duration(one.seconds)} of work within {duration(one.stop - one.start)}"
-        detail = f"{plural(one.tasks, 'task')}, {work}"
-        overview.append(row(STAGES[one.stage], one.stage, detail, one.busy))
+    for stage in stages:
+        work = f"{duration(stage.seconds)} of work within {duration(stage.stop - stage.start)}"
+        detail = f"{plural(stage.tasks, 'task')}, {work}"
+        overview.append(axis.row(STAGES[stage.stage], stage.stage, detail, stage.busy))
     groups: list[dict[str, Any]] = [
-        {"title": "Stages", "detail": "while at least one task ran", "rows": overview}
+        {"title": "Stages", "detail": "while at least one task ran", "rows": overview},
+        *_partition_groups(stages, axis),
     ]
-    ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    # {partition: its tasks}
-    drawn: dict[str, WorkerTasks] = defaultdict(lambda: defaultdict(list))
-    for record in (record for stage in stages for record in stage.records):
-        where = record.partition if not record.misplaced else " + ".join(record.resources)
-        drawn[where or "no partition"][record.worker, record.stage].append(record)
-    for partition, tasks in sorted(drawn.items()):
-        workers = {worker for worker, _ in tasks}  # of tasks that have a record
-        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        count = sum(map(len, tasks.values()))
-        detail = f"{plural(len(workers), 'worker')}, {plural(max(ran[partition], count), 'task')}"
-        if ran[partition] > count:  # else gaps would look like idle time
-            detail += f", of which {count:,} are drawn: gaps are not all idle time"
-        if len(tasks) > ROWS_MOST:
-            detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
-        busy = {key: sum(task.seconds for task in some) for key, some in tasks.items()}
-        rows = []
-        for worker, stage in sorted(
-            nlargest(ROWS_MOST, tasks, key=lambda key: busy[key]),
-            key=lambda key: (natural(key[0]), [*STAGES].index(key[1])),
-        ):
-            some = tasks[worker, stage]
-            work = duration(busy[worker, stage])
-            words = f"{STAGES[stage]}, {plural(len(some), 'task')}, {work}"
-            rows.append(row(worker, stage, words, ((task.start, task.stop) for task in some)))
-        groups.append({"title": partition, "detail": detail, "rows": rows})
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
-    begun = f"{datetime.fromtimestamp(begin, UTC):%Y-%m-%d %H:%M UTC}"
+    begun = f"{datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M UTC}"
     drawing = {"ticks": ticks, "groups": groups, "row": ROW}
     return {"begun": begun, "seconds": seconds, "stages": stages, "names": STAGES} | drawing
 
 
+class _TimeAxis(NamedTuple):
+    """Axis of a timeline, seconds."""
+
+    start: float
+    length: float
+
+    def bars(self, times: Iterable[TimeSpan]) -> str:
+        """Draw spans of time as a path, wide enough to be visible, with close spans joined."""
+        spans = []
+        for start, stop in times:
+            x_start = min((start - self.start) * WIDTH / self.length, WIDTH - _THIN)
+            x_stop = max((stop - self.start) * WIDTH / self.length, x_start + _THIN)
+            spans.append((x_start, x_stop))
+        joined = union(spans, _GAP)
+        return "".join(f"M{x_start:.1f} {ROW / 2:g}H{x_stop:.1f}" for x_start, x_stop in joined)
+
+    def row(self, label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
+        """Return a row of the template."""
+        text = f"{label}: {detail}"
+        return {"label": label, "detail": text, "stage": stage, "bars": self.bars(times)}
+
+
+def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[dict[str, Any]]:
+    """Return a group of rows for each partition."""
+    task_counts = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
+    # {partition: its tasks}
+    drawn: dict[str, WorkerTasks] = defaultdict(lambda: defaultdict(list))
+    for record in (record for stage in stages for record in stage.records):
+        name = record.partition if not record.misplaced else " + ".join(record.resources)
+        drawn[name or "no partition"][record.worker, record.stage].append(record)
+    groups = []
+    for partition, tasks in sorted(drawn.items()):
+        workers = {worker for worker, _ in tasks}  # of tasks that have a record
+        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
+        count = sum(map(len, tasks.values()))
+        total = max(task_counts[partition], count)
+        detail = f"{plural(len(workers), 'worker')}, {plural(total, 'task')}"
+        if total > count:  # else gaps would look like idle time
+            detail += f", of which {count:,} are drawn: gaps are not all idle time"
+        if len(tasks) > MAX_ROWS:
+            detail += f"; the busiest {MAX_ROWS} of {len(tasks):,} rows"
+        groups.append({"title": partition, "detail": detail, "rows": _worker_rows(tasks, axis)})
+    return groups
+
+
+def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
+    """Return rows for the busiest pairs of a worker and a stage of a partition."""
+    busy_s = {key: sum(task.seconds for task in records) for key, records in tasks.items()}
+    rows = []
+    for worker, stage in sorted(
+        nlargest(MAX_ROWS, tasks, key=lambda key: busy_s[key]),
+        key=lambda key: (natural(key[0]), [*STAGES].index(key[1])),
+    ):
+        records = tasks[worker, stage]
+        work = duration(busy_s[worker, stage])
+        detail = f"{STAGES[stage]}, {plural(len(records), 'task')}, {work}"
+        rows.append(axis.row(worker, stage, detail, ((task.start, task.stop) for task in records)))
+    return rows
+
+
 def printable(text: str) -> str:
-    """Replace unprintable characters; names in files may contain ones that reverse a line."""
+    """Replace unprintable characters; names in files may contain characters that reverse a line."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
 
 
 def markdown(text: str) -> str:
-    """Text of a user as one line of Markdown that shows it as it is."""
+    """Return text of a user as a line of Markdown, escaped."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
 
 
 def code(text: str) -> Markup:
-    """Name as code of Markdown; with letters that end code or a cell, as text."""
+    """Return a name as code of Markdown, or as text if letters would end code or a cell."""
     is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
     return Markup(f"`{text}`" if is_plain else markdown(text))
 
 
 def duration(seconds: float) -> str:
-    """Return a time in the unit that suits it."""
+    """Return a time in a unit that gives few digits."""
     if 0 < seconds < 0.001:
         return f"{1e6 * seconds:.0f} µs"
     if 0 < seconds < 0.9995:
         return f"{1e3 * seconds:.3g} ms"
     if seconds < 99.95:
         return f"{seconds:.3g} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600:,} h {whole % 3600 // 60:02d} min"
+    total_s = round(seconds)
+    if total_s < 3600:
+        return f"{total_s // 60} min {total_s % 60:02d} s"
+    return f"{total_s // 3600:,} h {total_s % 3600 // 60:02d} min"
 
 
 def rate(number: float, seconds: float) -> str:
@@ -268,7 +292,7 @@ def rate(number: float, seconds: float) -> str:
 
 
 def large(number: float) -> str:
-    """Return a number with three digits, and k, M or G if it is large."""
+    """Return a number with three digits, and k, M or G for large numbers."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
         if number >= size:
             scaled = number / (1e3 if letter == "k" else size)
@@ -276,9 +300,9 @@ def large(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def share(part: float, whole: float) -> str:
+def share(part: float, total: float) -> str:
     """Return a part in per cent."""
-    return f"{100 * part / whole:.1f}%" if whole else "–"
+    return f"{100 * part / total:.1f}%" if total else "–"
 
 
 def excess(fraction: float) -> str:
@@ -289,7 +313,7 @@ def excess(fraction: float) -> str:
 
 
 def formatted(value: Any) -> str:
-    """Return a number of four digits, or to a tenth, whole ones with all; text, or several."""
+    """Return numbers with four digits or a decimal, integers with all digits; text unchanged."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
@@ -301,12 +325,12 @@ def formatted(value: Any) -> str:
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Coordinates in metres, to the millimetre."""
+    """Return coordinates in metres, to the millimetre."""
     return ", ".join(f"{round(value, 3) + 0.0:,.10g}" for value in values).replace("-", MINUS)
 
 
 def millimetres(value: float | None) -> str:
-    """Length in the unit that suits it, or words for none."""
+    """Return a length in metres or millimetres, or "unknown" for None."""
     if value is None:
         return "unknown"
     text = f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
@@ -314,5 +338,5 @@ def millimetres(value: float | None) -> str:
 
 
 def ratio(value: float | None) -> str:
-    """Return a share from 0 to 1, or words for none."""
+    """Return a share from 0 to 1, or "undefined" for None."""
     return "undefined" if value is None else f"{value:.3f}"
