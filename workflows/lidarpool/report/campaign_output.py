@@ -116,13 +116,13 @@ class DataSetOutput(Output[CampaignRun]):
         if shards != [str(self.campaign.shard)]:
             held = listed([*map(shard_in_words, shards)]) or "no shard"
             raise LidarError(
-                f"{self.dataset.place} holds {held}, and this is "
+                f"{self.dataset.storage} holds {held}, and this is "
                 f"{shard_in_words(str(self.campaign.shard))}: give another folder with --out."
             )
 
     def _is_complete(self, record: Mapping[str, Any], *, verify: bool) -> bool:
         """Read the rows of a finished data set, and return True if all jobs are intact."""
-        storage = self.dataset.place
+        storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
             rows = (row for row, _ in self.dataset.rows())
             self._rows += sorted(rows, key=lambda row: row.number)
@@ -138,7 +138,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     def _finished(self, run: Run[CampaignRun]) -> CampaignRun:
         """Show that a data set is complete, and return its sums."""
-        run.screen.tell(f"{self.dataset.place} is complete: nothing is left to do")
+        run.screen.tell(f"{self.dataset.storage} is complete: nothing is left to do")
         for row in self._rows:
             run.page.ended(row)
         notes = tuple(run.warn_of_empty_jobs(self._rows))
