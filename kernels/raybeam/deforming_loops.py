@@ -10,18 +10,20 @@ from numba import types
 from .arrays import Floats, Floats32, Ints, Ints32
 from .compiled import compiled, inlined, stage
 from .embree_memory import float32s, float64s
-from .moving_loops import CROSSING, NEAREST, named_tuple, pose_rotation, to_body_axes
+from .moving_loops import CROSSING, NEAREST, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS
 from .triangle_loops import areas, same_sign, shear
 
 WIDTH = 8  # children of a node
-_STACK = 512  # nodes that wait: far more than on any descent in a tree of 2**28 triangles
+_STACK = 512  # nodes still to visit: far more than on any descent in a tree of 2**28 triangles
 _BOX = 4 * 6 * WIDTH  # bytes of the boxes of a node
 _TINY = 1e-300
 
 
 class DeformingTree(NamedTuple):
-    """A mesh that deforms, and a tree over its triangles that is valid between all frames.
+    """A mesh that deforms, and a tree over its triangles with boxes for each interval of frames.
+
+    A frame is the vertices at a known time; between two frames each vertex moves straight.
 
     Attributes
     ----------
@@ -30,10 +32,12 @@ class DeformingTree(NamedTuple):
     faces
         int64 (t, 3): rows of the vertices of each triangle.
     order, child
-        int32 (t,) and (m, `WIDTH`): as of `tree.WideTree`.
+        int32 (t,) and (m, `WIDTH`): triangles in the order of the leaves, and children of each
+        node, as in `tree.WideTree`: a positive number of a node, 0 for none, or
+        ``~(first << LEAF_BITS | count - 1)`` for a leaf of ``order[first : first + count]``.
     boxes
         float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node, from each frame to the
-        next: lower x, y, z, upper x, y, z.
+        next: lower x, y, z, upper x, y, z, metres.
     """
 
     vertices: Floats
@@ -43,7 +47,7 @@ class DeformingTree(NamedTuple):
     boxes: Floats32
 
 
-_TREE = named_tuple(
+_TREE = named_tuple_type(
     DeformingTree,
     types.float64[:, :, ::1],
     types.int64[:, ::1],
@@ -55,7 +59,10 @@ _TREE = named_tuple(
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
 def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Write the boxes of all nodes from each frame to the next, see `DeformingTree`."""
+    """Write the boxes of all nodes from each frame to the next to `boxes`, see `DeformingTree`.
+
+    Boxes are larger than the triangles by `pad`, metres.
+    """
     for i in range(len(boxes)):
         for node in range(len(child) - 1, -1, -1):  # children come after their parents
             for c in range(WIDTH):
@@ -85,8 +92,9 @@ def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-d
 def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the distances at which a ray enters the boxes of a node's children; inf for a miss.
 
-    `box` and `entry_distances` are addresses; `inverse` is 1 over the ray's direction; the ray ends
-    at the distance `reach`.
+    `box` is the address of the boxes, float32 (6, `WIDTH`); `entry_distances` is the address of the
+    output, float64 (`WIDTH`,). `inverse` is 1 over the ray's direction; the ray ends at the
+    distance `reach`.
     """
     x, y, z = origin
     u, v, w = inverse
@@ -112,7 +120,10 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 
 @inlined
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
-    """Return a vertex at a share of the time from a frame to the next, with the axis last."""
+    """Return a vertex at a share of the time from a frame to the next, 0 to 1.
+
+    Returns three coordinates, metres, of which `axis` is the last.
+    """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
     remainder = 1 - share
@@ -125,7 +136,11 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
 
 @compiled(types.void(CROSSING, _TREE, NEAREST))
 def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast the pairs of a `Crossing` on a deforming mesh, and write nearer hits to a `Nearest`."""
+    """Cast the pairs of a `Crossing` on a deforming mesh, and write nearer hits to a `Nearest`.
+
+    Each ray meets the mesh in its shape at `Crossing.frame`. Nodes are visited nearest first;
+    `waits` are the distances of the nodes on the stack.
+    """
     rays = crossing.rays
     poses = crossing.poses
     body = crossing.body

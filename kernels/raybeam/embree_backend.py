@@ -1,4 +1,8 @@
-"""Ray casting with Embree, as embreex ships it."""
+"""Ray casting with Embree, as embreex ships it.
+
+Rays of a pattern are numbered firing after firing, so the next ray of a ring is `step` rays later.
+The compiled loops read and write memory by the addresses in a `CAST` record, see embree_memory.py.
+"""
 
 from __future__ import annotations
 
@@ -28,29 +32,33 @@ from .scan import Scan
 if TYPE_CHECKING:
     from .embree_memory import Cast
 
-_SHARE = 1 << 13  # rays that a thread casts at a time, if there are several threads
+_SHARE = 1 << 13  # rays that a thread casts in a call, if there are several threads
 # Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
 # rays, wider packets more slowly.
 _COHERENCE = 0.94
-_SHAPES = ((16, 1), (8, 2), (4, 4))  # rays of a group along a ring, and rings
+_SHAPES = ((16, 1), (8, 2), (4, 4))  # of groups: rays along a ring, and neighbouring rings
 _MAX_BLOCK = 1 << 15  # rays of a block
-_TRIALS = 5  # parts that are cast in each grouping to choose the fastest
-_TRIAL_RAYS = 1 << 10  # rays of such a part, at least
+_TRIALS = 5  # ranges of rays that are cast in every grouping, to choose the fastest grouping
+_TRIAL_RAYS = 1 << 10  # minimum number of rays of a timed cast
 _SIMILAR = 0.02  # maximum difference of the coherence of patterns with the same fastest grouping
 _MAX_PLANS = 16
 
 
 class _RayGrouping(NamedTuple):
-    """How rays are grouped, see `embree_packets`.
+    """How the rays of a scan are divided into groups of 16, see `embree_packets`.
+
+    A block is `step` times `rays_along` consecutive rays: `step` rings of `rays_along` rays.
 
     Attributes
     ----------
     step
-        Rays from a ray to its neighbour along a ring.
+        Difference of the numbers of neighbouring rays of a ring: 1 where consecutive rays form a
+        ring, or for example the rays of a firing.
     rays_along, rays_across
-        Rays of a ring in a group, and rings of a group.
+        Rays of each ring in a group, and rings of a group; their product is 16.
     coherence
-        A group with a smaller cosine between two rays is cast ray by ray.
+        Minimum cosine between the first and further rays of a group; a group with a smaller cosine
+        is cast ray by ray. Greater than 1 to cast all groups ray by ray.
     """
 
     step: int
@@ -77,7 +85,7 @@ class EmbreeBackend(Backend):
     """
 
     name: ClassVar[str] = "embree"
-    chunk: ClassVar[int] = 1 << 17  # rays, of 20 bytes; parts of a longer scan are copied together
+    chunk: ClassVar[int] = 1 << 17  # rays; hits take 20 bytes a ray, until chunks are joined
 
     @classmethod
     def missing(cls) -> str:
@@ -106,8 +114,8 @@ class EmbreeBackend(Backend):
         self._instances = (
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
-        self._plans: dict[tuple[int, int], _Plan] = {}
-        # Seconds a ray of calls of `cast_crossing`: in packets, and ray by ray.
+        self._plans: dict[tuple[int, int], _GroupingPlan] = {}
+        # Seconds a ray of timed calls of `cast_crossing`: in packets, and ray by ray.
         self._crossing_times: tuple[list[float], list[float]] = [], []
         self._loops = embree_packets
         self._memory = embree_memory
@@ -119,10 +127,11 @@ class EmbreeBackend(Backend):
                 record["uv"] = opacity.uv.ctypes.data
                 record["mask"] = opacity.mask.ctypes.data
                 record["mask_height"], record["mask_width"] = opacity.mask.shape
+        # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
         width = embree_library.packet_width()
-        packets = [embree_exact.propose] * min(16 // width, 4)  # none, for packets of 1
+        packets = [embree_exact.propose] * min(16 // width, 4)  # unused if a packet is one ray
         single = embree_exact.propose
         if not (scene.nested or masked):
             packets = [embree_exact.plain_proposer(width, k) for k in range(len(packets))]
@@ -164,7 +173,7 @@ class EmbreeBackend(Backend):
     def closest(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         cast = self._ray_cast(rays)
-        cast.record["index"] = 0
+        cast.record["index"] = 0  # hits get the row of the corners, which `weigh` needs
         ray, distance, row, instance = self._cast(cast, 0, len(rays))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
@@ -172,7 +181,7 @@ class EmbreeBackend(Backend):
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
         self._loops.weigh(cast.record, origins, directions, row, instance, u, v)
-        t = distance * self._scene.frame.scale  # a power of two
+        t = distance * self._scene.frame.scale  # local; exact, since the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
@@ -198,7 +207,11 @@ class EmbreeBackend(Backend):
             self._crossing_times[bool(use_single)].append((time.perf_counter() - start) / count)
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
-        """Yield start and stop of each part of a scan, and its hits, numbered from start."""
+        """Yield ranges of rays of a scan, and the hits of each range.
+
+        Yields start and stop of the range, and a `Part`: hits in ray order, whose rays are numbered
+        from start.
+        """
         cast = self._scan_cast(scan)
         plan = self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
@@ -208,7 +221,10 @@ class EmbreeBackend(Backend):
                     plan.choose(partial(self._cast, cast, begin, end))
 
     def _ray_cast(self, rays: Rays) -> Cast:
-        """Return the cast of rays that are not of a pattern."""
+        """Return the `Cast` of rays that are not of a pattern.
+
+        Each ray becomes a beam, seen from a single pose.
+        """
         origins: Floats | None = rays.origins
         position = np.zeros((1, 3))
         if len(rays.origins) == 1:
@@ -221,7 +237,7 @@ class EmbreeBackend(Backend):
         return cast
 
     def _scan_cast(self, scan: Scan) -> Cast:
-        """Return the cast of a scan."""
+        """Return the `Cast` of a scan; the loops also write the rays to `scan.room`, if any."""
         pattern = scan.pattern
         cast = self._memory.Cast(self._base)
         max_offset = cast.set_pattern(pattern, scan.poses, scan.first)
@@ -245,45 +261,61 @@ class EmbreeBackend(Backend):
     ) -> None:
         """Write the limits of distances, and whether all rays start near the scene, to a cast.
 
-        `origins` are of beams, relative to the sensor; sub-rays start at most `max_offset` metres
-        from their beam.
+        Parameters
+        ----------
+        cast
+            The cast, to whose record the limits are written.
+        poses
+            Poses of the rays, with their motion.
+        origins
+            (n, 3): origins of the beams relative to the sensor, metres; None for no origins.
+        limits
+            Closest and farthest distance of a hit, metres.
+        max_offset
+            Largest component of the vectors from a beam's origin to starts of sub-rays, metres.
         """
         motion = poses.motion
         frame = self._scene.frame
         record = cast.record
-        reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
-        reach += 2 * max_offset * frame.scale
+        # Upper bound of the local coordinates of all origins.
+        max_coordinate = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
+        max_coordinate += 2 * max_offset * frame.scale
         if origins is not None:
-            reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
+            max_coordinate += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
             max_delay = np.abs(motion.delays).max(initial=0)
             path = max_delay * np.abs(motion.velocities).max(initial=0)
-            reach += 2 * float(path) * frame.scale
-        record["starts_near"] = reach < NEAR
+            max_coordinate += 2 * float(path) * frame.scale
+        record["starts_near"] = max_coordinate < NEAR
         record["t_min"], record["t_max"] = (limit * frame.scale for limit in limits)
 
-    def _plan(self, scan: Scan) -> _Plan:
-        """Return the plan of similar scans, with their fastest groupings, or a new plan."""
+    def _plan(self, scan: Scan) -> _GroupingPlan:
+        """Return the plan of groupings that similar scans share; a new plan if there is none."""
         rays_per_pose = scan.poses.rays_per_pose if len(scan.poses) > 1 else 0
         key = (len(scan.pattern), rays_per_pose)
         plan = self._plans.get(key)
         if plan is None or not plan.fits(scan):
             if len(self._plans) >= _MAX_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = _Plan(scan, rays_per_pose)
+            plan = self._plans[key] = _GroupingPlan(scan, rays_per_pose)
         return plan
 
     def _cast(
         self, cast: Cast, start: int, stop: int, grouping: _RayGrouping = _CONSECUTIVE
     ) -> Part:
-        """Return the hits of rays `start` to `stop`, in their order, numbered from `start`."""
+        """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
+
+        Distances are in metres; `triangle` is the row in the caller's faces, or the row of the
+        corners if `index` of the record is 0.
+        """
         n = stop - start
         ray = np.empty(n, np.uint32)
         distance = np.empty(n)
         triangle = np.empty(n, np.int32)
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
-        def part(begin: int) -> Part:
+        def cast_share(begin: int) -> Part:
+            """Return the hits of `share` rays from `begin`, as views of the memory of all rays."""
             record = cast.record.copy()
             row = begin - start
             scratch, block_memory = self._memory.thread_memory.addresses(grouping.block)
@@ -305,19 +337,24 @@ class EmbreeBackend(Backend):
         share = max(_SHARE // grouping.block, 1) * grouping.block
         if self._count == 1 or n <= share:
             share = n
-            return part(start)
+            return cast_share(start)
         if self._process != os.getpid():  # a fork, which has no threads of its parent
             self._threads = ThreadPoolExecutor(self._count, "embree")
             self._process = os.getpid()
-        return join_hits(list(self._threads.map(part, range(start, stop, share))))
+        return join_hits(list(self._threads.map(cast_share, range(start, stop, share))))
 
 
-class _Plan:
+class _GroupingPlan:
     """Groupings of the rays of a pattern, of which the fastest is chosen during casts.
 
-    A group has rays of a ring, or of some neighbouring rings, or each ray is cast by itself: which
-    grouping is fastest depends on the scene. All are tried on the same parts. No grouping changes a
-    result.
+    A group has rays of a single ring, or of some neighbouring rings, or each ray is cast by itself:
+    which grouping is fastest depends on the scene. Some ranges of rays are cast in all groupings,
+    and timed. No grouping changes a result.
+
+    Attributes
+    ----------
+    groupings
+        Groupings that are tried; after `_TRIALS` timed ranges, the fastest alone.
     """
 
     def __init__(self, scan: Scan, rays_per_pose: int) -> None:
@@ -346,29 +383,32 @@ class _Plan:
         self._trials: list[list[float]] = []  # times of the groupings, as shares of the shortest
 
     def fits(self, scan: Scan) -> bool:
-        """Return whether the rays of a scan are as coherent as the rays of this plan."""
+        """Return whether the plan holds for a scan: of the same beams, or as coherent."""
         if self._beams() is scan.pattern.directions.base:
             return True
         grouping = _RayGrouping(self._step, 16, 1)
         return abs(_coherence(scan, grouping) - self._coherence) < _SIMILAR
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Yield start and stop of parts of rays, and whether to try all groupings on a part."""
-        part = -(-(stop - start) // _TRIALS)
+        """Yield start and stop of ranges of rays, and whether to time all groupings on a range."""
+        piece = -(-(stop - start) // _TRIALS)
         while start < stop:
             end = stop
             if len(self.groupings) > 1:
                 block = max(grouping.block for grouping in self.groupings)
                 trial_end = min(start + max(block, _TRIAL_RAYS), stop)
                 yield start, trial_end, True
-                end = min(max(trial_end, start + part), stop)
+                end = min(max(trial_end, start + piece), stop)
                 start = trial_end
             if start < end:
                 yield start, end, False
             start = end
 
     def choose(self, cast: Callable[[_RayGrouping], object]) -> None:
-        """Time the cast of a part, now in the caches, in each grouping; at last keep the best."""
+        """Time the cast of a range of rays in each grouping; after the last trial keep the fastest.
+
+        `cast` casts the range in a grouping. The range was cast before, so the caches are warm.
+        """
         groupings = self.groupings
         marks = [time.perf_counter()]
         if len(groupings) == 1:  # another thread has chosen meanwhile
@@ -383,7 +423,10 @@ class _Plan:
 
 
 def _coherence(scan: Scan, grouping: _RayGrouping) -> float:
-    """Return the mean over sampled groups of the smallest cosine between first and further rays."""
+    """Return the coherence of a grouping: the mean of the smallest cosines of 32 sampled groups.
+
+    Cosines are between the first ray of a group and three further rays, which `lags` numbers.
+    """
     lanes = np.array([0, 5, 10, 15])
     lags = grouping.step * (lanes // grouping.rays_across) + lanes % grouping.rays_across
     last_start = len(scan) - int(lags[-1])

@@ -1,4 +1,9 @@
-"""The loop that casts rays at moving bodies with Embree, as `cast_crossing` of crossing.py."""
+"""The loop that casts rays at moving bodies with Embree, as `cast_crossing` of crossing.py.
+
+`cast` is a `CAST` record, `scratch` the address of the `SCRATCH` memory, `floats` and `numbers`
+point to that memory as float64 and int64, and `lane` is a ray of the group. Local coordinates are
+the body's scene coordinates, centred and scaled.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,10 @@ from numba import types
 from . import embree_memory as memory
 from .compiled import compiled, inlined
 from .embree_memory import (
-    FIRST_ROW,
+    FIRST_ROW_FIELD,
+    INSTANCE_BYTES,
+    KEYS_PER_INSTANCE,
     LANES,
-    NUMBER,
-    RECORD,
     byte_offset,
     field_index,
     float64s,
@@ -34,13 +39,17 @@ from .rays import UNIT_SLACK
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(field_index, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _ENTRY, _REAL, _T, _KEY = map(field_index, ("entry", "real", "t", "key"))
 _PAIR = field_index("row")  # number of the pair of a `Crossing`
-_LENGTH = field_index("straight")  # of the direction, before it was made a unit vector
+_DIRECTION_LENGTH = field_index("straight")  # before the direction was made a unit vector
 _VALID_AT = byte_offset("valid")
 
 
 @inlined
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
-    """Write a ray, in metres in the axes of its body, to a group; return its direction's length."""
+    """Write a ray to a lane of a group, in local coordinates; return the length of its direction.
+
+    `origin`, metres, and `direction` are in the axes of the body. The length is 1 but for a sensor
+    that turns during a pose.
+    """
     scale = cast.scale
     centre = cast.centre
     u, v, w = direction
@@ -70,7 +79,7 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 @inlined
 def _fill_up(scratch, filled):  # type: ignore[no-untyped-def]
-    """Write copies of a group's first ray to the lanes after its `filled` rays."""
+    """Write copies of the first ray to the lanes after `filled`, the number of a group's rays."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     valid = int32s(scratch + _VALID_AT)
@@ -84,7 +93,11 @@ def _fill_up(scratch, filled):  # type: ignore[no-untyped-def]
 
 @inlined
 def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the hits of a group's `filled` rays to `nearest` where they are nearer."""
+    """Write the hits of a group's first `filled` rays to a `Nearest`, where they are nearer.
+
+    `key`, negative for a miss, is the row of the triangle in its mesh's corners, and
+    `KEYS_PER_INSTANCE` times the instance.
+    """
     scratch = cast.scratch
     numbers = int64s(scratch)
     floats = float64s(scratch)
@@ -97,15 +110,17 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
         pair = numbers[_PAIR + lane]
         ray = crossing.row[pair]
         body = crossing.body[pair]
-        metres = t * metre / floats[_LENGTH + lane]
+        metres = t * metre / floats[_DIRECTION_LENGTH + lane]
         nearer = metres < distance[ray] or (metres == distance[ray] and body < bodies[ray])
         if key < 0 or t > cast.t_max or not nearer:
             continue
-        row = key & (NUMBER - 1)
+        row = key & (KEYS_PER_INSTANCE - 1)
         instance[ray] = 0
         if cast.instances != 0:
-            instance[ray] = key // NUMBER
-            row += int64s(cast.instances + RECORD * (key // NUMBER))[FIRST_ROW]
+            instance[ray] = key // KEYS_PER_INSTANCE
+            row += int64s(cast.instances + INSTANCE_BYTES * (key // KEYS_PER_INSTANCE))[
+                FIRST_ROW_FIELD
+            ]
         distance[ray] = metres
         bodies[ray] = body
         triangle[ray] = index[row]
@@ -113,7 +128,10 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
 
 @compiled(types.void(memory.CASTS, CROSSING, NEAREST))
 def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`."""
+    """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`.
+
+    A pair whose ray misses the body's box, or ends before the box, takes no lane of a group.
+    """
     cast = casts[0]
     scratch = cast.scratch
     numbers = int64s(scratch)
@@ -136,7 +154,9 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
             origin = to_body_axes(rotation, x, y, z)
             direction = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
             if passes_box(corners, PADS_M, nearest.distance[k], origin, direction):
-                floats[_LENGTH + filled] = _write_ray(cast, floats, filled, origin, direction)
+                floats[_DIRECTION_LENGTH + filled] = _write_ray(
+                    cast, floats, filled, origin, direction
+                )
                 numbers[_PAIR + filled] = pair
                 filled += 1
             pair += 1

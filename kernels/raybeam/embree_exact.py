@@ -15,6 +15,29 @@ for memory, a third of the time in a terrain of two million triangles. At open b
 within rounding error of a rim are lost. Larger triangles in Embree's copy would need shared edges,
 found in as much time as building the tree; each grown by itself, they would have gaps for grazing
 rays.
+
+Parameters of the functions below, whose memory embree_memory.py describes:
+
+scratch, numbers, floats
+    Address of the `SCRATCH` memory of a thread, and pointers to that memory as int64 and float64.
+lane
+    Number of a ray in its group of `LANES` rays.
+mesh, instances
+    Addresses of the `MESH` and `INSTANCE` records; `instances` is 0 for a single mesh without a
+    transform.
+key
+    A triangle of an instance: row of the mesh's corners plus `KEYS_PER_INSTANCE` times the
+    instance.
+table
+    Pointer to the corners of a mesh, float64 (triangles, 3, 3), local to the mesh.
+hit
+    `PlaneHit`: areas a, b, c of a triangle as a ray sees the triangle, their sum, and the distance.
+reach
+    Local distance at which a ray ends.
+
+A rough distance is a distance in float32 as Embree computes it, from the start that Embree sees.
+The shear of a ray is what the test of triangle.py needs of the ray: the longest axis of its
+direction, its origin with that axis last, and the factors of the shear.
 """
 
 from __future__ import annotations
@@ -30,8 +53,8 @@ from . import embree_memory as memory
 from .compiled import callback, inlined, stage
 from .embree_library import find_library
 from .embree_memory import (
+    KEYS_PER_INSTANCE,
     LANES,
-    NUMBER,
     byte_offset,
     field_index,
     float32s,
@@ -84,7 +107,7 @@ MAX_DISTANCE = 8.0  # more than the diagonal of any scene
 
 _GRAZES = 2.0**-10  # sine of the smallest angle to a triangle that `decide` allows for
 _RIM = 2.0**-20  # share of a triangle's height: far more than rounding in float64
-_STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
+_MAX_AXIS_SUM = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
 _intersect_1 = types.ExternalFunction(
     "rtcIntersect1", types.void(types.intp, types.intp, types.intp)
@@ -96,7 +119,11 @@ _point_query = types.ExternalFunction(
 
 @stage
 def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray to an instance's coordinates, as `Scene.enter`; also return its length."""
+    """Transform a ray from the scene's to the mesh's local coordinates, as `Scene.enter`.
+
+    `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
+    the length of the direction before it was made a unit vector.
+    """
     x = (m[0] * dx + m[1] * dy) + m[2] * dz
     y = (m[4] * dx + m[5] * dy) + m[6] * dz
     z = (m[8] * dx + m[9] * dy) + m[10] * dz
@@ -109,7 +136,7 @@ def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @inlined
 def scene_ray(floats, lane):  # type: ignore[no-untyped-def]
-    """Return origin and direction of a ray of the group, local to the scene."""
+    """Return the origin and the direction of a ray of the group, local to the scene: 6 numbers."""
     x = floats[_OX + lane]
     y = floats[_OY + lane]
     z = floats[_OZ + lane]
@@ -118,7 +145,7 @@ def scene_ray(floats, lane):  # type: ignore[no-untyped-def]
 
 @inlined
 def store_shear(numbers, floats, lane, ray):  # type: ignore[no-untyped-def]
-    """Write the shear of a ray, by its origin and direction, to the scratch memory."""
+    """Write the shear of a ray, given as origin and direction in 6 numbers, to a lane."""
     axis, u, v, w, sx, sy, sz = shear(*ray)
     numbers[_AXIS + lane] = axis
     floats[_U + lane] = u
@@ -139,23 +166,29 @@ def shear_all(scratch):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Return the address of the `MESH` of a key; transform the ray to the mesh's coordinates."""
+def _enter_mesh(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
+    """Return the address of the `MESH` of a key, and write the shear of the ray in that mesh.
+
+    Without instances the lane has the shear already, as for the instance `inside` of the lane.
+    """
     if instances == 0:
         return mesh
-    number = key // NUMBER
-    address = instances + memory.RECORD * number
+    number = key // KEYS_PER_INSTANCE
+    address = instances + memory.INSTANCE_BYTES * number
     if numbers[_INSIDE + lane] != number:
         ox, oy, oz, dx, dy, dz, length = enter_instance(float64s(address), *scene_ray(floats, lane))
         store_shear(numbers, floats, lane, (ox, oy, oz, dx, dy, dz))
         floats[_LENGTH + lane] = length
         numbers[_INSIDE + lane] = number
-    return int64s(address)[memory.MESH_OF]
+    return int64s(address)[memory.MESH_FIELD]
 
 
 @inlined
 def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
-    """Return the three corners of a triangle, each with the axis last."""
+    """Return the three corners of a triangle, each as three coordinates of which `axis` is last.
+
+    `triangle` is the row in `table`.
+    """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
     k = 9 * triangle
@@ -168,7 +201,7 @@ def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
 
 @inlined
 def _load_shear(floats, lane):  # type: ignore[no-untyped-def]
-    """Return the sheared ray that `store_shear` wrote."""
+    """Return the shear that `store_shear` wrote, without the axis: 6 numbers."""
     u = floats[_U + lane]
     v = floats[_V + lane]
     w = floats[_W + lane]
@@ -177,7 +210,7 @@ def _load_shear(floats, lane):  # type: ignore[no-untyped-def]
 
 @inlined
 def _is_clearly_inside(hit):  # type: ignore[no-untyped-def]
-    """Return whether a ray passes inside a triangle, away from shared edges and corners."""
+    """Return whether a `PlaneHit` is inside its triangle, away from shared edges and corners."""
     a, b, c, det, _ = hit
     rim = _RIM * det * det
     return (a * det > rim) & (b * det > rim) & (c * det > rim)
@@ -185,7 +218,10 @@ def _is_clearly_inside(hit):  # type: ignore[no-untyped-def]
 
 @stage
 def _is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`."""
+    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`.
+
+    `mesh` points to a `MESH`, `triangle` is the row in its corners.
+    """
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
     height = mesh[3]
@@ -203,9 +239,12 @@ def _is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 
 @stage
 def _intersect(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Return the `PlaneHit` of a ray and a triangle by key, and the `MESH` of the triangle."""
-    record = int64s(_mesh_of(mesh, instances, numbers, floats, lane, key))
-    triangle = key & (NUMBER - 1)
+    """Return the `PlaneHit` of a ray and the triangle of a key, and a pointer to its `MESH`.
+
+    The distance is local to the scene.
+    """
+    record = int64s(_enter_mesh(mesh, instances, numbers, floats, lane, key))
+    triangle = key & (KEYS_PER_INSTANCE - 1)
     corners = corners_of(float64s(record[0]), triangle, numbers[_AXIS + lane])
     hit = areas(corners, _load_shear(floats, lane))
     if instances != 0:
@@ -216,26 +255,27 @@ def _intersect(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-
 
 @stage
 def _is_transparent(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Return whether a mask lets a ray through a triangle."""
+    """Return whether a mask lets a ray through the triangle of a key."""
     hit, record = _intersect(mesh, instances, numbers, floats, lane, key)
     if record[3] == 0:
         return False
-    return hit.det == 0 or not _is_opaque(record, key & (NUMBER - 1), hit)
+    return hit.det == 0 or not _is_opaque(record, key & (KEYS_PER_INSTANCE - 1), hit)
 
 
 @cache
-def plain_proposer(count: int, part: int = 0) -> Any:
-    """Return a filter function like `propose`, for packets of `count` rays in a plain scene.
+def plain_proposer(count: int, packet_number: int = 0) -> Any:
+    """Return a filter function like `propose`, for a scene without instances and masks.
 
-    A plain scene has no instances and masks. With a constant number of rays, and all numbers at
-    constant distances from a single address, the loop becomes a few vector instructions. `part` is
-    the number of the packet in its group.
+    With a constant number of rays `count` of a packet, and all numbers at constant distances from a
+    single address, the loop becomes a few vector instructions. `packet_number` counts the packets
+    of a group from 0; a filter for single rays has the lane from the scratch memory.
     """
-    packet = field_index("single") if count == 1 else _PACKET + 22 * count * part
-    first_lane = part * count
+    packet = field_index("single") if count == 1 else _PACKET + 22 * count * packet_number
+    first_lane = packet_number * count
 
     @callback(types.void(types.CPointer(types.int64)))
     def propose(arguments):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+        """Keep the closest triangle and a second, in `rough_32`, `first_32` and `second_32`."""
         valid = int32s(arguments[0])
         scratch = arguments[2]
         hits = int32s(arguments[4])
@@ -267,9 +307,9 @@ def plain_proposer(count: int, part: int = 0) -> Any:
 
 @inlined
 def _key(hits, count, k, instances):  # type: ignore[no-untyped-def]
-    """Return the key of the triangle that Embree asks about, from its RTCHitN."""
+    """Return the key of the triangle of ray k, from `hits`: an RTCHitN of `count` rays."""
     key = np.int64(hits[5 * count + k])
-    return key + NUMBER * hits[7 * count + k] if instances != 0 else key
+    return key + KEYS_PER_INSTANCE * hits[7 * count + k] if instances != 0 else key
 
 
 @callback(types.void(types.CPointer(types.int64)))
@@ -314,7 +354,10 @@ def propose(arguments):  # type: ignore[no-untyped-def]
 
 @stage
 def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
-    """Keep a triangle if closest so far; return whether the ray clearly passes inside."""
+    """Test the triangle of a key in float64, and write the hit to `t` and `key` if closest so far.
+
+    Returns whether the ray clearly passes inside the triangle.
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     mesh = numbers[_MESH]
@@ -336,20 +379,23 @@ def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
 
 @callback(types.boolean(types.CPointer(types.int64)))
 def nearby(arguments):  # type: ignore[no-untyped-def]
-    """Test a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
+    """Test the triangle that a point query found; takes an RTCPointQueryFunctionArguments."""
     scratch = arguments[1]
-    instance = int32s(arguments[3])[32]
+    instance = int32s(arguments[3])[32]  # of the RTCPointQueryContext
     numbers = int64s(scratch)
-    key = arguments[2] & (NUMBER - 1)
+    key = arguments[2] & (KEYS_PER_INSTANCE - 1)
     if numbers[_INSTANCES] != 0:
-        key += NUMBER * instance
+        key += KEYS_PER_INSTANCE * instance
     _consider(scratch, numbers[_LANE], key)
     return False  # the distance of interest stays
 
 
 @inlined
 def _distance_error(ray, normal):  # type: ignore[no-untyped-def]
-    """Return the error of float32 along a ray at a triangle: larger where the ray grazes."""
+    """Return the error of Embree's distance at a triangle, local: larger where the ray grazes.
+
+    `ray` is an RTCRay, `normal` the normal of the triangle, of any length.
+    """
     x = normal[0]
     y = normal[1]
     z = normal[2]
@@ -363,7 +409,10 @@ def _distance_error(ray, normal):  # type: ignore[no-untyped-def]
 
 @inlined
 def _consider_nearby(scratch, lane, distance, radius):  # type: ignore[no-untyped-def]
-    """Test all triangles within a radius of the point at a distance along a ray."""
+    """Test all triangles near the point at a distance along a ray, and keep the closest hit.
+
+    `distance` from the ray's origin, and the radius around the point, are local.
+    """
     numbers = int64s(scratch)
     query = float32s(scratch + _QUERY_AT)
     ox, oy, oz, dx, dy, dz = scene_ray(float64s(scratch), lane)
@@ -405,14 +454,17 @@ def decide(arguments):  # type: ignore[no-untyped-def]
 
 @inlined
 def _is_sure(floats, lane, t_min, hit):  # type: ignore[no-untyped-def]
-    """Return whether a ray clearly hits a triangle, at the distance of float32."""
+    """Return whether a ray clearly hits a triangle, within the error of the rough distance."""
     error = abs(hit.t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
     return _is_clearly_inside(hit) & (hit.t >= t_min) & (error <= 1.5 * MARGIN)
 
 
 @inlined
 def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-def]
-    """Test the candidates of a ray, and write the closer hit to `t`, `key` and `sure`."""
+    """Test the candidates of a ray in float64, and write the closer hit to `t`, `key` and `sure`.
+
+    `sure` is 0 for a ray that must be cast again by `cast_until_sure`.
+    """
     t = np.inf
     key = np.int64(-1)
     sure = True
@@ -436,8 +488,11 @@ def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
-    """Copy the corners of the candidates of a group, with the axis of the ray last.
+def _copy_corners(table, numbers, floats, candidate_field):  # type: ignore[no-untyped-def]
+    """Copy the corners of each ray's candidate to `corners`, with the axis of the ray last.
+
+    `candidate_field` is the index of `first_candidate` or `second_candidate`; without a candidate,
+    triangle 0 is copied.
 
     Scattered reads come first, which the processor overlaps, then vector instructions.
     """
@@ -448,7 +503,7 @@ def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
     if differ:
         for lane in range(LANES):
             (a, b, c), (d, e, f), (g, h, i) = corners_of(
-                table, max(numbers[candidate + lane], 0), numbers[_AXIS + lane]
+                table, max(numbers[candidate_field + lane], 0), numbers[_AXIS + lane]
             )
             for k, number in enumerate((a, b, c, d, e, f, g, h, i)):
                 floats[_CORNERS + LANES * k + lane] = number
@@ -456,7 +511,7 @@ def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
         x = axis + 1 if axis < 2 else 0
         y = x + 1 if x < 2 else 0
         for lane in range(LANES):
-            base = 9 * max(numbers[candidate + lane], 0)
+            base = 9 * max(numbers[candidate_field + lane], 0)
             for k in range(3):
                 target = _CORNERS + 3 * LANES * k + lane
                 floats[target] = table[base + 3 * k + x]
@@ -465,8 +520,8 @@ def _copy(table, numbers, floats, candidate):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _areas_of(floats, lane):  # type: ignore[no-untyped-def]
-    """Return the `PlaneHit` of a ray and the triangle that `_copy` copied for the ray."""
+def _plane_hit(floats, lane):  # type: ignore[no-untyped-def]
+    """Return the `PlaneHit` of a ray and the triangle that `_copy_corners` copied for the lane."""
     k = _CORNERS + lane
     p = floats[k], floats[k + LANES], floats[k + 2 * LANES]
     q = floats[k + 3 * LANES], floats[k + 4 * LANES], floats[k + 5 * LANES]
@@ -476,11 +531,11 @@ def _areas_of(floats, lane):  # type: ignore[no-untyped-def]
 
 @stage
 def _verify_first(scratch, t_min):  # type: ignore[no-untyped-def]
-    """Test the first candidates of a group, whose corners have been copied."""
+    """Test the first candidates of a group, whose corners are copied: write `t`, `key`, `sure`."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     for lane in range(LANES):
-        hit = _areas_of(floats, lane)
+        hit = _plane_hit(floats, lane)
         first = numbers[_FIRST + lane]
         sure = _is_sure(floats, lane, t_min, hit)
         floats[_T + lane] = hit.t if first >= 0 else np.inf
@@ -490,11 +545,11 @@ def _verify_first(scratch, t_min):  # type: ignore[no-untyped-def]
 
 @stage
 def _verify_second(scratch, t_min):  # type: ignore[no-untyped-def]
-    """Test the second candidates of a group, whose corners have been copied."""
+    """Test the second candidates of a group, and replace farther hits; corners are copied."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     for lane in range(LANES):
-        hit = _areas_of(floats, lane)
+        hit = _plane_hit(floats, lane)
         t = hit.t
         sure = _is_sure(floats, lane, t_min, hit)
         nearest = floats[_T + lane]
@@ -508,7 +563,7 @@ def _verify_second(scratch, t_min):  # type: ignore[no-untyped-def]
 
 @stage
 def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
-    """Test the candidates of all rays of a group as `verify` does, in a plain scene without masks.
+    """Test the candidates of all rays of a group as `verify`, without instances and masks.
 
     Numbers that all rays share are arguments: a load would keep loops from becoming vector
     instructions.
@@ -524,22 +579,30 @@ def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
         numbers[_SECOND + lane] = integers[_SECOND_32 + lane]
         second_count += np.int64(integers[_SECOND_32 + lane] >= 0)
     shear_all(scratch)
-    _copy(table, numbers, floats, _FIRST)
+    _copy_corners(table, numbers, floats, _FIRST)
     _verify_first(scratch, t_min)
     if second_count:
-        _copy(table, numbers, floats, _SECOND)
+        _copy_corners(table, numbers, floats, _SECOND)
         _verify_second(scratch, t_min)
 
 
 @inlined
 def embree_origin(o, d, entry):  # type: ignore[no-untyped-def]
-    """Return a coordinate of the origin for Embree, at most `NEAR` from the scene's centre."""
+    """Return a coordinate of the start that Embree sees, at most `NEAR` from the scene's centre.
+
+    `o` and `d` are a coordinate of the origin and of the direction, local; the start is at the
+    distance `entry` along the ray.
+    """
     return np.float32(min(max(o + entry * d, -NEAR), NEAR))
 
 
 @stage
 def cast_single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-untyped-def]
-    """Cast a single ray of a group, shifted for Embree across its axis by `aside` and `up`."""
+    """Cast a single ray of a group, whose start for Embree is shifted.
+
+    The shifts `aside` and `up`, local units, are along the two axes that follow the axis of a ray
+    along an axis; 0 for all other rays.
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     ray = float32s(scratch + _SINGLE_AT)
@@ -571,7 +634,9 @@ def cast_single(scene, scratch, lane, reach, aside, up):  # type: ignore[no-unty
 
 @stage
 def cast_until_sure(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Cast a ray that `propose` was not sure of with `decide`; write the hit to `t` and `key`.
+    """Cast a ray again, with the filter `decide`; write the hit to `t` and `key`.
+
+    The caller has written the filter to the arguments, for rays whose candidates are not sure.
 
     Embree misses triangles that touch a ray along an axis with the upper side of their box (0 * inf
     in its test of boxes). So eight more rays around a ray along an axis are cast, too.
@@ -594,8 +659,8 @@ def cast_until_sure(scene, scratch, lane, reach):  # type: ignore[no-untyped-def
 
 @inlined
 def is_along_axis(floats, lane):  # type: ignore[no-untyped-def]
-    """Return whether a ray runs along an axis."""
+    """Return whether a ray runs along a coordinate axis, within 2^-20."""
     x = floats[_DX + lane]
     y = floats[_DY + lane]
     z = floats[_DZ + lane]
-    return (abs(x) + abs(y)) + abs(z) < _STRAIGHT
+    return (abs(x) + abs(y)) + abs(z) < _MAX_AXIS_SUM

@@ -82,7 +82,9 @@ def load_library() -> ctypes.CDLL:
 
 
 def device(threads: int | None = None) -> int:
-    """Return the device of this process that builds trees with a number of threads.
+    """Return the address of the RTCDevice of this process, for a number of threads.
+
+    The device builds trees on the CPU; None for Embree's default number of threads.
 
     A forked process has a new device, since threads do not survive a fork.
     """
@@ -91,6 +93,10 @@ def device(threads: int | None = None) -> int:
 
 @cache
 def _device(process: int, threads: int | None, isa: str) -> int:
+    """Create an RTCDevice, one for each process, and return its address.
+
+    `isa` limits the vector instructions, for tests; "" for the best of the processor.
+    """
     options = [f"threads={threads}"] if threads else []
     options += [f"isa={isa}"] if isa else []
     device: int | None = load_library().rtcNewDevice(",".join(options).encode())
@@ -100,7 +106,7 @@ def _device(process: int, threads: int | None, isa: str) -> int:
 
 
 def packet_width() -> int:
-    """Return the number of rays of the widest packets of this processor; 1 without packets."""
+    """Return the rays of the widest packet that Embree casts on this processor; 1 for none."""
     ask = load_library().rtcGetDeviceProperty
     return next((width for number, width in _WIDTHS if ask(device(), number)), 1)
 
@@ -108,8 +114,8 @@ def packet_width() -> int:
 def build() -> str:
     """Return embreex's version, its Embree's hash, and a note if there is no fused multiply-add.
 
-    Without fused multiply-add, on processors before AVX2, Embree misses other rays at open rims.
-    Wider vectors change nothing.
+    Without fused multiply-add, on processors before AVX2, the rays that Embree misses at open rims
+    are different rays. Wider vectors change nothing.
     """
     from llvmlite.binding import get_host_cpu_features  # takes long to import
 

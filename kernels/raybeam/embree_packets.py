@@ -1,8 +1,11 @@
 """The loop that casts a scan: groups of 16 neighbouring rays in Embree's packets, hits in order.
 
-A block has `rays_along` neighbours along a ring, `step` rays apart, and all rays between these
-neighbours; a group has `rays_along` times `rays_across` rays of a block. After a block, its hits
-are written in the order of rays.
+The numbers of two neighbours along a ring differ by `step`. A block has `rays_along` neighbours
+along a ring, and all rays between these neighbours, so `step` rings; a group has `rays_along` rays
+of `rays_across` rings of a block. After a block, its hits are written in the order of rays.
+
+`scratch` is the address of the `SCRATCH` memory, `numbers` and `floats` point to that memory as
+int64 and float64; `valid`, `packet` and `arguments` of that memory are what Embree reads.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ from . import embree_exact as exact
 from . import embree_memory as memory
 from .compiled import callback, compiled, external, inlined, stage
 from .embree_memory import (
+    KEYS_PER_INSTANCE,
     LANES,
-    NUMBER,
     byte_offset,
     casts_at,
     field_index,
@@ -35,7 +38,7 @@ _FILTER = field_index("arguments") + 2
 _VALID_AT = byte_offset("valid")
 _PACKET = field_index("packet")
 _PACKET_AT = byte_offset("packet")
-_TILE = field_index("tile")
+_RAY_IN_GROUP = field_index("ray_in_group")
 _LANE = field_index("lane")
 _RAY = field_index("ray")
 _REAL = field_index("real")
@@ -62,7 +65,7 @@ _POSE = field_index("pose")
 f64_1 = types.float64[::1]
 f64_2 = types.float64[:, ::1]
 i32_1 = types.int32[::1]
-_FIELDS = 22  # numbers of each ray in a packet
+_FIELDS = 22  # numbers of each ray in a packet, an RTCRayHitN: field by field, N rays each
 
 _intersect_4, _intersect_8, _intersect_16 = (
     types.ExternalFunction(
@@ -74,7 +77,7 @@ _intersect_4, _intersect_8, _intersect_16 = (
 
 @inlined
 def prepare(cast):  # type: ignore[no-untyped-def]
-    """Write the numbers that all rays of a cast share to the scratch memory."""
+    """Write the numbers that all rays of a `CAST` share to the scratch memory."""
     scratch = cast.scratch
     width = cast.width
     numbers = int64s(scratch)
@@ -108,7 +111,10 @@ def prepare(cast):  # type: ignore[no-untyped-def]
 
 @inlined
 def _is_incoherent(floats, coherence):  # type: ignore[no-untyped-def]
-    """Return whether rays of a group differ too much from the first for a packet."""
+    """Return whether a sampled ray of a group differs too much from the first ray for a packet.
+
+    `coherence` is the minimum cosine between their directions.
+    """
     x = floats[_DX]
     y = floats[_DY]
     z = floats[_DZ]
@@ -122,11 +128,15 @@ def _filler(width: int) -> Any:
     """Return a function that fills packets of `width` rays, by vector instructions."""
 
     @stage
-    def fill(scratch, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
-        """Write origins and closest distances, unless `fixed`; directions and longest distances."""
+    def fill(scratch, t_min, t_max, has_origins):  # type: ignore[no-untyped-def]
+        """Write the rays of a group to packets, in float32.
+
+        Origins and the lower limits of distances are not written if the packets have these already;
+        directions and the upper limits are. `t_min` and `t_max` are local.
+        """
         rays = float32s(scratch)
         floats = float64s(scratch)
-        if not fixed:
+        if not has_origins:
             for lane in range(LANES):
                 k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
                 entry = floats[_ENTRY + lane]
@@ -151,30 +161,31 @@ _fill_4, _fill_8, _fill_16 = map(_filler, (4, 8, 16))
 
 
 @inlined
-def _fill(scratch, width, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
-    """Write the rays of a group to its packets; the origins unless `fixed`."""
+def _fill(scratch, width, t_min, t_max, has_origins):  # type: ignore[no-untyped-def]
+    """Write a group's rays to packets of `width` rays; the origins unless `has_origins`."""
     if width == 16:
-        _fill_16(scratch, t_min, t_max, fixed)
+        _fill_16(scratch, t_min, t_max, has_origins)
     elif width == 8:
-        _fill_8(scratch, t_min, t_max, fixed)
+        _fill_8(scratch, t_min, t_max, has_origins)
     else:
-        _fill_4(scratch, t_min, t_max, fixed)
+        _fill_4(scratch, t_min, t_max, has_origins)
 
 
 @stage
-def _select_rays(scratch, first, rays_across, step, count):  # type: ignore[no-untyped-def]
-    """Write the numbers of a group's rays, filled up by copies of its first; return their count.
+def _select_rays(scratch, first_ring, rays_across, step, count):  # type: ignore[no-untyped-def]
+    """Write the numbers within the block of a group's rays; return how many are no copies.
 
-    Copies stand for rays beyond the `step` rays of a column, or the `count` rays of the block.
+    `first_ring` is the lowest of the group's `rays_across` rings, and the number of the first ray.
+    Copies of the first ray stand for rays beyond the `step` rings or the `count` rays of the block.
     """
     numbers = int64s(scratch)
     valid = int32s(scratch + _VALID_AT)
     real = np.int64(0)
     for lane in range(LANES):
-        column = first + (lane & (rays_across - 1))
-        ray = first + numbers[_TILE + lane]
-        exists = (column < step) & (ray < count)
-        numbers[_RAY + lane] = ray if exists else first
+        ring = first_ring + (lane & (rays_across - 1))
+        ray = first_ring + numbers[_RAY_IN_GROUP + lane]
+        exists = (ring < step) & (ray < count)
+        numbers[_RAY + lane] = ray if exists else first_ring
         numbers[_REAL + lane] = np.int64(exists)
         valid[lane] = np.int32(-1) if exists else np.int32(0)
         real += np.int64(exists)
@@ -183,7 +194,7 @@ def _select_rays(scratch, first, rays_across, step, count):  # type: ignore[no-u
 
 @stage
 def _reset(scratch, plain):  # type: ignore[no-untyped-def]
-    """Reset the candidates of all rays of a group."""
+    """Reset the candidates; in 32 bits alone if `plain`, without instances and masks."""
     singles = float32s(scratch)
     integers = int32s(scratch)
     for lane in range(LANES):
@@ -200,7 +211,7 @@ def _reset(scratch, plain):  # type: ignore[no-untyped-def]
 
 @stage
 def _count_candidates(scratch):  # type: ignore[no-untyped-def]
-    """Return the number of rays with a candidate in a plain scene, and of rays along an axis."""
+    """Return the number of rays with a candidate in 32 bits, and of rays along an axis."""
     floats = float64s(scratch)
     integers = int32s(scratch)
     candidates = np.int64(0)
@@ -214,7 +225,7 @@ def _count_candidates(scratch):  # type: ignore[no-untyped-def]
 
 @stage
 def _cast_singly(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def]
-    """Cast each ray of a group by itself."""
+    """Cast each ray of a group by itself; `proposer` is the address of the filter."""
     numbers = int64s(scratch)
     flags = int32s(scratch + _ARGUMENTS_AT)
     flags[0] = exact.CALL_FILTER
@@ -226,23 +237,23 @@ def _cast_singly(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-de
 
 
 @inlined
-def _cast_packets(cast, fixed):  # type: ignore[no-untyped-def]
-    """Cast the rays of a group in packets; `fixed` if the origins in the packets are valid."""
+def _cast_packets(cast, has_origins):  # type: ignore[no-untyped-def]
+    """Cast a group in packets; `has_origins` if the packets have the origins already."""
     scratch = cast.scratch
     scene = cast.scene
     width = cast.width
     numbers = int64s(scratch)
-    _fill(scratch, width, cast.t_min, cast.t_max, fixed)
+    _fill(scratch, width, cast.t_min, cast.t_max, has_origins)
     arguments = scratch + _ARGUMENTS_AT
     numbers[_FILTER] = cast.packets[0]
     if width == 16:
         _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
         return
-    for part in range(LANES // width):
-        numbers[_FILTER] = cast.packets[part]
-        numbers[_LANE] = part * width
-        valid = scratch + _VALID_AT + 4 * part * width
-        rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
+    for packet in range(LANES // width):
+        numbers[_FILTER] = cast.packets[packet]
+        numbers[_LANE] = packet * width
+        valid = scratch + _VALID_AT + 4 * packet * width
+        rays = scratch + _PACKET_AT + 4 * _FIELDS * packet * width
         if width == 8:
             _intersect_8(valid, scene, rays, arguments)
         else:
@@ -264,8 +275,12 @@ def _cast_unsure(cast, axis_rays):  # type: ignore[no-untyped-def]
 
 
 @callback(types.int64(types.int64, types.int64, types.int64))
-def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
-    """Cast the rays of a group, and write their hits to `t` and `key`; return 0 if all miss."""
+def _cast_group(address, real, has_origins):  # type: ignore[no-untyped-def]
+    """Cast the rays of a group, and write their hits to `t` and `key`; return 0 if all miss.
+
+    `address` is of a `CAST`, `real` the number of rays that are no copies, and `has_origins`
+    whether the packets have the origins already.
+    """
     cast = carray(casts_at(address), 1)[0]
     mesh = cast.mesh
     instances = cast.instances
@@ -280,7 +295,7 @@ def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
     if cast.width == 1 or real == 1 or _is_incoherent(floats, cast.coherence):
         _cast_singly(cast.scene, scratch, cast.single, cast.t_max)
     else:
-        _cast_packets(cast, fixed)
+        _cast_packets(cast, has_origins)
     candidates, axis_rays = _count_candidates(scratch)
     if plain and candidates + axis_rays == 0:
         return False
@@ -293,15 +308,13 @@ def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
     return True
 
 
-# Arguments: address of a `CAST`, number of rays that are no copies, and whether the origins in the
-# packets stay valid. Called by its own address: as a part of each loop it would take 4 s more to
-# compile.
+# `_cast_group`, called by its address: as a part of each loop it would take 4 s more to compile.
 cast_group = external("raybeam_cast_group", _cast_group)
 
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast rays `start` to `stop`, and write the hits in ray order; return their number."""
+    """Cast rays `start` to `stop` of a `CAST`; write the hits in ray order, return their number."""
     cast = casts[0]
     address = casts.ctypes.data
     scratch = cast.scratch
@@ -325,9 +338,9 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: C901, PL
     triangle_out = int32s(cast.triangle)
     instance_out = int32s(cast.instance)
     prepare(cast)
-    fixed = np.int64(shares_origin and cast.starts_near != 0)
+    has_origins = np.int64(shares_origin and cast.starts_near != 0)
     for lane in range(LANES):
-        numbers[_TILE + lane] = (lane >> shift) * step + (lane & (rays_across - 1))
+        numbers[_RAY_IN_GROUP + lane] = (lane >> shift) * step + (lane & (rays_across - 1))
         numbers[_POSE + lane] = 0
         floats[_ENTRY + lane] = 0.0
     if shares_origin:
@@ -338,30 +351,30 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: C901, PL
     hit_count = 0
     for block in range(start, stop, span):
         count = min(span, stop - block)
-        first = block_start(cast, block)
-        for column in range(0, min(step, count), rays_across):
-            real = _select_rays(scratch, column, rays_across, step, count)
-            make_group(cast, scratch, first)
-            if not cast_group(address, real, fixed):
+        block_first = block_start(cast, block)
+        for ring in range(0, min(step, count), rays_across):
+            real = _select_rays(scratch, ring, rays_across, step, count)
+            make_group(cast, scratch, block_first)
+            if not cast_group(address, real, has_origins):
                 for lane in range(LANES):
                     block_triangles[numbers[_RAY + lane]] = -1
                 continue
-            for back in range(LANES):  # backwards: the first ray overwrites its copies
-                lane = LANES - 1 - back
+            for lanes_after in range(LANES):  # backwards: the first ray overwrites the copies
+                lane = LANES - 1 - lanes_after
                 ray = numbers[_RAY + lane]
                 t = floats[_T + lane]
                 key = numbers[_KEY + lane]
                 block_distances[ray] = t
                 block_triangles[ray] = key if t <= t_max else -1
                 if instances != 0:
-                    block_instances[ray] = key // NUMBER
+                    block_instances[ray] = key // KEYS_PER_INSTANCE
         for k in range(count):
             triangle = np.int64(block_triangles[k])
             if triangle < 0:
                 continue
             if instances != 0:
-                record = int64s(instances + memory.RECORD * block_instances[k])
-                triangle = (triangle & (NUMBER - 1)) + record[memory.FIRST_ROW]
+                record = int64s(instances + memory.INSTANCE_BYTES * block_instances[k])
+                triangle = (triangle & (KEYS_PER_INSTANCE - 1)) + record[memory.FIRST_ROW_FIELD]
                 instance_out[hit_count] = block_instances[k]
             ray_out[hit_count] = block - cast.first_ray + k
             distance_out[hit_count] = block_distances[k] * metre
@@ -376,8 +389,9 @@ def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
 ):
     """Write the weights `u` and `v` (m,) of the second and third corner for hits of a `CAST`.
 
-    Rays (m, 3) are local to the scene. `triangle_row`, in the corners of all meshes, and `instance`
-    are hits that `trace` wrote.
+    Rays (m, 3) are local to the scene; origins are (1, 3) if all rays share their origin.
+    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `trace` wrote
+    with `index` 0.
     """
     mesh = casts[0].mesh
     instances = casts[0].instances
@@ -393,17 +407,17 @@ def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
         row = np.int64(triangle_row[k])
         mesh_address = mesh
         if instances != 0:
-            address = instances + memory.RECORD * np.int64(instance[k])
+            address = instances + memory.INSTANCE_BYTES * np.int64(instance[k])
             record = int64s(address)
-            mesh_address = record[memory.MESH_OF]
-            row = row - record[memory.FIRST_ROW]
+            mesh_address = record[memory.MESH_FIELD]
+            row = row - record[memory.FIRST_ROW_FIELD]
             ox, oy, oz, dx, dy, dz, _ = exact.enter_instance(
                 float64s(address), ox, oy, oz, dx, dy, dz
             )
         axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
         corners = exact.corners_of(float64s(int64s(mesh_address)[0]), row, axis)
         a, b, c, det, _ = areas(corners, (p, q, r, sx, sy, sz))
-        sign = -1.0 if det < 0 else 1.0  # outside by float32's rounding: at the edge
+        sign = -1.0 if det < 0 else 1.0  # areas of a hit have the sign of `det`, or are 0
         a = max(sign * a, 0.0)
         b = max(sign * b, 0.0)
         c = max(sign * c, 0.0)

@@ -1,6 +1,12 @@
 """Rays of a pattern, sixteen at a time in compiled loops, with the operations of `plain_rays`.
 
-Each step is a loop over the rays of a group that becomes a few vector instructions.
+Each step is a loop over the `LANES` rays of a group that becomes a few vector instructions. A ray
+is a beam of the pattern, or a sub-ray of a beam, cast from a pose.
+
+`cast` is a `CAST` record and `scratch` the address of the `SCRATCH` memory (embree_memory.py), to
+which `floats` and `numbers` point as float64 and int64. A function that writes a quantity of a
+group's rays writes the field of the scratch memory of that name. Tables that a `CAST` names come as
+addresses, with one column for each beam or pose.
 """
 
 from __future__ import annotations
@@ -39,7 +45,7 @@ class BlockStart(NamedTuple):
     pose, within
         Number of the pose, and number of the ray within the pose.
     ray
-        Number of the ray.
+        Number of the ray in the scan.
     """
 
     row: int
@@ -65,7 +71,10 @@ def any_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """Return the two axes across a unit direction of `sub_rays.axes_about`, as six numbers."""
+    """Return the two axes across a unit direction of `sub_rays.axes_about`, as six numbers.
+
+    `axis` is `SubRays.axis`: three numbers.
+    """
     a, b, c = axis
     p = b * z - c * y
     q = c * x - a * z
@@ -84,18 +93,21 @@ def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _find_rows(scratch, first, total):  # type: ignore[no-untyped-def]
-    """Write the rows of a group's rays; `first` is the row of the block's first ray, of `total`."""
+def _find_rows(scratch, first_row, row_count):  # type: ignore[no-untyped-def]
+    """Write the rows in the pattern of a group's rays, counted in sub-rays.
+
+    `first_row` is the row of the block's first ray; the pattern, of `row_count` rows, repeats.
+    """
     numbers = int64s(scratch)
     max_row = np.int64(0)
     for lane in range(LANES):
-        row = first + numbers[_RAY + lane]
-        numbers[_ROW + lane] = row - total if row >= total else row
+        row = first_row + numbers[_RAY + lane]
+        numbers[_ROW + lane] = row - row_count if row >= row_count else row
     for lane in range(LANES):
         max_row = max(max_row, numbers[_ROW + lane])
-    if max_row >= total:  # a short pattern that repeats
+    if max_row >= row_count:  # a short pattern that repeats
         for lane in range(LANES):
-            numbers[_ROW + lane] %= total
+            numbers[_ROW + lane] %= row_count
 
 
 @stage
@@ -114,7 +126,12 @@ def _find_poses(scratch, pose, within, rays_per_pose):  # type: ignore[no-untype
 
 @stage
 def _look_up_subrays(scratch, shares, offsets, directions, rows, subrays):  # type: ignore[no-untyped-def]
-    """Write the beam directions of a group's sub-rays, and the shares across and up of each."""
+    """Write the beam direction of each sub-ray of a group, and the sub-ray's components.
+
+    The components, from `SubRays.loop_table` at `shares`, are of the sub-ray's direction along the
+    beam, across and up, and of its start across and up. `offsets`, 0 for none, change the angles of
+    each beam's sub-rays. Rows in the pattern become rows of the `rows` beams.
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     table = float64s(shares)
@@ -146,7 +163,10 @@ def _look_up_subrays(scratch, shares, offsets, directions, rows, subrays):  # ty
 
 @inlined
 def _spread_lane(floats, lane, has_starts, axes):  # type: ignore[no-untyped-def]
-    """Replace the direction of a beam by its sub-ray's, and write the sub-ray's start."""
+    """Replace the direction of a beam by its sub-ray's, and write the sub-ray's start.
+
+    `axes` are six numbers: the axes across and up.
+    """
     x = floats[_DX + lane]
     y = floats[_DY + lane]
     z = floats[_DZ + lane]
@@ -199,7 +219,7 @@ def _make_subrays(cast, scratch):  # type: ignore[no-untyped-def]
 
 @stage
 def _rotate_by_one(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group by a matrix; x, y and z are the columns of the vectors."""
+    """Rotate vectors of a group by a matrix at an address; x, y, z are the components' fields."""
     floats = float64s(scratch)
     m = float64s(matrix)
     a = m[0]
@@ -222,7 +242,10 @@ def _rotate_by_one(scratch, matrix, x, y, z):  # type: ignore[no-untyped-def]
 
 @stage
 def _rotate_by_poses(scratch, poses, rotations, x, y, z):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Rotate the vectors of a group to the mesh's axes, by the pose of each ray."""
+    """Rotate vectors of a group from the sensor's to the scene's axes, by the pose of each ray.
+
+    `rotations` is the address of matrices, float64 (9, poses).
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     matrices = float64s(rotations)
@@ -247,7 +270,7 @@ def _rotate_by_poses(scratch, poses, rotations, x, y, z):  # type: ignore[no-unt
 
 @inlined
 def _rotate(cast, scratch, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group to the mesh's axes; x, y and z are their columns."""
+    """Rotate vectors of a group to the scene's axes; x, y and z are fields of their components."""
     if cast.poses == 1:
         _rotate_by_one(scratch, cast.rotations, x, y, z)
     else:
@@ -256,7 +279,10 @@ def _rotate(cast, scratch, x, y, z):  # type: ignore[no-untyped-def]
 
 @stage
 def _apply_rates(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate the vectors of a group by the angular rates of their poses."""
+    """Rotate vectors of a group by the angular rates of their poses, as `PoseMotion` describes.
+
+    x, y and z are fields of the components of the vectors.
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     delay_of_ray = float64s(delays)
@@ -276,29 +302,30 @@ def _apply_rates(scratch, poses, delays, rates, x, y, z):  # type: ignore[no-unt
 
 
 @inlined
-def make_group(cast, scratch, block):  # type: ignore[no-untyped-def]
-    """Compute the rays of a group, by their numbers within a block in the scratch memory.
+def make_group(cast, scratch, start):  # type: ignore[no-untyped-def]
+    """Compute the rays of a group in local coordinates, by their numbers `ray` within a block.
 
-    `block` is the `BlockStart` of the block.
+    `start` is the `BlockStart` of the block. Origins that all rays share are not computed: the
+    caller has written these. Rays are also written to the outputs of rays of the cast, if any.
     """
     floats = float64s(scratch)
-    _find_rows(scratch, block.row, cast.rows * cast.subrays)
+    _find_rows(scratch, start.row, cast.rows * cast.subrays)
     if cast.shares_origin == 0:
-        _find_poses(scratch, block.pose, block.within, cast.rays_per_pose)
+        _find_poses(scratch, start.pose, start.within, cast.rays_per_pose)
     if cast.shares != 0:
         _make_subrays(cast, scratch)
     else:
-        _look_up(scratch, cast.directions, cast.rows)
+        _look_up_beams(scratch, cast.directions, cast.rows)
     if cast.rotations != 0:
         _rotate(cast, scratch, _DX, _DY, _DZ)
     if cast.delays != 0:
         _apply_rates(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
     if cast.directions_out != 0:
-        _write_vectors(scratch, cast.directions_out + 8 * block.ray, cast.ray_count, _DX)
+        _write_vectors(scratch, cast.directions_out + 8 * start.ray, cast.ray_count, _DX)
     if cast.shares_origin == 0:
         write_origins(cast, scratch)
         if cast.origins_out != 0:
-            _write_vectors(scratch, cast.origins_out + 8 * block.ray, cast.ray_count, _OX)
+            _write_vectors(scratch, cast.origins_out + 8 * start.ray, cast.ray_count, _OX)
         localise(cast, scratch)
     if cast.starts_near == 0:
         lower = cast.lower
@@ -310,18 +337,21 @@ def make_group(cast, scratch, block):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def block_start(cast, block):  # type: ignore[no-untyped-def]
-    """Return the `BlockStart` of the ray `block`."""
+def block_start(cast, ray):  # type: ignore[no-untyped-def]
+    """Return the `BlockStart` of a block, by the number of its first ray in the scan."""
     total = cast.rows * cast.subrays
     rays_per_pose = cast.rays_per_pose
-    pose = block // rays_per_pose
-    within = block - pose * rays_per_pose
-    return BlockStart((cast.first + block) % total, pose, within, block)
+    pose = ray // rays_per_pose
+    within = ray - pose * rays_per_pose
+    return BlockStart((cast.first + ray) % total, pose, within, ray)
 
 
 @stage
 def _write_vectors(scratch, address, count, x):  # type: ignore[no-untyped-def]
-    """Write the vectors of a group, from column x on, to the output (3, count) of all rays."""
+    """Write vectors of a group, whose first field is x, to an output (3, count) of all rays.
+
+    `address` is of the output of the block's first ray.
+    """
     numbers = int64s(scratch)
     floats = float64s(scratch)
     vectors = float64s(address)
@@ -333,7 +363,7 @@ def _write_vectors(scratch, address, count, x):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _look_up(scratch, directions, rows):  # type: ignore[no-untyped-def]
+def _look_up_beams(scratch, directions, rows):  # type: ignore[no-untyped-def]
     """Write the directions of a group's rays, by their rows in the pattern."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
@@ -347,7 +377,7 @@ def _look_up(scratch, directions, rows):  # type: ignore[no-untyped-def]
 
 @stage
 def _add_to_origins(scratch, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins; `field` has the number of each vector."""
+    """Add vectors of a table (3, count) to the origins; `field` has the column of each ray."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     vectors = float64s(table)
@@ -375,7 +405,7 @@ def _apply_velocities(scratch, delays, velocities, poses):  # type: ignore[no-un
 
 @stage
 def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Convert the origins of a group's rays to coordinates about a centre x, y, z."""
+    """Convert the origins of a group's rays, metres, to coordinates about a centre x, y, z."""
     floats = float64s(scratch)
     for lane in range(LANES):
         floats[_OX + lane] = (floats[_OX + lane] - x) * scale
@@ -385,13 +415,16 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 @inlined
 def localise(cast, scratch):  # type: ignore[no-untyped-def]
-    """Convert the origins of a group's rays to local coordinates."""
+    """Convert the origins of a group's rays, metres, to local coordinates."""
     _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 
 
 @inlined
 def write_origins(cast, scratch):  # type: ignore[no-untyped-def]
-    """Write the origins of a group's rays, metres, to which starts of sub-rays are added."""
+    """Write the origins of a group's rays in the scene, metres.
+
+    If sub-rays have starts, the fields of the origins hold these starts, as `_spread_lane` wrote.
+    """
     floats = float64s(scratch)
     has_starts = cast.shares != 0 and cast.has_starts != 0
     if not has_starts:
@@ -413,7 +446,7 @@ def write_origins(cast, scratch):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the larger of `entry` and the distance at which a ray enters a slab."""
+    """Return the larger of `entry` and the distance at which a ray enters a slab of the box."""
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY
@@ -422,7 +455,7 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(lower, upper, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a remote ray enters the scene's box; 0 for a ray nearby."""
+    """Return the distance at which a remote ray enters the scene's box, local; 0 for others."""
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > NEAR:
         entry = _clip_axis(lower[0], upper[0], o[0], d[0], entry)
@@ -433,7 +466,7 @@ def entry_distance(lower, upper, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _make_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write the directions (3, m), and origins unless (3, 0), of rays with numbers (m,)."""
+    """Write the directions (3, m), and the origins unless (3, 0), of rays with numbers (m,)."""
     cast = casts[0]
     count = len(rays)
     writes_origins = origins.shape[1] > 0
@@ -471,8 +504,7 @@ def compiled_rays(
     cast = memory.Cast(np.zeros(1, memory.CAST))
     record = cast.record
     cast.set_pattern(pattern, poses, first)
-    # metres
-    record["scale"] = 1.0
+    record["scale"] = 1.0  # local coordinates are metres, about the origin of the scene
     record["starts_near"] = 1
     record["scratch"], _ = memory.thread_memory.addresses(0)
     origins = np.empty((3, 0 if record["shares_origin"] else len(ray)))

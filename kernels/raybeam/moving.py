@@ -4,10 +4,11 @@ No tree is ever built again. Consecutive rays are fired nearly at the same time:
 each cell of rays, and the plane of a fan, is compared with the sphere around each body, along its
 path while rays are fired; where the two meet, each ray is compared with the body's box, at its pose
 when the cell is fired. The remaining rays are transformed to the body's axes at their own time, and
-cast there, at near bodies first. The comparisons are loops of moving_loops.py, and decide no hit.
+cast there, at near bodies first. The comparisons are loops of moving_loops.py, and decide no hit. A
+cell is `CELL` consecutive rays.
 
 A CUDA device compares each ray with a box around each body's path, and has the body's poses at all
-times of the rays.
+times of the rays. A shape that deforms has frames: vertices at known times (deforming.py).
 """
 
 from __future__ import annotations
@@ -43,19 +44,21 @@ class Moving:
     Attributes
     ----------
     shapes
-        Casters of the shapes, each in its own axes, and meshes that deform.
+        Casters of the rigid shapes, and meshes that deform; each in the axes of its bodies.
     boxes
-        float64 (s, 2, 3): lower and upper corners of the shapes, over all frames.
+        float64 (s, 2, 3): lower and upper corner of each shape, over all frames, in the shape's
+        axes, metres.
     shape
         intp (b,): number of each body's shape.
     presence
-        float64 (b, 2): first and last time at which each body is present.
+        float64 (b, 2): first and last time at which each body is present, seconds.
     poses
         Function of numbers of bodies (m,) and times (m,) that returns poses (12, m): positions,
         metres, and rotations from the body's axes, by rows.
     frames
-        Function of numbers of deforming bodies (m,) and times (m,) that returns their frames (m,),
-        see `Deforming`.
+        Function of numbers of deforming bodies (m,) and times (m,) that returns the frame of each
+        body's shape, float64 (m,): 1.5 is halfway between frames 1 and 2, see `Deforming`. None
+        without deforming bodies.
     """
 
     shapes: tuple[RayCaster | Deforming, ...]
@@ -67,7 +70,7 @@ class Moving:
 
     @cached_property
     def middle(self) -> Floats:
-        """Centres of the shapes' boxes (s, 3), metres."""
+        """Centres of the shapes' boxes (s, 3), in the shapes' axes, metres."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
@@ -96,9 +99,10 @@ def hits_on(
     moving, scan
         Bodies and rays.
     times
-        Function of numbers of rays (m,) that returns their times (m,).
+        Function of numbers of rays (m,) that returns their times (m,), seconds.
     limits
-        float64 (n,): distances before which hits count, metres; None for the limit of the scan.
+        float64 (n,): distance before which a hit of each ray counts, metres; None for the limit of
+        the scan.
     """
     from . import moving_loops as loops  # numba takes half a second to import
 
@@ -129,7 +133,7 @@ def near_boxes(
     rays
         float64 (6, n): origins, metres, and directions.
     times
-        float64 (n,): time of each ray.
+        float64 (n,): time of each ray, seconds.
     boxes
         float64 (b, 12): centres, and halves of the sides as vectors, metres.
     presence
@@ -170,7 +174,7 @@ class _CellPoses(NamedTuple):
     cell, body
         int64 (m,): number of the cell, and of the body.
     pose
-        int64 (m,): column in `poses` at the first time of the cell.
+        int64 (m,): column in `poses` of the body's pose at the first time of the cell.
     poses
         float64 (12, p): positions, metres, and rotations from the bodies' axes by rows.
     pads
@@ -190,14 +194,14 @@ class _CellPoses(NamedTuple):
 class _RayPairs(NamedTuple):
     """Pairs of a ray and a body whose box the ray passes, see `Crossing`."""
 
-    row: Ints  # (m,)
-    body: Ints  # (m,)
-    pose: Ints  # (m,)
-    poses: Floats  # (12, p)
+    row: Ints  # (m,), number of the ray in the chunk
+    body: Ints  # (m,), number of the body
+    pose: Ints  # (m,), column in `poses` of the body's pose at the time of the ray
+    poses: Floats  # (12, p), positions, metres, and rotations from the bodies' axes by rows
 
 
 class _Chunk:
-    """Consecutive rays of a scan, their times, and their nearest hits."""
+    """Consecutive rays of a scan: float64 (6, n), their times (n,), and their nearest hits (n,)."""
 
     def __init__(
         self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
@@ -210,7 +214,7 @@ class _Chunk:
         self._nearest = nearest
 
     def cast(self) -> None:
-        """Write the nearest hits on all bodies."""
+        """Cast the rays on all bodies that are present; write nearer hits to the nearest hits."""
         moving = self._moving
         first, last = moving.presence.T
         bodies = np.flatnonzero((first <= self._times.max()) & (last >= self._times.min()))
@@ -222,7 +226,7 @@ class _Chunk:
             self._cast_near_cells(bodies)
 
     def _cast_near_cells(self, bodies: Ints) -> None:
-        """Cast the cells that come near bodies, at near bodies first, where rays then end."""
+        """Cast the cells on bodies (b,) near them: first on near bodies, where rays then end."""
         loops = self._loops
         cells = loops.cells_of(self._rays, self._times, loops.CELL)
         wide_cells = loops.cells_of(self._rays, self._times, loops.CELL * loops.WIDE)
@@ -239,7 +243,7 @@ class _Chunk:
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
     def _cast_on_device(self, bodies: Ints) -> None:
-        """Write the nearest hits on bodies whose shapes are on a device."""
+        """Cast the rays on bodies (b,) whose shapes are on a device; write nearer hits."""
         moving = self._moving
         limits = (self._scan.t_min, self._scan.t_max)
         times, time_index = np.unique(self._times, return_inverse=True)
@@ -251,14 +255,19 @@ class _Chunk:
             for start in range(0, len(times), step):
                 rows = np.flatnonzero((time_index >= start) & (time_index < start + step))
                 span = slice(int(rows[0]), int(rows[-1]) + 1)
-                poses, boxes = self._timed_poses(number, shape_bodies, times[start : start + step])
+                poses, boxes = self._poses_and_boxes(
+                    number, shape_bodies, times[start : start + step]
+                )
                 rays = np.ascontiguousarray(self._rays[:, span])
                 row_times = (time_index[span] - start).astype(np.int32)
                 timed = TimedBodies(rays, row_times, shape_bodies, poses, boxes, limits)
                 shape.cast_bodies(timed, self._nearest.part(span.start, span.stop))
 
-    def _timed_poses(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-        """Return poses and boxes of bodies of a shape at times (t,), see `TimedBodies`."""
+    def _poses_and_boxes(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+        """Return the poses and the boxes of bodies (b,) of a shape at times (t,).
+
+        `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the bodies' paths.
+        """
         from .moving_loops import PADS_M
 
         moving = self._moving
@@ -280,7 +289,7 @@ class _Chunk:
         return poses.reshape(-1, len(bodies), 12), np.concatenate(boxes, axis=2)
 
     def _samples(self, bodies: Ints, cells: Floats) -> BodySamples:
-        """Return the boxes of bodies at equal steps of time over the cells, see `BodySamples`."""
+        """Return the boxes of bodies (b,) at equal steps of time over cells (c, 15)."""
         loops = self._loops
         moving = self._moving
         spans = cells[:, loops.BEGIN : loops.END + 1]
@@ -314,7 +323,10 @@ class _Chunk:
         return boxes
 
     def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast cells (m,), whose first and last times are spans (2, m), on bodies (m,)."""
+        """Cast each cell (m,) on its body (m,), and write nearer hits.
+
+        `spans` (2, m) are the first and last time of each cell, seconds.
+        """
         cell_poses = self._cell_poses(cell, spans, body)
         pairs = self._passing_rays(cell_poses)
         moving = self._moving
@@ -337,7 +349,7 @@ class _Chunk:
             caster.cast_crossing(crossing, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
-        """Return the pose of each body (m,) at the first time of a cell (m,), and its margin."""
+        """Return pairs of a cell and a body (m,) with the body's pose and the margin of its box."""
         moving = self._moving
         starts, stops = np.clip(spans, *moving.presence[body].T)
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(starts, prepend=np.nan) != 0)
@@ -382,7 +394,7 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return rotations (m, 3, 3) of poses (12, m)."""
+    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m), see `Moving.poses`."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 

@@ -1,4 +1,9 @@
-"""Loops of moving.py, which compare rays with moving bodies."""
+"""Loops of moving.py, which compare rays with the boxes and spheres around moving bodies.
+
+Rays are float64 (6, n): origins, metres, and directions of about unit length. Times are in
+seconds. A pose is a column of a table (12, p): position, metres, and rotation from the body's axes
+by rows.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +19,20 @@ from .embree_memory import float64s, int64s
 
 CELL = 64  # rays of a cell
 WIDE = 16  # cells of a wide cell
-PADS_M = 1e-3  # around a box, and 2e-6 of its distance: far more than rounding
-# Columns of cells: axis and half angle of the cone, sphere around the origins, first and last time,
-# normal of the plane that the rays lie near, and the sine of the greatest angle to the plane.
+PADS_M = 1e-3  # margin around boxes, besides 2e-6 of the distance: far more than rounding
+# Columns of cells: axis, and cosine and sine of the half angle, of the cone around the directions;
+# centre and radius of the sphere around the origins, metres; first and last time; normal of the
+# plane that the directions lie near, and the sine of the greatest angle between a direction and
+# the plane.
 AXIS = 0
 COSINE = 3
 SINE = 4
 MIDDLE = 5
-SPREAD = 8
+RADIUS = 8
 BEGIN = 9
 END = 10
 NORMAL = 11
-OFF = 14
+MAX_SINE = 14
 _TINY = 1e-300
 _f64_1 = types.float64[::1]
 _f64_2 = types.float64[:, ::1]
@@ -40,13 +47,14 @@ class BodySamples(NamedTuple):
     Attributes
     ----------
     sample_of_cell
-        int64 (c, 2): number of the sample at the first and at the last time of each cell of rays.
+        int64 (c, 2): number of the last sample up to the first time, and up to the last time of
+        each cell of rays.
     boxes
         float64 (b, s, 12): centres of the bodies' boxes, and halves of their sides as vectors,
         metres.
     spheres
-        float64 (b, 4): radius of the sphere around the box, how far the box may be from a sample
-        during a step, metres, and first and last time at which the body is present.
+        float64 (b, 4): radius of the sphere around the box, metres; slack: how far the box may be
+        from its sample during a step of time, metres; first and last time of the body's presence.
     """
 
     sample_of_cell: Ints
@@ -75,21 +83,26 @@ class CellPairs(NamedTuple):
     pads: Floats
 
 
-def named_tuple(kind: type, *fields: types.Type) -> types.Type:
-    """Return the numba type of a NamedTuple with fields of these types."""
+def named_tuple_type(kind: type, *fields: types.Type) -> types.Type:
+    """Return the numba type of a NamedTuple class `kind`, whose fields have these types."""
     return types.BaseTuple.from_types(fields, kind)
 
 
-_SAMPLES = named_tuple(BodySamples, _i64_2, types.float64[:, :, ::1], _f64_2)
-_PAIRS = named_tuple(CellPairs, _i64_1, _i64_1, _i64_1, _f64_1)
+_SAMPLES = named_tuple_type(BodySamples, _i64_2, types.float64[:, :, ::1], _f64_2)
+_PAIRS = named_tuple_type(CellPairs, _i64_1, _i64_1, _i64_1, _f64_1)
 LIMITS = types.UniTuple(types.float64, 2)
-CROSSING = named_tuple(Crossing, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1)
-NEAREST = named_tuple(Nearest, _f64_1, _i64_1, _i32_1, _i32_1)
+CROSSING = named_tuple_type(
+    Crossing, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1
+)
+NEAREST = named_tuple_type(Nearest, _f64_1, _i64_1, _i32_1, _i32_1)
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
 def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Return the cells (c, 15) of each `size` consecutive rays (6, n), fired at times (n,)."""
+    """Return cells (c, 15): each is `size` consecutive rays (6, n), fired at times (n,).
+
+    The constants `AXIS` to `MAX_SINE` are the columns of cells.
+    """
     count = -(-len(times) // size)
     cells = np.empty((count, 15))
     for c in range(count):
@@ -140,67 +153,73 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR091
             z = rays[2, k] - pz
             max_squared = max(max_squared, x * x + y * y + z * z)
         cosine = max(cosine, -1.0)
-        cells[c, 0] = ax
-        cells[c, 1] = ay
-        cells[c, 2] = az
-        cells[c, 3] = cosine
-        cells[c, 4] = np.sqrt(1 - cosine * cosine)
-        cells[c, 5] = px
-        cells[c, 6] = py
-        cells[c, 7] = pz
-        cells[c, 8] = np.sqrt(max_squared)
-        cells[c, 9] = first
-        cells[c, 10] = last
-        cells[c, 11] = nx
-        cells[c, 12] = ny
-        cells[c, 13] = nz
-        cells[c, 14] = max_sine
+        cells[c, AXIS] = ax
+        cells[c, AXIS + 1] = ay
+        cells[c, AXIS + 2] = az
+        cells[c, COSINE] = cosine
+        cells[c, SINE] = np.sqrt(1 - cosine * cosine)
+        cells[c, MIDDLE] = px
+        cells[c, MIDDLE + 1] = py
+        cells[c, MIDDLE + 2] = pz
+        cells[c, RADIUS] = np.sqrt(max_squared)
+        cells[c, BEGIN] = first
+        cells[c, END] = last
+        cells[c, NORMAL] = nx
+        cells[c, NORMAL + 1] = ny
+        cells[c, NORMAL + 2] = nz
+        cells[c, MAX_SINE] = max_sine
     return cells
 
 
 @inlined
 def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return whether rays of a cell may meet a body; arguments are pointers, see `BodySamples`."""
+    """Return whether rays of a cell may meet a body in its box.
+
+    `cell` points to a row of `cells_of`, `box` and `sphere` point to rows of `BodySamples`. `reach`
+    is the greatest distance at which a ray ends, metres.
+    """
     radius = sphere[0]
     slack = sphere[1]
     first = sphere[2]
     last = sphere[3]
-    x = box[0] - cell[5]
-    y = box[1] - cell[6]
-    z = box[2] - cell[7]
-    nx = cell[11]
-    ny = cell[12]
-    nz = cell[13]
+    x = box[0] - cell[MIDDLE]
+    y = box[1] - cell[MIDDLE + 1]
+    z = box[2] - cell[MIDDLE + 2]
+    nx = cell[NORMAL]
+    ny = cell[NORMAL + 1]
+    nz = cell[NORMAL + 2]
     plane_distance = abs(x * nx + y * ny + z * nz)
     distance_bound = abs(x) + abs(y) + abs(z)
-    reach_bound = radius + slack + cell[8] + 1e-6 * distance_bound
+    reach_bound = radius + slack + cell[RADIUS] + 1e-6 * distance_bound
     if (
-        plane_distance > reach_bound + (distance_bound + reach_bound) * cell[14]
+        plane_distance > reach_bound + (distance_bound + reach_bound) * cell[MAX_SINE]
     ):  # which needs no root
         return False
     distance = np.sqrt(x * x + y * y + z * z)
-    margin = slack + cell[8] + 1e-6 * distance
+    margin = slack + cell[RADIUS] + 1e-6 * distance
     radius = radius + margin
-    if distance - radius > reach or cell[10] < first or cell[9] > last:
+    if distance - radius > reach or cell[END] < first or cell[BEGIN] > last:
         return False
     side = 0.0
     for k in range(3, 12, 3):
         side += abs(box[k] * nx + box[k + 1] * ny + box[k + 2] * nz)
-    if plane_distance - (distance + radius) * cell[14] > side + margin:
+    if plane_distance - (distance + radius) * cell[MAX_SINE] > side + margin:
         return False
     if distance > radius:
         sine = radius / distance
         cosine = np.sqrt(1 - sine * sine)
-        if cell[4] * cosine + cell[3] * sine >= 0:  # within a half turn
-            edge = distance * (cell[3] * cosine - cell[4] * sine)
-            return x * cell[0] + y * cell[1] + z * cell[2] >= edge - 1e-6 * distance
+        if cell[SINE] * cosine + cell[COSINE] * sine >= 0:  # within a half turn
+            edge = distance * (cell[COSINE] * cosine - cell[SINE] * sine)
+            return (
+                x * cell[AXIS] + y * cell[AXIS + 1] + z * cell[AXIS + 2] >= edge - 1e-6 * distance
+            )
     return True
 
 
 # Loops write to arrays that are long enough: numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
-def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write pairs of a cell and a body that may meet; return their number."""
+def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
+    """Write pairs (2, k) of a cell and a body that may meet; return the number of pairs k."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers: views of arrays would be counted, which takes longer than the comparisons.
@@ -257,7 +276,7 @@ def cells_near_bodies(
 
 @inlined
 def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
-    """Return the rotation of a pose, by rows."""
+    """Return the rotation from the body's axes, three rows, of the pose in column p."""
     return (
         (poses[3, p], poses[4, p], poses[5, p]),
         (poses[6, p], poses[7, p], poses[8, p]),
@@ -267,14 +286,14 @@ def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
 
 @inlined
 def to_body_axes(rotation, x, y, z):  # type: ignore[no-untyped-def]
-    """Return a vector in the axes of a body, by the rotation of its pose."""
+    """Rotate a vector in the scene to the axes of a body, by the transposed `pose_rotation`."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     return (x * a + y * d) + z * g, (x * b + y * e) + z * h, (x * c + y * f) + z * i
 
 
 @inlined
 def box_corners(box):  # type: ignore[no-untyped-def]
-    """Return the lower and the upper corner of a box at a pointer."""
+    """Return the lower and the upper corner of a box, which points to six numbers."""
     return (box[0], box[1], box[2]), (box[3], box[4], box[5])
 
 
@@ -290,7 +309,10 @@ def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
 
 @inlined
 def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
-    """Return whether a ray passes through a box, larger by `pad`, before the distance `reach`."""
+    """Return whether a ray passes through a box, enlarged by `pad`, before the distance `reach`.
+
+    The ray and the corners of the box are in the axes of the body, metres.
+    """
     (a, b, c), (d, e, f) = corners
     x, y, z = origin
     pad += 2e-6 * (abs(x) + abs(y) + abs(z))
@@ -304,8 +326,9 @@ def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyp
 def _test_cell(rays, n, reaches, pose, corners, pad, passing):  # type: ignore[no-untyped-def]
     """Write whether each ray of a cell passes through a box at a pose.
 
-    `rays` is the address of the first ray in (6, n), `reaches` and `passing` are addresses of
-    float64 and int64 (`CELL`,); `pose` is a position and a rotation by rows.
+    `rays` is the address of the cell's first ray in (6, n). `reaches`, where each ray ends, and the
+    output `passing`, 0 or 1, are addresses of float64 and int64 (`CELL`,). `pose` is a position and
+    a rotation by rows. Corners are in the axes of the body.
     """
     ray = float64s(rays)
     reach = float64s(reaches)
@@ -318,8 +341,12 @@ def _test_cell(rays, n, reaches, pose, corners, pad, passing):  # type: ignore[n
 
 
 @compiled(types.int64(_f64_2, _f64_1, _PAIRS, _f64_2, _f64_2, _i64_1, _i64_2))
-def _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the rays that pass through boxes, and the number of each's pair; return their count."""
+def _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs):  # type: ignore[no-untyped-def]
+    """Write the rays that pass through boxes to `ray_pairs`, with the pair of each.
+
+    Returns the number of columns written: number of the ray, and of the pair of a cell and a body.
+    `passing` is memory for a cell. Arguments are those of `rays_through_boxes`.
+    """
     cell, pose_of_pair, shape, pads = pairs
     written = 0
     count = rays.shape[1]
@@ -368,7 +395,7 @@ def rays_through_boxes(
     ray_pairs = np.empty((2, len(cell) * CELL), np.int64)
     if len(reaches) < CELL:  # the loop over a cell has a constant length
         rays = np.concatenate([rays, np.zeros((6, CELL - len(reaches)))], axis=1)
-        # No distance is before NaN.
+        # A ray that ends at NaN passes no box.
         reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
     passing = np.empty(CELL, np.int64)
     count = _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs)
