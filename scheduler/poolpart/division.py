@@ -33,7 +33,11 @@ _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
 def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `question(steward, **arguments)` on the scheduler; raise its PoolError here."""
+    """Call `question(steward, **arguments)` on the scheduler, and return its result.
+
+    `question` is a coroutine function of this module, such as `grow`. If it raises a PoolError on
+    the scheduler, a PoolError with the same message is raised here.
+    """
     result, complaint = on_scheduler(client, _answer, question=question, arguments=arguments)
     if complaint:
         raise PoolError(complaint)
@@ -43,6 +47,7 @@ def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
 async def _answer(
     question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
+    """Return the result of a question and "", or None and the message of a PoolError."""
     # Raised here, the error would be in the scheduler's log with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
@@ -79,7 +84,8 @@ async def declare(
     Returns
     -------
     notes
-        {partition: remark for users, possibly empty}.
+        {partition: remark for users, possibly empty}: on the choice of workers, and on what this
+        version of Dask lacks.
     remainder
         Workers of the pool that no rule has chosen.
 
@@ -98,6 +104,7 @@ async def declare(
     candidates = [worker.with_gpus(pool[worker.name]) for worker in present if worker.name in pool]
     chosen, notes = divide(initial_rules, candidates)
     for name in rules:
+        # Workers that may be in the partition already: it is made again.
         permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
         foreign = [
             worker.address
@@ -118,7 +125,7 @@ async def declare(
         steward.enter(name, rule)
         for worker in chosen[name]:
             steward.put(seats[worker.address], name, rule.slots_of(worker))
-    await workers_informed()  # before they get tasks
+    await workers_informed()  # before the members get tasks, which lend slots
     members = [seats[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: "; ".join(filter(None, (notes.get(name), common_note))) for name in rules}
@@ -137,7 +144,13 @@ async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Let tasks inherit the partitions, raise or lower fences, and count tasks."""
+    """Prepare the scheduler for tasks of new partitions; return a remark for users, or "".
+
+    From now on, tasks that a task of a partition submits inherit the partition (`inherit.py`),
+    fences keep other tasks off exclusive partitions (`fence.py`), and tasks are counted
+    (`stats.py`). The remark names features that this version of Dask lacks. PoolError if it lacks
+    fences, and a rule is exclusive.
+    """
     scheduler = steward.scheduler
     try:
         note = begin_inheritance(rules, scheduler)
@@ -243,6 +256,7 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
     """Sort seats by the load of their workers; workers with long-running tasks come last."""
 
     def load(seat: Seat) -> tuple[int, int]:
+        """Return the numbers of long-running tasks and of all tasks of a worker."""
         worker = steward.scheduler.workers[seat.info.address]
         return len(worker.long_running), len(worker.processing)
 
@@ -268,15 +282,15 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
         end_inheritance(scheduler, name)
-    if names is None:
+    if names is None:  # also in partitions that workers were started with, which have no rule
         end_inheritance(scheduler, None)
     if not steward.rules:
         close_page(scheduler)
         forget_statistics(scheduler)
     for seat in seats:
         steward.put(seat, None)
-    lift_restrictions(scheduler, dissolved)
-    await workers_informed()
+    lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
+    await workers_informed()  # that tasks lend no more
     # An absent worker comes back as it was started.
     present = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):

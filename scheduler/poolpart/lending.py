@@ -97,7 +97,7 @@ class Lender:
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
         self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
         self._lent: set[Any] = set()  # keys of running tasks that have lent before
-        self._warned: set[Any] = set()  # keys of submitting tasks
+        self._warned: set[Any] = set()  # keys of submitting tasks that clients were warned of
         self._next_look: Any = None  # handle of the event loop
 
     # -- loans -------------------------------------------------------------------------
@@ -128,12 +128,20 @@ class Lender:
         self._rejoining.discard(key)
 
     def serve(self) -> None:
-        """Give slots back, as far as they are free."""
+        """Give slots back to returning tasks in order, as far as the slots are free.
+
+        After the last partition has ended, all returning tasks go on at once.
+        """
         while self._returning and (not self.names or self._are_free(self._returning[0].slots)):
             self._returning.popleft().returned.set()
         self._notify()
 
     def _are_free(self, slots: Resources) -> bool:
+        """Return whether a returning task may have these slots, {resource: number}, back.
+
+        `take_back` has taken the slots of all returning tasks from the available slots, which may
+        be below 0: the sum of both is what further tasks leave.
+        """
         for name, number in slots.items():
             available, total = slots_here(self.worker, name)
             free = available + sum(loan.slots.get(name, 0) for loan in self._returning)
@@ -145,14 +153,16 @@ class Lender:
     # -- who wants slots ---------------------------------------------------------------
 
     def slots_wanted(self) -> bool:
-        """Return whether nested or returning tasks wait for slots or a thread of the worker."""
+        """Return whether nested or returning tasks wait for slots, or a task for its thread."""
         return bool(self._nested or self._returning or self._rejoining)
 
     def lends_at_once(self, loan: _Loan) -> bool:
-        """Return whether a task lends in each wait: threads may be short while slots are free.
+        """Return whether a task must lend in each wait, although nobody waits for slots.
 
-        Dask counts a task that has seceded as long-running to its end, also in a thread of the
-        worker: with more slots than threads, a nested task then starts, and waits for that thread.
+        True for a task that has lent before, on a worker with more slots than threads. Dask counts
+        a task that has seceded as long-running to its end, also after it has rejoined the worker's
+        threads: a nested task may have started in a free slot, and wait for this task's thread. The
+        nested task does not wait for slots, so that `slots_wanted` does not see it.
         """
         slots = sum(slots_here(self.worker, name)[1] for name in loan.slots)
         return loan.key in self._lent and slots > threads_of(self.worker)
@@ -184,6 +194,7 @@ class Lender:
     # -- warnings ----------------------------------------------------------------------
 
     def _look_later(self) -> None:
+        """Call `_look` in half of `WARN_AFTER_S`."""
         loop = asyncio.get_running_loop()
         self._next_look = loop.call_later(WARN_AFTER_S / 2, self._look)
 
@@ -319,7 +330,7 @@ slots_lent = WAIT_HOOKS.lent
 
 
 def begin_lending(worker: Any, name: str) -> Lender:
-    """Let the tasks of a partition lend on a worker; runs in its event loop."""
+    """Let the tasks of a partition lend on a worker; runs in the worker's event loop."""
     with _lock:
         let_waits_lend(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
@@ -328,7 +339,7 @@ def begin_lending(worker: Any, name: str) -> Lender:
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Let the tasks of a partition keep their slots again."""
+    """Let the tasks of a partition keep their slots again; runs in the worker's event loop."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)

@@ -161,7 +161,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe on the scheduler, with its items; do nothing if there is no pipe."""
+        """Delete the pipe on the scheduler, with all queued items; skip an unknown pipe."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -171,7 +171,12 @@ class Pipe:
         self.delete()
 
     def _reply(self, replies: Replies) -> Reply:
-        """Return the reply for this pipe: its state, and the answer to the request."""
+        """Return the reply for this pipe, and remember the advice in the reply.
+
+        A reply has the state of the pipe (`closed`, `failure`, `advice`) and the `answer` to the
+        request: the number of queued items (CHANGE), the number of items that fitted (PUT), or the
+        list of packed items that were taken (TAKE). `PipeFailed` if the pipe does not exist.
+        """
         if self.name not in replies:
             raise PipeFailed(f"Pipe {self.name!r} does not exist: never created, or deleted.")
         reply = replies[self.name]
@@ -179,7 +184,11 @@ class Pipe:
         return reply
 
     def _change(self, **changes: Any) -> Reply:
-        """Change the state of the pipe; without changes, return the current state."""
+        """Change the state of the pipe on the scheduler, and return the reply with the new state.
+
+        `changes` are `producer`, the id of a producer that closes the pipe, `failure` and `advice`.
+        Without changes, the reply has the current state. The answer is the number of queued items.
+        """
         return self._reply(_ask(self.client, CHANGE, names=[self.name], **changes))
 
     def _ask_until(
@@ -190,10 +199,21 @@ class Pipe:
         on_reply: Callable[[Reply], None] = lambda reply: None,
         **arguments: Any,
     ) -> Reply:
-        """Repeat a request to the scheduler until a reply is settled or a deadline has passed.
+        """Repeat a request to the scheduler until a reply ends the wait; return the last reply.
 
-        A reply is also settled if the pipe has ended. `on_reply` is called with each reply in the
-        event loop of the client, even if this thread has been interrupted.
+        Parameters
+        ----------
+        deadline
+            Time of `time.monotonic` at which the wait ends; with -inf the request is made once, and
+            does not wait.
+        is_settled
+            Returns True for a reply that ends the wait. A reply of a pipe that was closed, has
+            failed or is gone always ends the wait.
+        question
+            PUT or TAKE, see `pipe_states.Pipes`; `arguments` are those of the request.
+        on_reply
+            Called with each reply in the event loop of the client, even if this thread has been
+            interrupted.
         """
 
         def has_settled_reply(replies: Replies) -> bool:
@@ -213,7 +233,7 @@ class Pipe:
 
     @property
     def depth(self) -> int:
-        """Items queued now."""
+        """Number of items that are queued now."""
         return int(self._change()["answer"])
 
     def close(self) -> None:
@@ -235,9 +255,10 @@ class Pipe:
 
     @property
     def advice(self) -> int:
-        """Number of records that the consumer wants bundled in an item, as of the last `put`.
+        """Number of records that the consumer wants bundled in an item.
 
-        A producer may ignore it.
+        The number is as old as the last `put`, `get` or other request of this object; before the
+        first request, the scheduler is asked. A producer may ignore the number.
         """
         return int(self._change()["advice"] if self._advice is None else self._advice)
 
@@ -311,7 +332,8 @@ class Pipe:
         timeout_s
             Longest wait in seconds.
         linger_s
-            Time in seconds for which to wait for further items after the first.
+            Longest wait in seconds for further items after the first, 1 s at most. A full pipe ends
+            this wait.
 
         Raises
         ------
@@ -348,11 +370,18 @@ class Pipe:
         return len(self._buffer)
 
     def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
-        """Take up to `limit` queued items, as soon as there are any or a task has ended.
+        """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
 
-        For `Partition.for_each`. With a limit of 0, waits for the end of the pipe or of a task.
-        Returns the items, and whether the scheduler has said that the pipe is closed; raises
-        `PipeFailed`.
+        For `Partition.for_each`, which waits beside its running tasks. With a limit of 0, the call
+        waits for the end of the pipe or of a task. Raises `PipeFailed`.
+
+        Returns
+        -------
+        items
+            The items, possibly none.
+        closed
+            True if the scheduler has replied that the pipe is closed; False if this call took items
+            from the buffer, and did not ask.
         """
 
         def is_settled(reply: Reply) -> bool:
@@ -371,10 +400,11 @@ class Pipe:
         is_settled: Callable[[Reply], bool] | None = None,
         **arguments: Any,
     ) -> Reply:
-        """Have the event loop append queued items to the buffer; raises `PipeFailed`.
+        """Take queued items into the buffer, in the event loop of the client; raises `PipeFailed`.
 
-        Returns the last reply, once the buffer has items (also of a request of another thread), or
-        after the deadline.
+        Without `is_settled`, the wait ends once the buffer has items, also items that another
+        thread has taken. `deadline` and `is_settled` are those of `_ask_until`; `arguments` are
+        those of the request TAKE. Returns the last reply.
         """
 
         def append_items(reply: Reply) -> None:
@@ -390,7 +420,7 @@ class Pipe:
         return reply
 
     def _remove(self, limit: float = math.inf) -> list[Packed]:
-        """Remove and return the first items of the buffer, at most `limit` items."""
+        """Remove and return the first items of the buffer, at most `limit`, still pickled."""
         packed: list[Packed] = []
         with suppress(IndexError):  # threads may share this object
             while len(packed) < limit:
@@ -398,10 +428,10 @@ class Pipe:
         return packed
 
     def _unpack(self, packed: Sequence[Packed]) -> list[Any]:
-        """Return the items before the first that cannot be unpickled; raise the error of that item.
+        """Unpickle items of the buffer, up to the first item that cannot be unpickled.
 
-        The error is raised if no item comes before. Items that are not returned go back to the
-        buffer.
+        If that item is the first of all, its error is raised, and the item is lost. Otherwise the
+        item and the items after it go back to the buffer.
         """
         items: list[Any] = []
         for number, packed_item in enumerate(packed):
@@ -416,7 +446,7 @@ class Pipe:
         return items
 
     def _raise_at_end(self, reply: Reply, deadline: float, timeout_s: float | None) -> None:
-        """Raise if no item can come any more, or none has come until the deadline."""
+        """Raise PipeClosed if no item can come any more, TimeoutError after the deadline."""
         if reply["closed"]:
             raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
         if time.monotonic() > deadline:
@@ -430,15 +460,17 @@ class Pipe:
 
 
 def _deadline(timeout_s: float | None) -> float:
+    """Return the time of `time.monotonic` after a time-out in seconds; inf without a time-out."""
     return math.inf if timeout_s is None else time.monotonic() + timeout_s
 
 
 def _is_answered(reply: Reply) -> bool:
+    """Return whether items of a PUT, at least 1, fitted into the pipe."""
     return bool(reply["answer"])
 
 
 def _producer() -> str:
-    """Return the key of the task of this thread, or a random id outside tasks."""
+    """Return an id of the producer: the key of this thread's task, or a random id elsewhere."""
     running = task_of_thread()
     return uuid.uuid4().hex if running is None else str(running[1].key)
 
@@ -469,9 +501,10 @@ def take_news(
         Names of pipes, one at least, and keys of tasks. A pipe that was closed, has failed or is
         gone ends the wait as well, as does a task that the scheduler does not know.
     puts
-        Items by pipe, whatever its capacity. Those for a pipe that has ended or is gone are lost.
+        {pipe: items to put}, beyond the capacity if necessary. Items for a pipe that has ended or
+        is gone are lost.
     linger_s
-        Wait so long for more once there is something, within `seconds`.
+        Longest wait in seconds for more items after the first, `seconds` at most.
 
     Returns
     -------
@@ -493,7 +526,11 @@ def take_news(
 
 
 def _ask(client: Client, question: str, **arguments: Any) -> Replies:
-    """Send a request to the scheduler and return its replies."""
+    """Send a single request to the scheduler; return {pipe: reply} of the pipes that exist.
+
+    `question` is CHANGE, PUT or TAKE: the name of a handler that `pipe_states.Pipes` adds to the
+    scheduler. `arguments` are those of the handler.
+    """
     check_client(client)
     replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
     return replies or {}  # a scheduler without pipes has no such handler
@@ -507,9 +544,22 @@ def _ask_until(
     on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
-    """Repeat a request to the scheduler until its replies are settled or a deadline has passed.
+    """Repeat a request to the scheduler until its replies end the wait; return the last replies.
 
     All requests are one wait of this thread: a task of a partition that waits lends its slot once.
+
+    Parameters
+    ----------
+    client
+        The client that asks.
+    deadline
+        Time of `time.monotonic` at which the wait ends. The first request is made in any case.
+    is_settled
+        Returns True for replies, {pipe: reply}, that end the wait.
+    question
+        PUT or TAKE, as of `_ask`; `arguments` are those of the handler.
+    on_replies
+        Called with the replies to each request, in the event loop of the client.
     """
     interrupted = threading.Event()
 

@@ -7,7 +7,8 @@ one loop for each worker (`Steward._settle`) synchronises three things with the 
 1. the resources that the worker declares, which its tasks must find there;
 2. the resources by which the scheduler places tasks: removed before a worker leaves a partition, so
    that it gets no more of its tasks, and added only when the worker has declared them;
-3. the workers behind a fence, from the moment of the change.
+3. the workers behind a fence, from the moment of the change. A fence keeps all tasks that do not
+   ask for an exclusive partition off the partition's workers (`fence.py`).
 
 Nannies are not modified: a restarted worker declares its original resources, joins, and is settled
 again. So the loop may be interrupted anywhere, and dissolving leaves nothing behind.
@@ -56,12 +57,14 @@ class Seat:
     is_declaring: bool = False  # a request to declare resources is under way
     partition: str | None = None
     slots: float = 0  # of the partition
-    unplaced: bool = False  # it joined after the division, and a rule has yet to take it
-    by_rule: bool = False  # it joined after the division, and a rule has taken it
+    # It joined after the division, and the rules are to choose its partition: for the first time,
+    # or again if it is in the remainder.
+    unplaced: bool = False
+    by_rule: bool = False  # it joined after the division, and the rules chose its partition
     away: bool = False  # it has left, and its nanny may be restarting it
     removed: bool = False  # it is no longer expected
-    reconciler: asyncio.Task[None] | None = None
-    giving_up: asyncio.TimerHandle | None = None
+    reconciler: asyncio.Task[None] | None = None  # loop `Steward._settle` of this worker
+    giving_up: asyncio.TimerHandle | None = None  # removes the seat, while the worker is away
 
 
 class Steward(SchedulerPlugin):
@@ -74,7 +77,7 @@ class Steward(SchedulerPlugin):
         self.rules: dict[str, Rule] = {}  # by partition, in the order in which they choose
         self.seats: dict[Hashable, Seat] = {}  # by key
         self.open_requests = 0  # of clients
-        self._names: set[str] = set()  # of all partitions so far
+        self._names: set[str] = set()  # of all partitions so far, also of dissolved partitions
         self._assigning: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
@@ -101,16 +104,24 @@ class Steward(SchedulerPlugin):
         return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
     def target_resources(self, seat: Seat) -> Resources:
-        """Return the resources that a worker should declare, with the resource of its partition."""
+        """Return the resources that a worker should declare.
+
+        A worker without a partition declares what it was started with, except the resources of the
+        present partitions: it is in none of these. A member of a partition declares the slots of
+        this partition, and what it was started with, except the resource of any partition that
+        there is or was: it is in a single partition.
+        """
         if seat.partition is None:
             return {r: slots for r, slots in seat.original.items() if r not in self.rules}
         original = {r: slots for r, slots in seat.original.items() if r not in self._names}
         return {**original, seat.partition: seat.slots}
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
-        """Put a worker into a partition or, with None, into no partition.
+        """Record the partition of a worker or, with None, that the worker is in no partition.
 
-        The slots default to those that the worker was started with.
+        The worker is behind the fence of the partition, if any, from now on; `settle` does the
+        rest. The number of slots is the first of these: `slots`, the slots of the rule, the slots
+        of the partition that the worker was started with, the worker's threads.
         """
         seat.partition = name
         seat.slots = 0
@@ -150,7 +161,10 @@ class Steward(SchedulerPlugin):
             self.put(seat, name, seat.original[name])
 
     def resize(self, name: str | None, change: int) -> None:
-        """Change the number of workers in a rule `n_workers`; or do nothing for further rules."""
+        """Change the number of workers that the rule `n_workers` of a partition asks for.
+
+        Partitions with another rule have no such number, and nothing is done.
+        """
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
@@ -158,7 +172,10 @@ class Steward(SchedulerPlugin):
     # -- joining and leaving -----------------------------------------------------------
 
     def _seat(self, worker: Any) -> Seat:
-        """Return the seat of a worker that has joined or returned, updated."""
+        """Return the seat of a worker that has joined or returned, with the worker's new address.
+
+        A new worker gets a new seat, without a partition.
+        """
         key = seat_key(worker.name, worker.address, worker.nanny)
         info = WorkerInfo.from_identity(worker.address, worker.identity())
         seat = self.seats.setdefault(key, Seat(key, info))
@@ -196,7 +213,10 @@ class Steward(SchedulerPlugin):
                 seat.giving_up = loop.call_later(HOLD_S if seat.nanny else 0, self._give_up, seat)
 
     def _give_up(self, seat: Seat) -> None:
-        """Remove the seat of a worker that has not returned in time."""
+        """Remove the seat of a worker that has not returned in time, and fill its place by rule.
+
+        Members of the remainder that joined by rule are assigned again.
+        """
         seat.removed = True
         del self.seats[seat.key]
         # A worker that was started as a replacement has joined before, and went to the rest.
@@ -221,13 +241,13 @@ class Steward(SchedulerPlugin):
     # -- assigning workers that join ---------------------------------------------------
 
     def _assign_soon(self) -> None:
-        """Assign workers without a partition soon: rules or members have changed."""
+        """Assign unplaced workers in `_ASSIGN_EVERY_S`: rules or members have changed."""
         if self._assigning is None:
             loop = asyncio.get_running_loop()
             self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
     def _assign_waiting(self) -> None:
-        """Assign all present workers without a partition that have listed their GPUs."""
+        """Assign all present unplaced workers that have listed their GPUs."""
         self._assigning = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
         # Other workers are still asked for their GPUs, and are assigned after their answer.
@@ -235,7 +255,7 @@ class Steward(SchedulerPlugin):
         self.settle([seat for seat in ready if self._assign(seat)])
 
     def _assign(self, seat: Seat) -> bool:
-        """Assign a joining worker by the rules; return whether its partition changes."""
+        """Assign an unplaced worker by the rules; return whether the worker's partition changes."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
         if moves := name not in (None, seat.partition):
@@ -294,12 +314,16 @@ class Steward(SchedulerPlugin):
             except OSError as error:  # the worker is leaving, or the connection was bad
                 logger.info("The worker at %s does not answer: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
-        # A resource set by hand earlier has woken no tasks.
+        # `show` does not start the tasks that have waited for a worker with these resources.
         if worker:
             wake(self.scheduler, worker)
 
     async def _step(self, seat: Seat, worker: Any, requested_moves: set[Any]) -> bool:
-        """Advance a worker towards its seat; return False if its tasks must end first."""
+        """Let a worker declare its target resources; return False if its tasks must end first.
+
+        The worker refuses while it runs a task that holds a resource to be removed, also a task
+        that the scheduler has forgotten.
+        """
         target = self.target_resources(seat)
         leaving = {name for name, slots in seat.declared.items() if slots and name not in target}
         if leaving and not self._has_released(seat, worker, leaving, requested_moves):
@@ -317,7 +341,8 @@ class Steward(SchedulerPlugin):
             seat.declared = target
             if self.target_resources(seat) == target:
                 self._show(seat, worker, target)
-                for name in leaving:  # other members may have taken over tasks
+                # Other members may have taken over tasks, whose slots Dask counts wrongly.
+                for name in leaving:
                     for address in self.scheduler.resources.get(name, ()):
                         recount(self.scheduler.workers[address])
         return True
@@ -336,7 +361,10 @@ class Steward(SchedulerPlugin):
         return not held_by(self.scheduler, worker, leaving)
 
     def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
-        """Let the scheduler place tasks by the given resources of a worker only."""
+        """Let the scheduler place tasks by the given resources of a worker only.
+
+        Also renew the group of workers that `choosing.py` compares, and the worker's fence.
+        """
         show(self.scheduler, worker, resources)
         note_change(self.scheduler)
         expect(self.scheduler, worker, seat.partition)

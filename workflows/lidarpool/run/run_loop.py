@@ -1,4 +1,9 @@
-"""The loop of a run: jobs are cast several at a time, committed and written, and paths planned."""
+"""The loop of a run: jobs are cast several at a time, committed and written, and paths planned.
+
+A survey has a single job, which may have a planning: trials, tasks of the partition OTHER, that
+search for a short path, beside the casting. A campaign has many jobs, which are written into a data
+set.
+"""
 
 from __future__ import annotations
 
@@ -40,14 +45,27 @@ from .writer import JobFiles, JobWriter
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
-EXTRA_JOBS = 64  # jobs under way in addition to two for each GPU slot
+EXTRA_JOBS = 64  # jobs under way, at most, in addition to two for each GPU slot
 
 
 class RunLoop:
     """Takes the jobs of a run through the pipeline: the first job, and the jobs of `maker`.
 
-    Jobs are written into a `dataset`. Without a data set there is a single job: its parts are kept,
-    and `on_frame` is called with its frames.
+    Parameters
+    ----------
+    cluster
+        Checked cluster with the partitions GPU, LIDAR and OTHER.
+    store
+        Database of the run, and storage of its parts.
+    page
+        Page of the run, to which parts and ended jobs are reported.
+    maker
+        Makes the jobs of a campaign after the first; None for the single job of a survey.
+    dataset
+        Data set into which the jobs of a campaign are written; None for a survey, whose parts are
+        kept.
+    on_frame
+        Called with each frame of the single job of a survey.
     """
 
     def __init__(
@@ -84,7 +102,8 @@ class RunLoop:
         if dataset is not None:
             self._writer = JobWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
         self._trials: TrialPump | None = None
-        self._rows: list[JobRow] = []  # of jobs that have ended, and are not yet committed
+        # Rows of the job table for jobs that have ended, and are not yet in the run's database.
+        self._rows: list[JobRow] = []
         self._scans_begun = 0
         self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
@@ -102,7 +121,7 @@ class RunLoop:
         return self._maker.ended and not self._store.under_way
 
     def step(self) -> bool:
-        """Step the pipeline and the writer once; return True if there were changes.
+        """Begin jobs, step pipeline and writer once, and commit ended jobs; True after changes.
 
         LidarError if a failure concerns all jobs.
         """
@@ -139,7 +158,8 @@ class RunLoop:
         """Begin jobs that are ready, if there is room; return True if any was begun."""
         moved = False
         max_under_way = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
-        # Small jobs begin together, and go on together: then they share messages and tasks.
+        # Small jobs begin together, as many as have batches in one task, and go on together: then
+        # they share messages and tasks.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
         if self._maker is None or not self._maker.has(together):
             return False
@@ -164,14 +184,16 @@ class RunLoop:
             self._fail(job.number, error)
 
     def _cast(self, job: JobUnderWay) -> None:
-        """Add a job to the pipeline, and begin its planning."""
+        """Add a job to the pipeline, begin its planning, and estimate the scans to come."""
         cluster = self._cluster
         is_only = self._writer is None
         planning = job.job.planning
         if is_only and planning is not None:
             self._trials = TrialPump(cluster.tasks(OTHER), planning, job.trials)
-            self._trials.step()  # first: no slot of OTHER waits for the survey
-            self._trials.tasks.partition.want(0)  # waiting trials request workers from now on
+            self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
+            # End the request for slots that was made before there were tasks: from now on, waiting
+            # trials let an adaptive partition grow.
+            self._trials.tasks.partition.want(0)
         # Many jobs follow in a campaign, so that batches need not be divided among all slots.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
         self._pipeline.begin(
@@ -192,7 +214,7 @@ class RunLoop:
         self._pipeline.scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
     def _files_of(self, under_way: JobUnderWay) -> JobFiles:
-        """Return the input of the writer for a committed job."""
+        """Return the input of the writer for a job whose scans are all committed."""
         job = under_way.job
         row = JobRow(
             number=job.number,
@@ -208,18 +230,21 @@ class RunLoop:
         return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
-        """Record a failed job; raise the error if the run has a single job."""
+        """Record the row of a failed job; raise the error if the run is a survey's."""
         if self._store.only_job is not None:
             raise error
         self._rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self) -> None:
-        """Commit jobs that have ended, and remove their parts."""
+        """Commit the rows of ended jobs in the run's database, and remove the jobs' parts.
+
+        The names, models and rates of their sensors are stored for the card of the data set.
+        """
         rows = self._rows
         self._rows = []
         if not rows:
             return
-        under_way = self._store.under_way  # without jobs that could not be made
+        under_way = self._store.under_way  # jobs that could not be made are not in it
         ended = [(row, under_way[row.number]) for row in rows if row.number in under_way]
         self._store.name_sensors(
             (
@@ -246,7 +271,10 @@ class RunLoop:
                 self._store.storage.remove([part.name for part in job.parts.ordered])
 
     def under_way(self) -> list[dict[str, Any]]:
-        """Return the states of the jobs that are being cast, then of the jobs being written."""
+        """Return the states of the jobs that are being cast, then of the jobs being written.
+
+        See `JobUnderWay.status` for the fields of a state.
+        """
         writing = {row.number for row in self._writer.jobs} if self._writer else set()
         jobs = [*self._store.under_way.values()]
         states = [job.status(is_writing=job.number in writing) for job in jobs]
@@ -254,8 +282,11 @@ class RunLoop:
 
     # -- to the end --------------------------------------------------------------------------
 
-    def cast(self, first: Job, show: Show) -> None:
-        """Do all jobs; on any error, all tasks have been stopped."""
+    def run(self, first: Job, show: Show) -> None:
+        """Cast, write and plan all jobs; on any error, all tasks have been stopped.
+
+        `first` is the first job, and `show` is called with the progress.
+        """
         cluster = self._cluster
         pipeline = self._pipeline
         try:
@@ -280,12 +311,18 @@ class RunLoop:
             self._store.notes.append(note)
 
     def _loop(self, first: Job, show: Show) -> None:
-        """Step pipeline, writer and planning until all have finished."""
+        """Step pipeline, writer and planning until all have finished; show progress meanwhile.
+
+        `step` steps the first two until the last job has ended; then the stages of the pipeline are
+        closed, and the loop waits for their end.
+        """
         pipeline = self._pipeline
         started = time.monotonic()
         pause_s = 0.0
         self._begin(first)  # and its trials
         timeline.mark(timeline.FIRST_BATCH)
+        # Detects partitions without workers. The stages on LIDAR last as long as the run: workers
+        # that take no more tasks are good enough there.
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
@@ -327,7 +364,7 @@ class RunLoop:
         self._store.notes += watch.notes
 
     def _save(self) -> None:
-        """Commit finished trials, and the number of frames that were handed out."""
+        """Store finished trials, and the number of frames handed out, in the run's database."""
         if self._trials is not None and (only_job := self._store.only_job) is not None:
             self._store.db.add_trials(only_job, self._trials.trials[len(only_job.trials) :])
         self._store.save()
@@ -349,7 +386,10 @@ class RunLoop:
         return replace(progress, trials_done=len(self._trials.trials))
 
     def _stop(self, reason: str) -> None:
-        """Stop all tasks, as far as the cluster can be reached."""
+        """Stop all tasks because of an error, as far as the cluster can be reached.
+
+        `reason` is the error in words, which the stages get.
+        """
         client = self._cluster.client
         pipeline = self._pipeline
         trials = self._trials

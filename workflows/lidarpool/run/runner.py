@@ -194,7 +194,7 @@ class Run(Generic[R]):
         self.page.follow(self.cluster.partitions, dataset)
         self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, self._frame)
         with self.screen.progress() as show:
-            self.loop.cast(first, show)
+            self.loop.run(first, show)
 
     def _frame(self, frame: ScanFrame) -> None:
         self.page.on_frame(frame)

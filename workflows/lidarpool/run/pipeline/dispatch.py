@@ -1,4 +1,11 @@
-"""Dispatches batches to casting workers and collectors, and offers lost batches again."""
+"""Dispatches batches to casting workers and collectors, and offers lost batches again.
+
+Stage 1 (GENERATE) sends ranges of scans, of which the dispatcher makes batches. Stage 2 (INTERSECT)
+casts batches on GPU workers. Stage 4 (COLLECT) writes them as parts. A batch is WAITING, CASTING,
+CAST or COLLECTING, see `BatchState`. Amounts of work are weights: a task takes `per_task` small
+batches, each of weight 1, and a batch that fills half of a task's memory has the weight of half a
+task, see `policies.weight`.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +26,12 @@ from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .pipeline_job import PipelineJob
 from .placement import TaskRecord
 
-MIN_ADVICE_CHANGE = 0.2  # share of the scans in an item of stage 1 that is worth a request
-PIECES = 16  # batches that a failing batch is divided into
+MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a request to stage 1
+PIECES = 16  # batches, at most, that a batch is divided into when its worker has died with it alone
 
 
 class Stages(Protocol):
-    """Interface of stages 1 and 4 for a dispatcher."""
+    """Interface of stages 1 (GENERATE) and 4 (COLLECT) for a dispatcher."""
 
     collector_count: int  # including collectors that are starting
 
@@ -34,7 +41,7 @@ class Stages(Protocol):
         ...
 
     def advise(self, scans: int) -> None:
-        """Set the number of scans that stage 1 puts into an item from now on."""
+        """Set the number of scans in each range that stage 1 sends from now on."""
         ...
 
     def send(self, name: str, messages: Sequence[CollectOrder]) -> None:
@@ -45,24 +52,24 @@ class Stages(Protocol):
 class Dispatcher:
     """Dispatches the batches of all jobs, and isolates scans that kill their workers.
 
-    Files of parts have the run's `mark`. Jobs that cannot be cast are in `failed`, until they are
-    dropped.
+    The run's `mark` is in the file names of parts. Jobs that cannot be cast are in `failed`, until
+    they are dropped.
     """
 
     def __init__(self, workers: CastingWorkers, stages: Stages, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[PipelineJob, JobError] = {}
-        self.advice = 1  # scans that stage 1 puts into an item
+        self.advice = 1  # scans in each range that stage 1 sends: those of a batch
         self._workers = workers
         self._stages = stages
         self._mark = mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: uncommitted batches}
         self._batch_count = 0  # batches so far
-        # Casting time in seconds and number of scans of each recent batch.
+        # Casting time in seconds and number of scans of each of the last committed batches.
         self._recent_casts: deque[tuple[float, int]] = deque(maxlen=64)
         self._cast_seconds = 0.0  # casting time of all committed batches
         self._cast_scans = 0  # scans of all committed batches
-        self.per_task = 1  # small batches of a task
+        self.per_task = 1  # small batches that are cast in one task
         # {job: batches that killed a worker, tried alone before any batch of the job was cast}
         self._first_deaths: dict[PipelineJob, list[Batch]] = {}
 
@@ -71,10 +78,14 @@ class Dispatcher:
         return [batch for batch in self.batches.values() if batch.state in states]
 
     def _batches_of(self, job: PipelineJob) -> list[Batch]:
+        """Return the uncommitted batches of a job."""
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _batches_within(self, receipt: Receipt) -> list[Batch]:
-        """Return the batches whose scans are all in a part."""
+        """Return the uncommitted batches whose scans are all in a part.
+
+        There are several if the batch was divided after its part was written.
+        """
         first = receipt.first
         stop = receipt.stop
         exact_match = self.batches.get((receipt.job, first))
@@ -90,15 +101,16 @@ class Dispatcher:
 
     @property
     def max_weight(self) -> int:
-        """Largest weight of the batches under way."""
+        """Largest permitted weight of the batches under way, see `policies.weight`."""
         slots = self._workers.slot_count
         collectors = self._stages.collector_count
         return policies.max_under_way(slots, collectors, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of batches that may be taken of a job.
+        """Return the weight of further batches of a job that may be under way; <= 0 if none.
 
-        It is 0 if the newest batch of all jobs is far ahead of the oldest batch of this job.
+        There is no room if many batches of any jobs are younger than the oldest batch of this job:
+        the sorter, and the memory, would have to hold their scans.
         """
         span = max((self._batch_count - batch.number for batch in self._batches_of(job)), default=0)
         if span >= policies.MAX_SPAN * self.max_weight:
@@ -111,7 +123,10 @@ class Dispatcher:
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
     def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
-        """Update the sizes of batches and tasks from casting times, and advise stage 1."""
+        """Update the sizes of batches and tasks from casting times, and advise stage 1.
+
+        Each record is of one batch: its casting time, and in `items` its number of scans.
+        """
         for job, record in records:
             job.seconds += record.seconds
             self._recent_casts.append((record.seconds, record.items))
@@ -132,7 +147,7 @@ class Dispatcher:
     # -- casting ---------------------------------------------------------------------------
 
     def take(self, job: PipelineJob, first: int, stop: int) -> None:
-        """Make batches of the scans that stage 1 has described and that are not committed."""
+        """Make batches of the uncommitted scans in a range that stage 1 has sent."""
         first = max(first, job.generated)  # a restarted generator repeats scans
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
@@ -170,7 +185,12 @@ class Dispatcher:
         return bool(chosen)
 
     def check(self) -> bool:
-        """Update the batches of casting tasks that have ended; return True if there are any."""
+        """Update the batches of casting tasks that have ended; return True if there are any.
+
+        If the worker died or had no rig, the batches are offered again. If casting has failed, and
+        the task had batches of several jobs, they are offered again, too, each in a task with
+        batches of its own job only (`Outcome.DIVIDE`); with batches of a single job, the job fails.
+        """
         moved = False
         for key, task_batches in [*self._tasks.items()]:
             if task_batches[0].state is not BatchState.CASTING:
@@ -211,6 +231,7 @@ class Dispatcher:
             self._blame(batch, INTERSECT, batch.worker)
 
     def _remove(self, batch: Batch) -> None:
+        """Remove a batch that is committed, divided or condemned."""
         self._forget_task(batch)
         del self.batches[batch.job.number, batch.first]
 
@@ -222,7 +243,7 @@ class Dispatcher:
         self.failed.pop(job, None)
 
     def _forget_task(self, batch: Batch) -> None:
-        """Drop a batch's casting task, unless batches of the task are uncommitted."""
+        """Detach a batch from its casting task; cancel or drop the task after its last batch."""
         key = batch.key
         batch.key = ""
         if (task_batches := self._tasks.get(key)) is not None:
@@ -272,7 +293,8 @@ class Dispatcher:
         several batches have killed a worker.
         """
         killers = self._first_deaths.setdefault(batch.job, [])
-        killers[:] = [o for o in killers if o.stop <= batch.first or batch.stop <= o.first]
+        # Not those that overlap with this batch: it is a piece of them.
+        killers[:] = [k for k in killers if k.stop <= batch.first or batch.stop <= k.first]
         killers.append(batch)
         batch.order = self._batch_count
         self._batch_count += 1
@@ -321,33 +343,37 @@ class Dispatcher:
         self._recast_uncollected([*task_batches], "its columns could not be fetched")
 
     def _recast_uncollected(self, batches: Iterable[Batch], reason: str) -> None:
+        """Offer the COLLECTING batches again, to be cast; skip batches in any further state."""
         for batch in batches:
             if batch.state is BatchState.COLLECTING:
                 self._offer_again(batch, reason)
 
     def release(self, committed: Iterable[tuple[PipelineJob, Receipt]]) -> None:
         """Remove the batches of committed parts, and learn from their casting tasks."""
-        first_orders: dict[str, float] = {}  # {collector: when its first committed batch came}
+        # {collector: the earliest time at which it was assigned one of the committed batches}
+        earliest_s: dict[str, float] = {}
         records = []
         for job, receipt in committed:
             for batch in self._batches_within(receipt):
-                since = min(batch.since, first_orders.get(batch.collector, batch.since))
-                first_orders[batch.collector] = since
+                since = min(batch.since, earliest_s.get(batch.collector, batch.since))
+                earliest_s[batch.collector] = since
                 self._remove(batch)
             self._fail_condemned(job)
             if receipt.record is not None:
                 records.append((job, receipt.record))
-        for waiting in self.in_states(BatchState.COLLECTING) if first_orders else ():
-            # Batches behind the committed ones had to wait: their time starts now.
-            if (
-                waiting.collector in first_orders
-                and waiting.since >= first_orders[waiting.collector]
-            ):
+        for waiting in self.in_states(BatchState.COLLECTING) if earliest_s else ():
+            # A collector takes its batches in order. Batches behind the committed batches had to
+            # wait: the time after which they are late starts now.
+            if waiting.collector in earliest_s and waiting.since >= earliest_s[waiting.collector]:
                 waiting.move(BatchState.COLLECTING)
         self._learn(records)
 
     def leave_collectors(self, died: Mapping[str, str], started: Collection[str]) -> None:
-        """Take back the batches of collectors that died, {name: address}, or were replaced."""
+        """Take back the batches of collectors, to be collected by another collector.
+
+        `died` are the collectors whose workers died, {name: address of the worker}; `started` are
+        the names of stages that were started now, which do not know earlier orders.
+        """
         for batch in self.in_states(BatchState.COLLECTING):
             name = batch.collector
             if name in died or name in started:

@@ -1,5 +1,15 @@
 """The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
 
+The driver and four stages exchange messages (`messages.py`):
+
+1. GENERATE describes scans: it finds out that the survey defines them, and reports ranges of scans,
+   of which the driver makes batches;
+2. INTERSECT casts batches on GPU workers, in short tasks;
+3. SORT, the sorter, puts summaries of committed scans into scan order, for frames;
+4. COLLECT, several collectors, writes the points of each batch as a part into storage.
+
+A summary of a scan has its numbers of hits and points, and the ends of a few sample rays.
+
 Everything happens in `step`, called repeatedly from one thread; no call in `step` waits for long.
 There is one rule of recovery: uncommitted batches are offered again, and frames that were not
 handed out are sorted again, whatever was lost. Messages that arrive twice do no harm: a second
@@ -39,7 +49,7 @@ WAIT_S = 0.05  # wait for news while the driver is idle
 LINGER_S = 0.004  # wait for more news after the first, for each job or batch of a task
 MAX_LINGERS = 25  # jobs or batches that are counted for that wait
 CLOSING_S = 0.001  # longest wait while the stages end
-ANNOUNCED = 2  # jobs that stage 1 should have ahead, whatever their size
+ANNOUNCED = 2  # jobs that stage 1 should have ahead at least, whatever their size
 
 
 class Commits(Protocol):
@@ -52,15 +62,16 @@ class Commits(Protocol):
         ...
 
     def summaries(self, part: Receipt) -> bytes:
-        """Return the summaries of the scans of a committed part."""
+        """Return the summaries of a committed part's scans, bytes of a `summary_type` array."""
         ...
 
 
 class Pipeline:
-    """The four stages, which jobs pass on the partitions of a cluster.
+    """The driver's side of the four stages, which jobs pass on the partitions of a cluster.
 
-    `workers` and `stages` are the only access to Dask, so that tests can replace the cluster. Parts
-    are committed in `commits`, and their files have the run's `mark`.
+    `workers` (stage 2) and `stages` (stages 1, 3 and 4) are the only access to Dask, so that tests
+    can replace the cluster. Parts are committed in `commits`. The `mark`, a text of the run, is in
+    the file names of all parts.
     """
 
     def __init__(
@@ -71,9 +82,10 @@ class Pipeline:
         self._commits = commits
         self.dispatcher = Dispatcher(workers, stages, mark)
         self.jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast}
-        self.book = TaskBook()  # of stage 2, and in the end of the others
+        # Times and workers of the batches of stage 2 and, after `finish`, of the long stages.
+        self.book = TaskBook()
         self.progress = 0  # number of scans that were committed, plus frames handed out
-        self.scans_to_come = 0  # scans of jobs that are not begun yet
+        self.scans_to_come = 0  # estimated scans of jobs that are not begun yet; the caller sets it
         # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
         self._announced: dict[int, int] = {}
         self._ended: list[tuple[PipelineJob, JobError | None]] = []  # for `take_ended`
@@ -96,7 +108,8 @@ class Pipeline:
         scans_per_task
             Scans that fit into the memory of a casting task.
         scans_of_run
-            Scans of the whole run, where many jobs are like this one.
+            Scans of the jobs of the run that have not ended, if all are like this job. Batches need
+            not be divided among all slots where many jobs follow.
         on_frame
             Called with each frame, in scan order, in the driver's thread. Without it there are no
             frames, and the job is complete when all its scans are committed.
@@ -115,7 +128,8 @@ class Pipeline:
         job.has_frames = on_frame is not None
         job.on_frame = on_frame
         job.on_parts = on_parts
-        # If all is committed, stage 1 need not describe any scan.
+        # One past the last scan that stage 1 has described. If all is committed, stage 1 need not
+        # describe any scan.
         job.generated = job.scans.start if job.missing_count else job.scans.stop
         self.jobs[job.number] = job
         self._describe([job])
@@ -148,11 +162,13 @@ class Pipeline:
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
-        if error is not None and job.has_frames:  # the sorter forgets the job's summaries
+        # The sorter forgets a job once the last scan is framed. This message says so of the first.
+        if error is not None and job.has_frames:
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._ended.append((job, error))
 
     def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
+        """End each job whose scans are all committed and, in a job with frames, framed."""
         for job in jobs:
             if job.scans_complete and job.number in self.jobs:
                 self._end(job)
@@ -190,7 +206,11 @@ class Pipeline:
         return moved
 
     def wait(self, seconds: float, keys: Iterable[str] = ()) -> None:
-        """Wait at most `seconds` for messages, or the end of a casting task or a task of `keys`."""
+        """Wait for messages, or the end of a casting task or a task of `keys`.
+
+        The wait lasts `seconds` at most, or `WAIT_S` if that is longer; after `close`, `CLOSING_S`.
+        `keys` are keys of Dask tasks. The next `step` takes the messages.
+        """
         if self.stages.closed:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
@@ -198,12 +218,13 @@ class Pipeline:
             keys = [*self.workers.pending, *keys]
             # Small jobs and batches come in dozens, and while there are many, nobody waits for a
             # single one. Each step costs a millisecond or two, however few messages came.
-            small = max(len(self.jobs), self.dispatcher.per_task)
+            burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
             much_under_way = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
-            linger_s = LINGER_S * min(small, MAX_LINGERS if much_under_way else 1)
+            linger_s = LINGER_S * min(burst, MAX_LINGERS if much_under_way else 1)
             self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:
+        """Handle a message of a stage, except for receipts, see `_commit`."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
             return
@@ -225,7 +246,10 @@ class Pipeline:
                     self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs under way."""
+        """Commit the receipts of jobs under way; sort, report and record the new parts.
+
+        Jobs that are complete with these parts end.
+        """
         stored = [
             (self.jobs[receipt.job], receipt)
             for receipt in receipts
@@ -278,7 +302,10 @@ class Pipeline:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Order stage 1 to describe remaining scans of jobs; `_look` repeats lost orders."""
+        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on.
+
+        `_look` repeats lost orders.
+        """
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
@@ -290,8 +317,12 @@ class Pipeline:
 
     @property
     def _wants_scans(self) -> bool:
-        """True if the next job of stage 1 has room for scans, or has ended."""
-        # Scans of later jobs are behind them in the pipe: a job gets no more than it has room for.
+        """True if the job that stage 1 describes has room for batches, or has ended.
+
+        False if stage 1 has no orders. `wait` takes ranges of scans from stage 1 only if True.
+        """
+        # Stage 1 describes one job after the other, and `_announced` has the same order. While the
+        # first job has no room, its scans and those of later jobs behind it stay in the pipe.
         # After the last scan the pipe is closed, which ends each wait at once: a driver that still
         # asked did so 700 times a second.
         for number in self._announced:
@@ -300,7 +331,10 @@ class Pipeline:
         return False
 
     def _sort(self, job: PipelineJob, parts: Sequence[Receipt]) -> None:
-        """Send summaries of parts to the sorter; `_look` sends all again when the sorter starts."""
+        """Send the summaries of committed parts to the sorter, for jobs with frames.
+
+        `_look` sends all again when the sorter starts.
+        """
         if parts and job.has_frames:
             messages = [
                 Summaries(
@@ -317,7 +351,7 @@ class Pipeline:
             self.stages.send(SORT, messages)
 
     def _sort_again(self, jobs: Iterable[PipelineJob]) -> None:
-        """Send the sorter all summaries of jobs that were not handed out as frames."""
+        """Send the sorter all summaries of jobs' committed scans that were not handed out."""
         for job in jobs:
             job.sorted_at = time.monotonic()
             if job.has_frames:
@@ -329,7 +363,7 @@ class Pipeline:
 
     def close(self) -> None:
         """Let all stages end after everything is committed."""
-        self.workers.want(0)
+        self.workers.want(0)  # the partition may shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
@@ -339,7 +373,7 @@ class Pipeline:
         self.stages.stop(reason)
 
     def finish(self) -> None:
-        """Wait a moment for the stages to end, and clean up scheduler and storage."""
+        """Wait a moment for the stages to end, add their records to `book`, and clean up."""
         try:
             for record in self.stages.finish(self.workers.futures):
                 self.book.add(record)

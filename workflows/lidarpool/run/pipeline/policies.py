@@ -45,7 +45,8 @@ def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int
     scans_per_task
         Scans that fit into the memory of a casting task.
     scan_count
-        Scans of the run. They are divided so that all slots get some.
+        Scans that the run is about to cast, of all jobs that have not ended. They are divided so
+        that all slots get some.
     slots
         Casting tasks that run at a time.
     """
@@ -67,7 +68,7 @@ def scans_per_batch(
     scans_per_task
         Scans that fit into the memory of a casting task.
     scan_count
-        Scans of the run. They are divided so that all slots get some.
+        Scans that the run is about to cast, as of `max_scans_per_batch`.
     slots
         Casting tasks that run at a time.
     """
@@ -105,10 +106,11 @@ def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> i
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
-    """Return the number of small batches that `batches` count as, if a task has `per_task`.
+    """Return the weight of batches, in small batches, if a task has `per_task` small batches.
 
-    All batches of a task are in a worker's memory at a time: a batch that takes half of the memory
-    counts as half a task.
+    All batches of a task are in a worker's memory at a time: a batch of which two fill the memory
+    of a task (`batch.share` is 0.5) counts as half a task, `per_task / 2`. A batch counts as 1 at
+    least.
     """
     return sum([max(1.0, per_task * batch.share) for batch in batches])
 
@@ -181,13 +183,14 @@ def offers(
     state = _OfferState.from_batches(batches, slots, max_weight, per_task)
     waiting = [batch for batch in batches if batch.state is BatchState.WAITING]
     idle_slots = state.idle_slots()
-    spread = -(-weight(waiting, per_task) // max(1, idle_slots))  # all idle slots get some
-    task_size = per_task if state.has_backlog else min(per_task, spread)
+    # Weight of a task if the waiting batches are shared by all idle slots, rounded up.
+    idle_share = -(-weight(waiting, per_task) // max(1, idle_slots))
+    task_size = per_task if state.has_backlog else min(per_task, idle_share)
     groups: dict[object, deque[Batch]] = {}  # batches that may share a task
     for batch in waiting:
         groups.setdefault(_group_key(batch), deque()).append(batch)
     chosen: list[TaskOffer] = []
-    passed: set[Batch] = set()
+    passed: set[Batch] = set()  # batches in a chosen task, or left to wait for a larger task
     for first in waiting:
         if first in passed:
             continue
@@ -271,14 +274,21 @@ class _OfferState:
 
 
 def _group_key(batch: Batch) -> object:
-    """Return a key that is equal for batches that may share a task."""
+    """Return a key that is equal for batches that may share a task.
+
+    A batch with which a worker died shares with none. A batch of a task that has failed, with
+    several jobs in it, shares only with its own job; all others share with jobs of their scene.
+    """
     if batch.deaths:
         return batch
     return batch.job.number if batch.divided else batch.job.scene_name
 
 
 def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:
-    """Remove the batches of a task from a group and return the batches; at least 1."""
+    """Remove the batches of a task from a group and return the batches.
+
+    There is at least 1 batch; further batches are added up to `max_weight`.
+    """
     task = [group.popleft()]
     task_weight = weight(task, per_task)
     while group and (task_weight := task_weight + weight([group[0]], per_task)) <= max_weight:
@@ -287,7 +297,7 @@ def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Ba
 
 
 class Handover(NamedTuple):
-    """Batches that were cast in one task, and the collector that stores the batches."""
+    """Batches from one casting task, and the collector that stores the batches."""
 
     batches: list[Batch]
     collector: str  # name
@@ -342,6 +352,10 @@ def loss(
 ) -> Outcome | None:
     """Return why a batch should be offered again although its task has not failed, or None.
 
+    The worker died (DIED), or the columns are gone with it or the worker is silent (GONE); the
+    worker is paused and has not started the task (REFUSED); the batch has been cast or collected
+    for too long (LATE).
+
     A worker that Dask has paused starts no task until memory is free, perhaps never: its tasks
     that have not started are offered elsewhere.
 
@@ -350,7 +364,8 @@ def loss(
     batch
         A batch under way.
     locations
-        Workers of the partition, and where their tasks are.
+        Workers of the partition (`members`), those without a recent heartbeat (`silent`), those
+        that are not paused (keys of `free`), and the states of their tasks.
     prepared_workers
         Workers that can cast. While there is no other worker, a silent or late worker is waited
         for.
