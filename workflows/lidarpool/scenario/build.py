@@ -55,14 +55,16 @@ from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
+# Defaults of scenes with the default objects (scene.preset: seed): x and y of the planned path's
+# ends, and poses of the sensor, world metres.
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
-# Of the hits in a scene with the default objects, every fifth is in the cloud.
+# Of the returns in a scene with the default objects, every fifth is in the cloud.
 SEED_KEEP_EVERY = 5
 
-# Class of buildings by ASPRS LAS: sensors are not placed in objects that a file gives this class.
+# Class of buildings by ASPRS LAS: sensors are not placed inside objects of this class.
 BUILDING = 6
 
 # Precision of points in scenes without the default objects, if no sensor states a resolution.
@@ -88,7 +90,7 @@ class Job:
     number, name, split
         Number of the job in its campaign, its name in files, and the name of its split.
     outputs
-        Formats that the cloud is also written in.
+        Formats that the cloud is written in besides PLY.
     made_of
         Names and SHA-256 of the files that the job was made of.
 
@@ -113,19 +115,19 @@ class Job:
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
-        # Cells of the cloud's precision have 32-bit indices.
-        reach = float(np.abs(scene.bounds).max(initial=0.0))
-        if survey.spray_g_m3:
+        # Largest local coordinate, also of actors; over the precision it must fit 32-bit integers.
+        reach_m = float(np.abs(scene.bounds).max(initial=0.0))
+        if survey.spray_g_m3:  # vehicles on a wet road raise spray
             check_spray(scene.actors)
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             positions, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
             mesh_bounds = (actor.mesh.animation or actor.mesh).bounds
-            reach = max(reach, float(np.abs(positions).max() + np.abs(mesh_bounds).max()))
-        if reach / survey.precision_m >= 2**31 - 1:
+            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(mesh_bounds).max()))
+        if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach:.0f} m from its origin: use at least {reach / 2e9:.2g}."
+                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}."
             )
         warn_of_grey(scene, survey)
 
@@ -168,16 +170,16 @@ def build(
     scene = static.scene
     shapes = Shapes(scenario, findings)
     epsg = _common_epsg(scenario, findings)
-    with prefixed(scenario.source):
+    with prefixed(scenario.source):  # errors begin with the scenario's name
         track = _carrier_track(scenario, static.standing)
         sensors = _mounted_sensors(shapes)
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
         placing = _placing(scenario, scene, findings, sensors[0])
-        if placing.grid:
+        if placing.grid:  # no sensor is given, and the scene is a single object
             sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
-    carrier = track or (SEED_POSES if placing is None else placing.poses)
-    parts = _SurveyParts(scenario, findings, sensors, carrier, scene.origin, epsg)
+    track_or_poses = track or (SEED_POSES if placing is None else placing.poses)
+    parts = _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg)
     actors = _build_actors(shapes, static.standing, track)
     vehicles = _build_traffic(parts, shapes, static.standing)
     if actors or vehicles:
@@ -206,7 +208,8 @@ class Built:
     scene, survey, planning
         In the scene's local coordinates; the planning is None if the scenario asks for none.
     placing
-        Chosen poses of the sensor, if the scenario has no poses; else None.
+        Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
+        or a trajectory, or has the default objects.
     findings
         Notes about the files, and their content in words.
     """
@@ -219,57 +222,73 @@ class Built:
     findings: Findings
 
     def job(self, **fields: Any) -> Job:
-        """Return scene, survey and planning as a job with further fields, such as `name`."""
+        """Return scene, survey and planning as a job with further fields, such as `name`.
+
+        Results always have a PLY, so that PLY is not among the job's outputs.
+        """
         outputs = tuple(entry for entry in self.scenario.output.write if entry.format != "ply")
         return Job(self.scene, self.survey, self.planning, outputs=outputs, **fields)
 
 
 class _SurveyParts(NamedTuple):
-    """Parts of a survey that are known before its materials are."""
+    """Parts of a survey that are known before the materials are."""
 
     scenario: Scenario
     findings: Findings
     sensors: Sequence[Mounted]
-    carrier: Track | Sequence[Pose]  # the poses count if the scenario gives no poses
-    origin: Floats  # (3,), world metres
-    epsg: int | None  # code of the rasters' coordinate system
+    # Trajectory of the carrier, local; or poses, world, which `scenario.poses` replace if given.
+    track_or_poses: Track | Sequence[Pose]
+    origin: Floats  # (3,), of the scene, world metres
+    epsg: int | None  # EPSG code of the rasters' coordinate system
 
 
 def _carrier_track(scenario: Scenario, standing: StandingSurfaces) -> Track | None:
-    """Return the trajectory of the survey in local coordinates, or None."""
+    """Return the trajectory of the carrier in local coordinates; None without a trajectory."""
     if scenario.trajectory is None:
         return None
     return scenario.trajectory.track(scenario.path, standing)
 
 
 def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
-    """Choose poses for a scenario of mesh files that gives neither poses nor a trajectory."""
-    alone = scenario.mount is None and not scenario.sensors
+    """Choose poses for a scenario of mesh files that gives neither poses nor a trajectory.
+
+    Scenes with rasters are landscapes. If the scenario states no field of the sensor, and the scene
+    looks like a single object, the sensor becomes a grid as wide as the object.
+    """
+    is_unmounted = scenario.mount is None and not scenario.sensors
     return place_sensor(
         scene,
         sensor,
         landscape=bool(findings.rasters),
         buildings=findings.named(BUILDING),
-        narrow=alone and not scenario.sensor.model_fields_set,
+        narrow=is_unmounted and not scenario.sensor.model_fields_set,
     )
 
 
 def _build_traffic(
     parts: _SurveyParts, shapes: Shapes, standing: StandingSurfaces
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Build the actors of the traffic, each with its entry; an empty list without traffic."""
+    """Build the actors of the traffic that are present during the survey.
+
+    Each actor comes with the entry of `traffic.vehicles` that gives its shape; the list is empty
+    without traffic.
+    """
     scenario = parts.scenario
     if scenario.traffic is None:
         return []
     with prefixed(scenario.source):
-        duration_s = _build_survey(parts, []).duration_ns / 1e9
-        carrier = parts.carrier
-        start_s = carrier.start_s or 0.0 if isinstance(carrier, Track) else 0.0
+        duration_s = _build_survey(parts, []).duration_ns / 1e9  # materials do not matter for it
+        track_or_poses = parts.track_or_poses
+        # of the survey, by the clock of the carrier's trajectory
+        start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
         return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
-    """Return the EPSG code of the rasters that keep x and y; their systems must be the same."""
+    """Return the EPSG code of the rasters whose placement keeps x and y, or None.
+
+    LidarError if the coordinate systems of these rasters differ.
+    """
     unmoved = [(e.file, raster) for e, raster in findings.rasters if e.transform().keeps_xy]
     systems = {raster.crs: file for file, raster in unmoved if raster.crs}
     if len(systems) > 1:
@@ -295,7 +314,11 @@ def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
 
 
 def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
-    """Return the pose of a sensor in the carrier frame."""
+    """Return the pose of a sensor in the carrier frame.
+
+    A mount with a link is relative to that link of a robot on the carrier; LidarError if no robot
+    or several have the link, or joints move the link.
+    """
     scenario = shapes.scenario
     mount: MountSection | None = getattr(section, "mount", scenario.mount)
     if mount is None or mount.link is None:
@@ -325,14 +348,18 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
 
 
 def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments of `Robot.path` and `Robot.actors` that read a table of joints."""
+    """Return the arguments of `Robot.path` and `Robot.actors` for an actor's table of joints."""
     if entry.joints is None:
         return {}
     return {"joints": scenario.path(entry.joints.file), "ignore": entry.joints.ignore}
 
 
 def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | None) -> list[Actor]:
-    """Build the actors of a scenario; trajectories start with the survey's."""
+    """Build the actors of a scenario, without traffic.
+
+    `track` is the trajectory of the carrier, or None. Trajectories start at the survey's start; an
+    actor with neither trajectory nor pose is the carrier, and follows `track`.
+    """
     scenario = shapes.scenario
     actors = list[Actor]()
     with prefixed(scenario.source):
@@ -351,14 +378,14 @@ def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | Non
 def _robot_actors(
     entry: ActorSection, robot: Robot, trajectory: Track, shapes: Shapes
 ) -> Sequence[Actor]:
-    """Return the actors of a robot, without the links that carry sensors."""
-    tell = shapes.findings.notes.append
+    """Return the actors of a robot, one per link, without the links that sensors are mounted on."""
+    add_note = shapes.findings.notes.append
     links = shapes.scenario.links
-    without = links.intersection(robot.meshes) if entry.is_carrier else ()
-    for link in sorted(without):
-        tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+    sensor_links = links.intersection(robot.meshes) if entry.is_carrier else ()
+    for link in sorted(sensor_links):
+        add_note(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
     joints = _joint_arguments(entry, shapes.scenario)
-    return robot.actors(trajectory, name=entry.name, without=without, tell=tell, **joints)
+    return robot.actors(trajectory, name=entry.name, without=sensor_links, tell=add_note, **joints)
 
 
 def _traffic_actors(
@@ -368,16 +395,20 @@ def _traffic_actors(
     start_s: float,
     duration_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Return the vehicles and persons present during the survey, each with its entry."""
-    begin = start_s - section.offset_s
+    """Return the vehicles and persons present during the survey, each with its entry.
+
+    `start_s` and `duration_s` are start and duration of the survey, in seconds by the clock of the
+    carrier's trajectory.
+    """
+    file_start_s = start_s - section.offset_s
     findings = shapes.findings
     file = shapes.scenario.path(section.file)
-    passages, count = read_fcd(file, begin, begin + duration_s, section.ignore)
+    passages, count = read_fcd(file, file_start_s, file_start_s + duration_s, section.ignore)
     actors = actors_of(section, passages, shapes.mesh_of, standing, start_s)
     if not actors:
         findings.notes.append(
-            f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
-            f"{begin + duration_s:g} s of the file: check offset_s, translation and surfaces"
+            f"{section.file}: no vehicle or person is in the scene from {file_start_s:g} to "
+            f"{file_start_s + duration_s:g} s of the file: check offset_s, translation and surfaces"
         )
     findings.sources[section.file] = (
         f"{plural(len(actors), 'actor')} during the survey, of {plural(count, 'vehicle')} "
@@ -392,47 +423,56 @@ def _materials(
     scene: Scene,
     vehicles: Sequence[tuple[Actor, VehicleSection]],
 ) -> list[Material]:
-    """Return materials by name, with the classes of actors, of copies and of objects of files.
+    """Return the scenario's materials, with further entries for the classes of objects.
 
-    `vehicles` are the last actors of the scene, with their entries.
+    Classes of actors, copies and traffic come from the scenario; classes of other objects come from
+    files. `vehicles` are the last actors of the scene, with their entries of the traffic. Rows of
+    objects are indices into `scene.all_names`.
     """
     vehicle_classes = [entry.semantic_class for _, entry in vehicles]
-    default = Material("*")
+    default_material = Material("*")
     materials = [*scenario.materials]
     kinds = scene.surface_kinds
     classed = _classed_objects(scenario, scene)
     if classed and not materials:
-        materials = [default]
+        materials = [default_material]
     for classed_object in classed:
         materials = _with_object_class(materials, classed_object, kinds)
-    first = len(scene.all_names) - len(vehicles)
+    first_vehicle_row = len(scene.all_names) - len(vehicles)
     for semantic_class in sorted({number for number in vehicle_classes if number is not None}):
-        rows = np.array(
-            [first + k for k, number in enumerate(vehicle_classes) if number == semantic_class]
+        vehicle_rows = np.array(
+            [
+                first_vehicle_row + k
+                for k, number in enumerate(vehicle_classes)
+                if number == semantic_class
+            ]
         )
-        materials = with_class(materials or [default], semantic_class, rows, kinds)
+        materials = with_class(materials or [default_material], semantic_class, vehicle_rows, kinds)
     if findings.classes:
         class_patterns = {number: findings.named(number) for number in findings.class_names}
-        materials = with_classes(materials or [default], class_patterns, kinds)
+        materials = with_classes(materials or [default_material], class_patterns, kinds)
     return materials
 
 
 class _ClassedObject(NamedTuple):
-    """An object that its entry of copies or actors gives a class."""
+    """An object to which its entry of `scene.copies` or `actors` gives a class."""
 
-    name: str
-    patterns: list[str]  # of the names of its rows in the scene
+    name: str  # of the entry, or of a robot's link
+    patterns: list[str]  # fit the names of the object and its numbered copies in the scene
     semantic_class: int
 
 
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
-    """Return the objects whose entries of copies and actors give a class."""
+    """Return the objects whose entries of copies and actors give a class.
+
+    All copies of an entry are one such object; each link of a robot is an object of its own.
+    """
     classed: list[_ClassedObject] = []
     for entry in scenario.placed:
         if entry.semantic_class is None:
             continue
         patterns = {entry.name: [escape(entry.name)]}
-        numbered = f"{escape(entry.name)}.[0-9]*"
+        numbered = f"{escape(entry.name)}.[0-9]*"  # second and further copies: Tree.2
         if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
             patterns[entry.name].append(numbered)
         elif isinstance(entry, ActorSection) and entry.robot:
@@ -447,16 +487,21 @@ def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
 def _with_object_class(
     materials: Sequence[Material], classed: _ClassedObject, kinds: SurfaceKinds
 ) -> list[Material]:
-    """Return materials with the class of an object, which its materials get in copies."""
-    objects = np.concatenate([rows_named(pattern, kinds.names) for pattern in classed.patterns])
-    object_materials = {kinds.material[kind] for kind in kinds.of_rows(objects).tolist()}
+    """Return materials with the class of an object.
+
+    Each entry that applies to the object is preceded by an entry with the same properties, for the
+    object alone, with the class.
+    """
+    object_rows = np.concatenate([rows_named(pattern, kinds.names) for pattern in classed.patterns])
+    object_materials = {kinds.material[kind] for kind in kinds.of_rows(object_rows).tolist()}
     changes: dict[str, Any] = {
         "objects": classed.patterns,
         "semantic_class": classed.semantic_class,
     }
     result: list[Material] = []
     for material in materials:
-        # Before the materials of the object: an earlier material, of a single copy, counts there.
+        # The first entry for a face counts. An earlier entry for a single copy, such as Tree.7,
+        # does not apply to the object's name, and stays before the new entry: it still counts.
         if material.named(classed.name, object_materials):
             result.append(replace(material, **changes))
         result.append(material)
@@ -468,27 +513,32 @@ def _with_object_class(
 def _build_survey(
     parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str] = ()
 ) -> Survey:
-    """Build the survey along a track, or at poses if the scenario gives none; local coordinates."""
+    """Build the survey along a trajectory or at poses, in local coordinates.
+
+    `columns` are names of columns that the cloud gets beside those of the scenario and formats.
+    """
     scenario = parts.scenario
     sensors = parts.sensors
-    needs = scenario.output.needs
+    format_columns = scenario.output.needs
     cloud = declared(scenario.cloud, CloudOptions)
-    cloud["columns"] = (*scenario.cloud.columns, *needs, *columns)
+    cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
     cloud["epsg"] = scenario.cloud.epsg or parts.epsg
     if scenario.scene.has_seed:
-        cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEEP_EVERY)
+        cloud["keep_every"] = cloud["keep_every"] or (
+            1 if "ray" in format_columns else SEED_KEEP_EVERY
+        )
     elif not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
-    check_whole((*needs, *columns), cloud["keep_every"] or 1)
-    carrier = parts.carrier
-    track = carrier if isinstance(carrier, Track) else None
-    poses = () if isinstance(carrier, Track) else scenario.poses or carrier
+    check_whole((*format_columns, *columns), cloud["keep_every"] or 1)
+    track_or_poses = parts.track_or_poses
+    track = track_or_poses if isinstance(track_or_poses, Track) else None
+    poses = () if isinstance(track_or_poses, Track) else scenario.poses or track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
-    alone = not scenario.sensors and scenario.mount is None and sensors[0].noise is None
+    needs_no_mounting = not scenario.sensors and scenario.mount is None and sensors[0].noise is None
     survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, parts.origin))) for p in poses],
         trajectory=track,
-        **({"sensor": sensors[0].sensor} if alone else {"sensors": sensors}),
+        **({"sensor": sensors[0].sensor} if needs_no_mounting else {"sensors": sensors}),
         steps=scenario.steps,
         materials=materials,
         classes=_class_names(parts, materials, cloud["columns"]),
@@ -507,11 +557,12 @@ def _class_names(
 ) -> dict[int, str]:
     """Return the names of the classes of a survey, {number: name}.
 
-    Files give classes to objects; a number or name in the scenario has the scenario's meaning.
+    Names come from `scenario.classes`, and from the classes that files give to objects, unless the
+    scenario uses the number or the name otherwise. `columns` are those of the cloud.
     """
     scenario = parts.scenario
-    placed = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
-    scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *placed)}
+    entries = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
+    scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
     numbers: dict[str, int] = {}  # {name of a class: number}
     if scenario.classes or "class" in columns:
@@ -537,7 +588,7 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
         return None
     discs, labels = _obstacle_discs(scenario, scene)
     discs[:, 2] += section.clearance_m
-    with_area = np.flatnonzero(discs[:, 2])  # upright lines have no area
+    with_area = np.flatnonzero(discs[:, 2])  # objects that are vertical lines have no area
     discs = discs[with_area]
     labels = [labels[i] for i in with_area]
     start_xy, target_xy = [(x - x0, y - y0) for x, y in (start, target)]
@@ -555,16 +606,20 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
 
 
 def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
-    """Return the obstacles as local x, y, radius (m, 3), and a label for each obstacle."""
+    """Return the obstacles as discs (m, 3): x, y, radius, local, metres; and their labels (m,).
+
+    By default all static objects higher than `FLAT_M` are obstacles. `planning.clearance_m` is not
+    added to the radii.
+    """
     if scenario.planning.obstacles is None:
         tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
         return scene.footprints[tall], [scene.names[i] for i in tall]
-    rows: dict[str, list[float]] = {}  # {label: x, y, radius}
+    discs: dict[str, list[float]] = {}  # {label: x, y, radius}
     for number, entry in enumerate(scenario.planning.obstacles):
         if entry.object is None:
             assert entry.centre and entry.radius_m, "either of the two kinds is given"
             centre = np.subtract(entry.centre, scene.origin[:2])
-            rows[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
+            discs[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
             continue
         # An exact name comes first, even with brackets; else the text is a pattern.
         matches = [i for i, name in enumerate(scene.names) if name == entry.object] or [
@@ -576,5 +631,5 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
                 f"planning.obstacles names {entry.object!r}, but no object has that name."
                 + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
             )
-        rows |= {scene.names[i]: list(scene.footprints[i]) for i in matches}
-    return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
+        discs |= {scene.names[i]: list(scene.footprints[i]) for i in matches}
+    return np.array(list(discs.values()), dtype=np.float64).reshape(-1, 3), list(discs)

@@ -44,8 +44,8 @@ from .sections import (
     file_states,
 )
 
-# Fields of a mesh file that a robot that stands still has.
-_OF_ROBOTS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
+# Fields of a mesh file's entry that are allowed if the file is a robot.
+_ROBOT_FIELDS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
 
 
 @dataclass
@@ -53,9 +53,9 @@ class Findings:
     """Notes about a scene, collected while its files are read."""
 
     notes: list[str] = field(default_factory=list)  # about objects left out of the scene
-    remarks: list[str] = field(default_factory=list)  # about axes of files
+    remarks: list[str] = field(default_factory=list)  # about the up-axes of files
     sources: dict[str, str] = field(default_factory=dict)  # {file: its content in words}
-    rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)
+    rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)  # entry, description
     # {file of the scene: {number: class}} of files whose format gives classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
 
@@ -64,7 +64,7 @@ class Findings:
         return Findings(*(values.copy() for values in vars(self).values()))
 
     def named(self, number: int) -> tuple[str, ...]:
-        """Return the patterns of the names of objects that files give a class by its number."""
+        """Return name patterns of the objects to which files give the class of a number."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()
@@ -93,7 +93,11 @@ class StaticScene(NamedTuple):
 
 
 class SceneCache:
-    """The static scenes of the last scenarios, for scenarios with the same files and sections."""
+    """Cache of the last `max_scenes` static scenes.
+
+    Scenarios with the same scene section, unchanged files and the same options of reading share a
+    scene.
+    """
 
     def __init__(self, max_scenes: int = 4) -> None:
         self._max_scenes = max_scenes
@@ -103,30 +107,41 @@ class SceneCache:
         """Return the static scene of a scenario, from the cache or read from its files."""
         key = _key(scenario)
         static = self._scenes.pop(key, None) or read_static_scene(scenario)
-        self._scenes[key] = static  # at the end: the last used
+        self._scenes[key] = static  # at the end: the first scene is the least recently used
         while len(self._scenes) > self._max_scenes:
             del self._scenes[next(iter(self._scenes))]
         return static
 
 
 def _key(scenario: Scenario) -> object:
-    """Return the key of a static scene: equal for scenarios that may share the scene."""
+    """Return the key of a static scene: equal for scenarios that may share the scene.
+
+    The key has the scene section, the options of reading, and size and time of the files.
+    """
     section = scenario.scene
-    names: list[str] = [entry.file for entry in section.files]
+    files: list[str] = [entry.file for entry in section.files]
     for copies in section.copies:
-        names += [entry.file for entry in (copies.file, copies.table) if entry is not None]
-    states = file_states(map(scenario.path, names))
-    read_by = scenario.path(""), scenario.coloured, scenario.names_materials, scenario.cloud.epsg
-    return section.model_dump_json(), *read_by, states
+        files += [entry.file for entry in (copies.file, copies.table) if entry is not None]
+    states = file_states(map(scenario.path, files))
+    reading_options = (
+        scenario.path(""),
+        scenario.coloured,
+        scenario.names_materials,
+        scenario.cloud.epsg,
+    )
+    return section.model_dump_json(), *reading_options, states
 
 
 def read_static_scene(scenario: Scenario) -> StaticScene:
     """Read the mesh files of a scenario, and place its copies and ground.
 
+    The scene has the default objects, if any, the files' objects, the copies, and the ground. Its
+    actors are objects that move in their files.
+
     Raises
     ------
     LidarError
-        If a file cannot be read, or copies have no position.
+        If a file cannot be read, or copies have no surface to stand on or no room.
     """
     section = scenario.scene
     findings = Findings()
@@ -163,23 +178,30 @@ class Shapes:
         self._robots: dict[MeshFile, Robot] = {}
 
     def mesh_of(self, entry: ShapeSection) -> SceneMesh:
-        """Return the mesh of a copy, an actor or vehicles; the name of the mesh is arbitrary."""
+        """Return the mesh of a copy, an actor or vehicles: all objects of a file, or a box, joined.
+
+        Entries of the same file, animation and wheels share a mesh, named by the first entry.
+        Objects that move in the file stand at their first poses.
+        """
         shape = entry.file or entry.box or (1.0, 1.0, 1.0)
         meshes = self._meshes
         animation, wheels = (getattr(entry, name, None) for name in ("animation", "wheels"))
-        played = animation and (animation.name, animation.speed_m_s, animation.repeat)
-        key = shape, played, wheels
+        animation_key = animation and (animation.name, animation.speed_m_s, animation.repeat)
+        key = shape, animation_key, wheels
         if key not in meshes:
             name = entry.name or "vehicle"
             if not isinstance(shape, MeshFile):
                 return meshes.setdefault(key, box(name, shape))
-            read = self.read(shape, animation and (animation.name or ""))
+            # "" is the first animation of the file.
+            file_objects = self.read(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
-            still = read.at_start(lambda line: self.findings.notes.append(f"{path} moves {line}"))
+            objects = file_objects.at_start(
+                lambda line: self.findings.notes.append(f"{path} moves {line}")
+            )
             if wheels is not None:
                 with prefixed(path):
-                    still = (*rolling(still, wheels, self.findings.notes.append),)
-            mesh = meshes[key] = join_meshes(name, still)
+                    objects = (*rolling(objects, wheels, self.findings.notes.append),)
+            mesh = meshes[key] = join_meshes(name, objects)
             if animation is not None and mesh.animation is not None:
                 settings = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}
                 meshes[key] = replace(mesh, animation=replace(mesh.animation, **settings))
@@ -200,7 +222,11 @@ class Shapes:
         return self._robots[entry]
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file, with an animation; LidarError if the file cannot be used."""
+        """Read the objects of a file in world coordinates; LidarError if the file cannot be used.
+
+        `animation` is the name of the animation that the meshes play; "" is the first of the file,
+        None none.
+        """
         scenario = self.scenario
         findings = self.findings
         with prefixed(scenario.source):
@@ -225,8 +251,8 @@ class Shapes:
         return objects
 
     def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
-        """Return a robot with its joints at zero."""
-        if refused_fields := sorted(entry.model_fields_set - _OF_ROBOTS):
+        """Return the links of a robot as static objects, with the joints at zero."""
+        if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
                 f"out {' and '.join(refused_fields)}."
@@ -239,13 +265,18 @@ class Shapes:
         return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
 
 
-def _place_copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:
-    """Place the copies, which stand on files' objects and on the ground, not on copies."""
+def _place_copies(
+    shapes: Shapes, static_objects: list[SceneMesh | SceneInstance]
+) -> list[SceneInstance]:
+    """Place the copies, which stand on `static_objects` and on the ground, not on copies.
+
+    `static_objects` are the default objects and the objects of files, in world coordinates.
+    """
     scenario = shapes.scenario
     section = shapes.scenario.scene
-    scene = Scene.from_meshes(base) if base else None
-    if section.ground is not None and (base or _copy_extents(section)):
-        scene = Scene.from_meshes([*base, _ground_mesh(section, scene)])
+    scene = Scene.from_meshes(static_objects) if static_objects else None
+    if section.ground is not None and (static_objects or _copy_extents(section)):
+        scene = Scene.from_meshes([*static_objects, _ground_mesh(section, scene)])
     standing = StandingSurfaces(scene)
     copies: list[SceneInstance] = []
     mistakes = Mistakes()
@@ -273,7 +304,11 @@ def _copy_extents(section: SceneSection) -> list[Floats]:
 
 
 def _ground_mesh(section: SceneSection, scene: Scene | None) -> SceneMesh:
-    """Return two triangles under a scene, and under the extents of copies."""
+    """Return the ground in world coordinates: two triangles under a scene and its copies.
+
+    The rectangle contains the scene, the positions of listed copies and the rectangles of scattered
+    copies, with a margin.
+    """
     ground = section.ground
     assert ground is not None, "of a section with a ground"
     corners_xy = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
@@ -286,18 +321,18 @@ def _ground_mesh(section: SceneSection, scene: Scene | None) -> SceneMesh:
 
 
 MIN_SCALE = 1e-6
-DRAW_SIZE = 1 << 14  # positions that are drawn at a time
-# Positions that are drawn: the larger of the two limits.
+DRAW_SIZE = 1 << 14  # random positions that are drawn at a time
+# Most positions that are drawn for an entry: the larger of the two limits.
 MAX_DRAWS_PER_COPY = 200
 MAX_DRAWS = 1 << 21
 
-_POSITION = ("x", "y", "z")
-_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
-_SCALES = ("scale_x", "scale_y", "scale_z")
+_POSITION_NAMES = ("x", "y", "z")
+_ANGLE_NAMES = ("yaw_deg", "pitch_deg", "roll_deg")
+_SCALE_NAMES = ("scale_x", "scale_y", "scale_z")
 _COPY_COLUMNS = (
     *POSITION,
     *ANGLES,
-    *(Quantity(name, (name,), NUMBERS, "") for name in ("scale", *_SCALES)),
+    *(Quantity(name, (name,), NUMBERS, "") for name in ("scale", *_SCALE_NAMES)),
 )
 
 
@@ -319,7 +354,7 @@ def copies_of(
         else:
             poses = _CopyPoses(
                 np.array([(*copy.position, np.nan)[:3] for copy in entry.at]),
-                np.array([[getattr(copy, name) for name in _ANGLES] for copy in entry.at]),
+                np.array([[getattr(copy, name) for name in _ANGLE_NAMES] for copy in entry.at]),
                 np.array([copy.scale for copy in entry.at]),
             )
         poses.set_missing_heights(standing)
@@ -371,7 +406,7 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
                 refused=REFUSED_COLUMNS,
             )
         )
-        if "scale" in columns and any(name in columns for name in _SCALES):
+        if "scale" in columns and any(name in columns for name in _SCALE_NAMES):
             raise ValueError("it has both scale and scales of axes: ignore one")
     except (OSError, ValueError, LidarError) as error:
         raise LidarError(f"{path} is not a usable table of copies: {message_of(error)}") from error
@@ -382,30 +417,39 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
     def columns_of(names: Sequence[str], default: Any) -> Floats:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
 
-    scales = columns_of(("scale",) * 3 if "scale" in columns else _SCALES, 1.0)
-    return _CopyPoses(columns_of(_POSITION, np.nan), angles_of(columns, count), scales)
+    scales = columns_of(("scale",) * 3 if "scale" in columns else _SCALE_NAMES, 1.0)
+    return _CopyPoses(columns_of(_POSITION_NAMES, np.nan), angles_of(columns, count), scales)
 
 
 def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> _CopyPoses:
     """Draw the poses and scales of copies at random.
 
-    Positions are drawn in a rectangle, and are valid where the highest surface is one of the
-    scatter's: only sums, products and comparisons, so that all machines draw the same.
+    Positions are drawn in a rectangle, and rejected where the highest surface is not one of
+    `scatter.surfaces`. The arithmetic is only sums, products and comparisons, so that all machines
+    draw the same.
     """
-    # The name, so that trees and rocks of the same seed do not share positions.
+    # The seed includes the name, so that trees and rocks of the same seed do not share positions.
     seeds = [scatter.seed, *name.encode()]
     positions = _scatter_positions(scatter, seeds, standing)
     count = scatter.count
-    looks = np.random.Generator(np.random.PCG64([1, *seeds])).random((count, 2))
-    yaw = 360.0 * looks[:, 0] if scatter.yaw_deg is None else np.full(count, scatter.yaw_deg)
+    yaw_and_scale_draws = np.random.Generator(np.random.PCG64([1, *seeds])).random((count, 2))
+    yaw = (
+        360.0 * yaw_and_scale_draws[:, 0]
+        if scatter.yaw_deg is None
+        else np.full(count, scatter.yaw_deg)
+    )
     min_scale, max_scale = scatter.scale
-    scales = min_scale + looks[:, 1] * (max_scale - min_scale)
+    scales = min_scale + yaw_and_scale_draws[:, 1] * (max_scale - min_scale)
     angles = np.column_stack([yaw, np.zeros((count, 2))])
     return _CopyPoses(positions, angles, np.repeat(scales[:, None], 3, axis=1))
 
 
 def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
-    """Draw positions (n, 3) on surfaces, world metres; LidarError if there is no room."""
+    """Draw positions (n, 3) on surfaces, world metres; LidarError if there is no room.
+
+    `standing` are the surfaces of all objects. If none of the first positions is on a surface of
+    the scatter, as under a roof, all other surfaces are ignored.
+    """
     surfaces = standing.of_objects(scatter.surfaces)
     x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within
     rng = np.random.Generator(np.random.PCG64([0, *seeds]))
@@ -422,7 +466,7 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
         draws = rng.random((DRAW_SIZE, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
         heights, objects = standing.heights_below(draws)
         on_surfaces = np.flatnonzero(np.isin(objects, surfaces.owners))
-        if not drawn_count and not len(on_surfaces):  # a roof is above: leave it out
+        if not drawn_count and not len(on_surfaces):  # probably under a roof
             standing = surfaces
             heights, objects = standing.heights_below(draws)
             on_surfaces = np.flatnonzero(objects >= 0)
@@ -440,10 +484,11 @@ class _OccupiedPositions:
 
     def __init__(self, spacing_m: float) -> None:
         self._spacing_m = spacing_m
-        self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}  # {cell: positions}
+        # {column and row of a square cell with sides of `spacing_m`: positions}
+        self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
 
     def occupy(self, x: float, y: float) -> bool:
-        """Occupy a position and return True, or return False if there is no room."""
+        """Occupy a position and return True; return False if an occupied position is too close."""
         spacing_m = self._spacing_m
         if not spacing_m:
             return True

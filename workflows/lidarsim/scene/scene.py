@@ -20,9 +20,8 @@ from ..base.vectors import hypot
 from ..base.words import plural
 from ..sensor import Pose, Track
 from ..sensor.materials import SurfaceKinds
-from . import colours as coloured
 from .actors import Actor
-from .colours import Colours, are_indices
+from .colours import GREY, Colours, are_indices, join_colours
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, OpacityMode, load_objects, warn
 from .files.scene_graph import Window
@@ -52,22 +51,23 @@ class Scene:
     vertices
         float64 (v, 3), metres, Z-up, local.
     faces
-        int32 (f, 3), f >= 1, indices into `vertices`.
+        int32 (f, 3), indices into `vertices`; f >= 1 unless there are instances.
     face_object
         int32 (f,), for each triangle the index of its object in `names`.
     names
-        Names of the objects, without duplicates.
+        Names of the static objects, without duplicates; an object's number is its index.
     origin
         float64 (3,), whole metres.
     actors
-        Moving objects, numbered after the static objects.
+        Moving objects, numbered after the static objects; their meshes are not in `faces`.
     instances
-        Triangles that are stored once and are at several positions, or have a mask; they are
-        numbered after `faces`, instance by instance. The triangles of actors follow.
+        Static triangles that are not in `faces`: parts of meshes that are stored once and placed
+        any number of times, or that have a mask (transparent pixels) or voxels (leaves). The
+        triangles are numbered after `faces`, instance by instance; the triangles of actors follow.
     colours
-        Colours of `faces`, or None.
+        Colours of `faces`, or None; parts of instances and meshes of actors have their own.
     materials
-        Names of the materials of the objects, or None.
+        Names of the materials of the static objects' faces in the scene's files, or None.
 
     Raises
     ------
@@ -106,7 +106,8 @@ class Scene:
             )
         arrays = {"vertices": vertices, "faces": faces, "face_object": owners, "origin": origin}
         for name, array in arrays.items():
-            if array.flags.writeable:  # else another scene shares the array, by its identity
+            # A read-only array is already another scene's: both keep the same Python object.
+            if array.flags.writeable:
                 array = array.view()
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -211,8 +212,8 @@ class Scene:
         called with a line on the loss.
         """
         if not objects.static:
-            lost = "nothing stands in the scene, and without that nothing moves: "
-            return cls.from_meshes(objects.at_start(lambda line: tell(lost + line)))
+            note_start = "nothing stands in the scene, and without that nothing moves: "
+            return cls.from_meshes(objects.at_start(lambda line: tell(note_start + line)))
         scene = cls.from_meshes(objects.static)
         actors = []
         for actor in objects.actors:
@@ -261,7 +262,7 @@ class Scene:
             names=unique_names([item.name for item in objects]),
             origin=origin,
             instances=instances,
-            colours=coloured.join_colours([mesh.colours for mesh in split.meshes], sizes),
+            colours=join_colours([mesh.colours for mesh in split.meshes], sizes),
             materials=ObjectMaterials.from_meshes(
                 [
                     (item if isinstance(item, SceneMesh) else item.mesh).materials
@@ -291,9 +292,10 @@ class Scene:
         return scene
 
     def moved(self, owner: int, pose: Pose) -> Scene:
-        """Return the same scene with the instances of the object `owner` at another pose.
+        """Return the same scene with the instances of an object at another pose.
 
-        The pose is that of the mesh's frame in local coordinates. The instances keep their scale.
+        `owner` is the object's index in `names`. The pose is the pose of the mesh's frame in local
+        coordinates; the instances keep their scale.
         """
         assert self.instances is not None
         scene = copy(self)
@@ -337,22 +339,28 @@ class Scene:
 
     @property
     def material_names(self) -> tuple[str, ...]:
-        """Distinct names of all materials of faces; the column `material` numbers these names."""
+        """Distinct names of all materials of faces.
+
+        The column `material` holds indices into these names.
+        """
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
 
     @property
     def masked(self) -> tuple[str, ...]:
-        """Names of the objects that stop light only in part, in order."""
+        """Names of the objects with masks, through which light passes in part, in order."""
         owners = set()
-        if (shared := self.instances) is not None:
-            owners = set(shared.owners(lambda part: part.mask is not None).tolist())
+        if (instances := self.instances) is not None:
+            owners = set(instances.owners(lambda part: part.mask is not None).tolist())
         first_actor = len(self.names)
         owners |= {first_actor + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
         return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
     def coloured(self) -> list[Colours]:
-        """Colours of the faces, of the parts of instances and of the actors, without None."""
+        """Colours of the faces, of parts of instances and of actors' meshes; empty if all are grey.
+
+        Only colours that exist are listed, in this order.
+        """
         parts = self.instances.parts if self.instances else ()
         colours = [self.colours, *(part.colours for part in parts)]
         colours += [actor.mesh.colours for actor in self.actors]
@@ -363,30 +371,35 @@ class Scene:
         """True for each object with a colour, actors after the static objects: (objects,)."""
         has_colour = np.zeros(len(self.all_names), np.bool_)
         if (colours := self.colours) is not None:
-            grey = np.array([image is coloured.GREY for image in colours.images])
+            grey = np.array([image is GREY for image in colours.images])
+            # Faces without a colour have the image `GREY` if other faces are coloured.
             has_colour[self.face_object[~grey[colours.image]]] = True
-        if (shared := self.instances) is not None:
-            has_colour[shared.owners(lambda part: part.colours is not None)] = True
+        if (instances := self.instances) is not None:
+            has_colour[instances.owners(lambda part: part.colours is not None)] = True
         has_colour[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
         return has_colour
 
     @property
     def has_voxels(self) -> Bools:
-        """True for each object with voxels, actors after the static objects: (objects,)."""
+        """True for each object that is filled with voxels of leaves: (objects,), actors last."""
         has_voxels = np.zeros(len(self.names) + len(self.actors), np.bool_)
-        if (shared := self.instances) is not None:
-            has_voxels[shared.owners(lambda part: part.voxels is not None)] = True
+        if (instances := self.instances) is not None:
+            has_voxels[instances.owners(lambda part: part.voxels is not None)] = True
         return has_voxels
 
     @property
     def triangles(self) -> int:
-        """Number of triangles, including triangles of instances and actors."""
-        shared = self.instances.triangles if self.instances else 0
-        return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
+        """Number of triangles, including triangles of all instances and actors."""
+        instance_triangles = self.instances.triangles if self.instances else 0
+        return (
+            len(self.faces)
+            + instance_triangles
+            + sum(len(actor.mesh.faces) for actor in self.actors)
+        )
 
     @property
     def kept_triangles(self) -> int:
-        """Number of triangles in memory, without actors; instances count their part once."""
+        """Number of static triangles in memory: a part counts once for all its instances."""
         parts = self.instances.parts if self.instances else ()
         return len(self.faces) + sum(len(part.faces) for part in parts)
 
@@ -397,11 +410,15 @@ class Scene:
         The counters of instances follow the counters of `faces`; the counters of the actors'
         triangles come last.
         """
-        shared = len(self.instances) if self.instances else 0
-        return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
+        instance_count = len(self.instances) if self.instances else 0
+        return (
+            len(self.faces) + instance_count + sum(len(actor.mesh.faces) for actor in self.actors)
+        )
 
     def solid(self, time_ns: float) -> Scene:
-        """Return a scene of `faces` and the actors' triangles at a time, without instances.
+        """Return a scene in which the actors at a time are static objects, without instances.
+
+        A scene without actors is returned unchanged, with its instances.
 
         Parameters
         ----------
@@ -422,15 +439,13 @@ class Scene:
             np.append(self.face_object, owners),
             self.all_names,
             self.origin,
-            colours=coloured.join_colours(
-                [self.colours, *(mesh.colours for mesh in meshes)], sizes
-            ),
+            colours=join_colours([self.colours, *(mesh.colours for mesh in meshes)], sizes),
         )
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return the objects that have triangles, in world coordinates and in order.
+        """Return the static objects that have triangles, in world coordinates and in order.
 
-        An object with masks gives a mesh or instance for each part.
+        An object with masks is returned as a mesh or instance for each part.
         """
         by_object: list[list[SceneMesh | SceneInstance]] = [[] for _ in self.names]
         order = np.argsort(self.face_object, kind="stable")
@@ -438,12 +453,12 @@ class Scene:
         for owner, rows in enumerate(np.split(order, stops)):
             if len(rows):
                 by_object[owner].append(self._mesh_of_faces(owner, rows))
-        if (shared := self.instances) is not None:
+        if (instances := self.instances) is not None:
             meshes = [
-                self._mesh_of_shared_part(shared, index) for index in range(len(shared.parts))
+                self._mesh_of_shared_part(instances, index) for index in range(len(instances.parts))
             ]
             for index, matrix, owner in zip(
-                shared.part, shared.transforms, shared.owner, strict=True
+                instances.part, instances.transforms, instances.owner, strict=True
             ):
                 transform = Transform(matrix[:, :3], matrix[:, 3] + self.origin)
                 instance = SceneInstance(meshes[index], transform, self.names[owner])
@@ -451,7 +466,7 @@ class Scene:
         return tuple(item for items in by_object for item in items)
 
     def _mesh_of_faces(self, owner: int, rows: Indices) -> SceneMesh:
-        """Return the faces (k,) of an object as a mesh in world coordinates."""
+        """Return the faces `rows` (k,) of an object as a mesh in world coordinates."""
         points, faces = compacted(self.vertices, self.faces[rows])
         return SceneMesh(
             self.names[owner],
@@ -461,12 +476,15 @@ class Scene:
             materials=None if self.materials is None else self.materials.of_object(owner, rows),
         )
 
-    def _mesh_of_shared_part(self, shared: Instances, index: int) -> SceneMesh:
-        """Return a part of instances as a mesh, named by the first object that has the part."""
-        part = shared.parts[index]
+    def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:
+        """Return a part of instances as a mesh, in the frame of the part.
+
+        The mesh has the name of the first object that has the part.
+        """
+        part = instances.parts[index]
         cutouts = () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),)
         return SceneMesh(
-            self.names[shared.owner[np.argmax(shared.part == index)]],
+            self.names[instances.owner[np.argmax(instances.part == index)]],
             part.vertices,
             part.faces.astype(np.int64),
             cutouts,
@@ -477,7 +495,7 @@ class Scene:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the triangles, local coordinates, metres: (2, 3)."""
+        """Lowest and highest corner of the static triangles, local, metres: (2, 3)."""
         corners = self._face_bounds
         if self.instances:
             corners = np.concatenate([corners, self.instances.bounds.reshape(-1, 3)])
@@ -485,7 +503,7 @@ class Scene:
 
     @cached_property
     def _face_bounds(self) -> Floats:
-        """Lowest and highest corner of `faces` alone: (2, 3), or (0, 3) without faces."""
+        """Lowest and highest corner of `faces`, local, metres: (2, 3), or (0, 3) without faces."""
         is_used = np.zeros(len(self.vertices), np.bool_)
         is_used[self.faces] = True
         used = self.vertices[is_used]
@@ -493,7 +511,7 @@ class Scene:
 
     @cached_property
     def object_bounds(self) -> Floats:
-        """Lowest and highest corner of each object, local coordinates, metres: (objects, 2, 3).
+        """Lowest and highest corner of each static object, local, metres: (objects, 2, 3).
 
         An object without triangles has (+inf, -inf).
         """
@@ -502,14 +520,16 @@ class Scene:
         upper = np.full((len(self.names), 3), -np.inf)
         np.minimum.at(lower, self.face_object, corners.min(axis=1))
         np.maximum.at(upper, self.face_object, corners.max(axis=1))
-        if (shared := self.instances) is not None:
-            np.minimum.at(lower, shared.owner, shared.bounds[:, 0])
-            np.maximum.at(upper, shared.owner, shared.bounds[:, 1])
+        if (instances := self.instances) is not None:
+            np.minimum.at(lower, instances.owner, instances.bounds[:, 0])
+            np.maximum.at(upper, instances.owner, instances.bounds[:, 1])
         return np.stack([lower, upper], axis=1)
 
     @cached_property
     def footprints(self) -> Floats:
-        """Circle around each object seen from above: x, y, radius, local, metres: (objects, 3).
+        """Circle around each static object, seen from above: x, y, radius: (objects, 3).
+
+        Local coordinates, metres.
 
         The circle is centred on the object's bounding rectangle and reaches its farthest
         vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
@@ -519,8 +539,8 @@ class Scene:
         for corner in range(3):
             offset = self.vertices[self.faces[:, corner], :2] - centres[self.face_object]
             np.maximum.at(reach, self.face_object, hypot(*offset.T))
-        if (shared := self.instances) is not None:
-            np.maximum.at(reach, shared.owner, shared.reach(centres[shared.owner]))
+        if (instances := self.instances) is not None:
+            np.maximum.at(reach, instances.owner, instances.reach(centres[instances.owner]))
         return np.column_stack([centres, reach])
 
 
@@ -537,7 +557,7 @@ def local_origin(vertices: Floats) -> Floats:
 
 
 class _PlacedPart(NamedTuple):
-    """A mesh part placed in a scene."""
+    """A part of a mesh at a pose in a scene."""
 
     owner: int  # index of the object
     part: int  # index of the part
@@ -546,7 +566,11 @@ class _PlacedPart(NamedTuple):
 
 @dataclass
 class _SplitObjects:
-    """Objects of a scene: meshes whose triangles are copied, and parts that instances share."""
+    """Objects of a scene: meshes whose triangles are copied, and parts that instances share.
+
+    Meshes are in world coordinates, parts in the frame of their mesh; an owner is the index of an
+    object.
+    """
 
     meshes: list[SceneMesh] = field(default_factory=list)  # without masks and voxels
     mesh_owners: list[int] = field(default_factory=list)  # index of each mesh's object
@@ -586,13 +610,14 @@ def _check_objects(objects: Sequence[object]) -> None:
 def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObjects:
     """Split objects into meshes to copy, and parts of meshes to place as instances.
 
-    Meshes with masks or voxels are divided into parts, as instances are. A part without a mask of
-    a mesh that is no instance is copied.
+    A `SceneMesh` without masks and voxels is copied. Other meshes are divided into parts, one for
+    each mask and one for the opaque triangles. Of a `SceneMesh`, the opaque part is copied and
+    the parts with a mask or voxels are placed; of a `SceneInstance`, all parts are placed.
     """
     split = _SplitObjects()
     part_indices: dict[SceneMesh, range] = {}
     for owner, item in enumerate(objects):
-        single = isinstance(item, SceneMesh)
+        is_mesh = isinstance(item, SceneMesh)
         if isinstance(item, SceneMesh):
             if not item.cutouts and item.voxels is None:
                 split.add_mesh(owner, item)
@@ -608,7 +633,7 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
             part_indices[mesh] = range(first, len(split.parts))
         for index in part_indices[mesh]:
             part = split.parts[index]
-            if single and part.mask is None and part.voxels is None:
+            if is_mesh and part.mask is None and part.voxels is None:
                 split.add_mesh(owner, _mesh_of_part(item.name, part))
             else:
                 split.placed_parts.append(_PlacedPart(owner, index, matrix))
@@ -616,7 +641,7 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
 
 
 def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
-    """Return a part without a mask as a mesh."""
+    """Return a part without mask and voxels as a mesh; frame and triangles stay."""
     return SceneMesh(
         name,
         part.vertices,

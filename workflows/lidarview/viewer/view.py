@@ -1,4 +1,4 @@
-"""What a page shows of a survey: its answers to the page's questions; the command `view`."""
+"""A survey or a cloud on a page: answers to the questions of the page; the command `view`."""
 
 from __future__ import annotations
 
@@ -70,27 +70,28 @@ from .point_selection import (
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MAX_POINTS = 20_000_000  # in an answer, and in a download
-MAX_RAYS = 150  # more rays would hide the surfaces
+MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
 _SAMPLE = 100_000  # points from which colour scales and limits are computed
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
-_HITS_SAMPLE = 500_000  # points whose density is shown on large triangles
-_MAX_NAMES = 2000  # in a menu
-# maximum of columns; rows for sensors with few or many channels
-_IMAGE_WIDTH = 1024
-_IMAGE_ROWS = 128
+_HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
+_MAX_NAMES = 2000  # named values of a column that a menu of the page lists
+_IMAGE_WIDTH = 1024  # most columns of a range image
+_IMAGE_ROWS = 128  # of a range image, unless its rows are channels
 _COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
-_MIN_CHANNELS = 4
-_MAX_CHANNELS = 512
-_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation of a sensor that looks down
-_MAX_FIELD_RAD = math.radians(300)  # a spinning sensor sees more
+_MIN_CHANNELS = 4  # of a sensor whose channels are the rows of a range image
+_MAX_CHANNELS = 512  # likewise
+_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation; below, the sensor looks down
+_MAX_FIELD_RAD = math.radians(300)  # a wider field of view is shown as 360°
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
-MAX_TRIANGLES = 300_000  # 50 bytes each, sent again when colours change
-MAX_PIECES = 60_000  # of large triangles, where hits are shown
-_INWARD_SHARE = 1e-4  # of the scene's diagonal
-_MAX_SIZE_M = 200.0  # of a scene: a shift of 2 cm is enough for any scene
+MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colours
+MAX_PIECES = 60_000  # further triangles from dividing large triangles, to show hits
+# Surfaces are moved inwards by this share of the scene's diagonal, or of `_MAX_SIZE_M` if that is
+# smaller: two centimetres.
+_INWARD_SHARE = 1e-4
+_MAX_SIZE_M = 200.0
 MAX_LABELS = 1000  # in a legend
-Legend = dict[str, Any]  # for the JSON of the page
+Legend = dict[str, Any]  # JSON for the page: of `legend_of` or `scale_legend`
 CLOUD = "cloud.ply"
 
 
@@ -106,24 +107,27 @@ class Downloads:
 class View:
     """A survey on a page, or a cloud alone.
 
-    The scene is left out of a result whose points are in the axes of their sensors.
+    The page gets coordinates that are local: world coordinates minus `origin`. The scene is left
+    out of a result whose points are in the sensor frame.
     """
 
     points: Points
-    pictured: PictureContent | None = None
-    sweeps: Sweeps | None = None
+    pictured: PictureContent | None = None  # scene, sensors, some rays and hit counts; local
+    sweeps: Sweeps | None = None  # poses and scans of all sweeps
     note: str = ""  # a remark for the user
     title: str = "lidarpool"
     results: Sequence[str] = ()  # names, if the points are of several results
-    # Returns the hits of each triangle, of actors' triangles last; by default as pictured.
+    # Returns the hits of each triangle of the scene, actors' triangles last, during a run; None
+    # takes `pictured.hit_counts`.
     hits: Callable[[], AnyArray] | None = None
-    triangles: int = MAX_TRIANGLES  # of the scene, that are shown
+    triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
     downloads: Downloads | None = None  # None if points are not offered as files
 
     def __post_init__(self) -> None:
-        self.version = 0  # of the points
+        self.version = 0  # counts the replacements of the points by `show`
+        # (n, 2, 3): both ends of sample rays, local, metres
         self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
-        self.path: Floats | None = None
+        self.path: Floats | None = None  # (w, 2): corners of the planned path, local, metres
         sources = (source for source in (self.pictured, self.sweeps) if source is not None)
         if any(source.coordinates != "world" for source in sources):
             self.note = self.note or IN_SENSOR_AXES
@@ -155,7 +159,10 @@ class View:
 
     @cached_property
     def sensors(self) -> Sequence[SensorPositions]:
-        """Positions of the sensors: exact, or at the starts of their sweeps."""
+        """Positions of the sensors, local, metres: as pictured, else at the starts of sweeps.
+
+        A sensor moves if it is at a new position in more than half of at least three sweeps.
+        """
         if self.pictured is not None:
             return self.pictured.sensors
         sweeps = self.sweeps
@@ -187,7 +194,7 @@ class View:
         return float(starts[-1] + (np.diff(starts).min() if len(starts) > 1 else 0))
 
     def _names(self, column: str) -> Sequence[str]:
-        """Names of the values 0, 1, 2, … of a column, if any."""
+        """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
         if column == RESULT.name and self.results:
             return self.results
         if self.pictured is not None and column in self.columns:
@@ -204,10 +211,11 @@ class View:
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _extent(self) -> tuple[Floats, Floats, Floats]:
-        """Return the local origin, the box (2, 3) of the view, and points (k, 3) to be in sight.
+        """Return the origin (3,), world metres; the box (2, 3) and points (k, 3) to be in sight.
 
-        These points are corners of the scene, sensors, and both ends of the planning. The corners
-        of the box would be farther apart: around an object the box is mostly empty.
+        The box contains the points, local, metres. The points are the corners of the scene, the
+        positions of the sensors, and both ends of the planned path: closer together than the
+        corners of the box, which around an object is mostly empty.
         """
         if self.pictured is None:
             origin, box = _cloud_extent(self.points)
@@ -224,7 +232,11 @@ class View:
     # -- answers -------------------------------------------------------------------------
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page."""
+        """Answer a question of the page: a header for JSON, and arrays by name.
+
+        `abandoned` returns True once the browser no longer waits for the answer; then the search
+        for points raises `Abandoned`.
+        """
         answers: Mapping[str, Callable[[Arguments, Callable[[], bool]], Answer]] = {
             "state": lambda *_: self._state(),
             "points": self._points,
@@ -237,7 +249,12 @@ class View:
         return answers[question](arguments, abandoned)
 
     def _state(self) -> Answer:
-        """Return the state of the view, without points and surfaces."""
+        """Return the header and arrays of the view, without points and surfaces.
+
+        In the header, "bounds" contain the scene, and "box" the part to look at first: around the
+        trajectories in a large scene, where "cut" is the z of its top. Local metres, and seconds.
+        """
+        # None: look at all of the scene
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
@@ -253,8 +270,8 @@ class View:
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
         pictured = self.pictured
-        objects = len(self._names("object"))
-        statics = objects - len(self.actors)
+        object_count = len(self._names("object"))
+        static_count = object_count - len(self.actors)
         classes = self._classes_of_objects()
         result_numbers = np.arange(len(self.results))
         header = {
@@ -277,13 +294,13 @@ class View:
             ],
             "actors": [
                 {"name": actor.name, "class": classes.get(number)}
-                for number, actor in enumerate(self.actors, statics)
+                for number, actor in enumerate(self.actors, static_count)
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(result_numbers, RESULT, self.results))["labels"],
             "exports": self._export_formats,
-            "actor_colours": as_bytes(object_colours(objects))[statics:].tolist(),
-            "statics": statics,
+            "actor_colours": as_bytes(object_colours(object_count))[static_count:].tolist(),
+            "statics": static_count,
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
@@ -291,9 +308,16 @@ class View:
         return header, arrays
 
     def _actor_arrays(self) -> dict[str, AnyArray]:
-        """Return meshes, with their poses if animated, and the trajectories of actors."""
-        meshes, shapes = distinct_meshes(self.actors)
-        arrays: dict[str, AnyArray] = {"actor_mesh": shapes.astype(np.int32)}  # no int64 in pages
+        """Return the meshes and trajectories of actors as arrays for the page.
+
+        Distinct meshes are numbered ``mesh0``, ``mesh1``, …; animated meshes have the vertices
+        (p, v, 3) of each pose of the animation, actors the number of the pose at each time, with
+        fractions (``actor0_frames``). Local metres, seconds.
+        """
+        meshes, mesh_indices = distinct_meshes(self.actors)
+        arrays: dict[str, AnyArray] = {
+            "actor_mesh": mesh_indices.astype(np.int32)
+        }  # no int64 in pages
         for k, mesh in enumerate(meshes):
             arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
@@ -307,21 +331,23 @@ class View:
             arrays |= {f"actor{k}_times": times / _NS, f"actor{k}_places": positions}
             arrays[f"actor{k}_turns"] = rotations
             arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
-            animation = actor.mesh.animation
-            if animation is not None:  # after the last pose, pages start again
-                frames = actor.seconds(times)[0] / animation.step_s
+            if (animation := actor.mesh.animation) is not None:
+                # Pages repeat all animations: numbers stay below the last pose if it remains.
+                pose_numbers = actor.seconds(times)[0] / animation.step_s
                 last = len(animation.vertices) - 1 - 1e-6
-                arrays[f"actor{k}_frames"] = frames if animation.repeat else frames.clip(0, last)
+                arrays[f"actor{k}_frames"] = (
+                    pose_numbers if animation.repeat else pose_numbers.clip(0, last)
+                )
         return arrays
 
     @property
     def rays_shown(self) -> Floats32:
-        """Rays (n, 2, 3), at most about `MAX_RAYS`."""
+        """Both ends of at most `MAX_RAYS` sample rays, local, metres: (n, 2, 3)."""
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
     def planned(self) -> dict[str, Any] | None:
-        """Planned path and its obstacles; None without a path."""
+        """Planned path and discs (x, y, radius) of obstacles, local metres; None without a path."""
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
             return None
@@ -329,7 +355,7 @@ class View:
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
-        """Return {object: class}, from a sample of the points."""
+        """Return {number of an object: class of one of its points}, from a sample of the points."""
         if not {"object", "class"} <= self.columns.keys():
             return {}
         rows, _ = self._finder.find(_SAMPLE)
@@ -337,7 +363,10 @@ class View:
         return dict(zip(*columns, strict=True))
 
     def _export(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Write the points for a filter and ranges of scans to a file; several files to a ZIP."""
+        """Return a file with the points for a filter and ranges of scans; a ZIP for several files.
+
+        The answer has an error instead if points are too many, or the format refuses the points.
+        """
         ending = arguments["format"]
         if self.downloads is None or ending not in self._export_formats:
             raise KeyError(ending)
@@ -347,12 +376,14 @@ class View:
             MAX_POINTS, *self._read_selection(arguments), None, abandoned
         )
         if count > MAX_POINTS:
-            words = f"{count:,} points are more than {MAX_POINTS:,}: filter or clip them, or use"
-            return {"error": f"{words} lidarpool export for all."}, {}
+            message = f"{count:,} points are more than {MAX_POINTS:,}: filter or clip them, or use"
+            return {"error": f"{message} lidarpool export for all."}, {}
         columns = {column.name: points.values(column.name, rows) for column in points.table}
-        world = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
-        further = tuple(column for column in points.table if column.name not in TABLE)
-        cloud = Cloud(world, columns, further, None if sweeps is None else lambda: sweeps)
+        world_positions = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
+        extra_columns = tuple(column for column in points.table if column.name not in TABLE)
+        cloud = Cloud(
+            world_positions, columns, extra_columns, None if sweeps is None else lambda: sweeps
+        )
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             path = Path(folder) / f"cloud.{ending}"
             try:
@@ -379,7 +410,11 @@ class View:
         return point_filter, read_scans(arguments["scans"]) if "scans" in arguments else None
 
     def _points(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Return points for a filter, ranges of scans and a camera, with their colours."""
+        """Return points for a filter, ranges of scans and a camera (`Eye`), with their colours.
+
+        Positions are local, metres; rows are indices of the points. "count" is the number of points
+        before the points are thinned out.
+        """
         finder = self._finder
         version = self.version
         selection = self._read_selection(arguments)
@@ -405,7 +440,10 @@ class View:
     def _colouring(
         self, finder: PointFinder, name: str, point_filter: Filter, abandoned: Callable[[], bool]
     ) -> Colouring:
-        """Return the colour scale of all points that a filter keeps, of any scan."""
+        """Return the colour scale of a column, the same for all scans.
+
+        The scale is taken from a sample of all points that the filter keeps.
+        """
         colourings = self._colourings
         colouring = colourings.get((name, point_filter))
         if colouring is None:
@@ -420,7 +458,7 @@ class View:
         return colouring
 
     def _column(self, name: str) -> Answer:
-        """Return the limits of a column, or its labels, for filters."""
+        """Return the limits of a column, or its labels and their values, for the page's filters."""
         column = self.columns[name]
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         values = values[np.isfinite(values)]
@@ -465,30 +503,37 @@ class View:
         return f"{number} {column.unit}".rstrip()
 
     def _scene(self, colour: str) -> Answer:
-        """Return triangles of the scene in their colours, and the heights of floor and cut."""
+        """Return the static triangles of the scene in their colours.
+
+        The header has the legend, and the heights of the floor and of the cut that takes off a
+        roof. `colour` is a name of `colours_for`.
+        """
         pictured = self.pictured
         if pictured is None:
             raise KeyError("surface")
-        with self._lock:  # browsers wait for the first, which may take long
+        with self._lock:  # simplifying may take long: only the first browser's question does so
             surface = self._surface = self._surface or ShownSurface(
                 pictured.scene, pictured.reflectance, self.triangles
             )
-        counts = pictured.hit_counts
+        hit_counts = pictured.hit_counts
         hit_points = np.zeros((0, 3), np.float32)
         if colour == "hits":
-            counts = counts if self.hits is None else self.hits()
-            counts = counts[: len(pictured.scene.faces)]
+            hit_counts = hit_counts if self.hits is None else self.hits()
+            hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
             rows, _ = self._finder.find(_HITS_SAMPLE)
             if "object" in self.columns:  # points on static objects only
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             hit_points = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
-        arrays, legend = surface.coloured(colour, counts, hit_points)
-        return {"legend": legend} | self._look_around, arrays
+        arrays, legend = surface.coloured(colour, hit_counts, hit_points)
+        return {"legend": legend} | self._floor_and_roof_cut, arrays
 
     @cached_property
-    def _look_around(self) -> dict[str, float | None]:
-        """Height of the floor, and of the cut that opens a building around the sensors."""
+    def _floor_and_roof_cut(self) -> dict[str, float | None]:
+        """Heights of the floor under the sensors, and of the cut that takes off a roof above them.
+
+        Local z, metres. None without sensors, floor or roof. Asked for after `_surface` is set.
+        """
         surface = self._surface
         pictured = self.pictured
         poses = [sensor.positions for sensor in self.sensors if len(sensor.positions)]
@@ -500,57 +545,64 @@ class View:
         return {"floor": floor, "roof_cut": cut}
 
     def _range(self, sweep: int) -> Answer:
-        """Return the range image of a sweep, rows from above, columns from left to right."""
+        """Return the range image of a sweep (number in `sweeps`), as of `range_image`.
+
+        "low" and "high" are the ends of the scale of ranges, metres, for all sweeps of a sensor.
+        """
         sweeps = self.sweeps
         finder = self._finder
         if sweeps is None or not 0 <= sweep < len(sweeps):
             raise KeyError(sweep)
-        first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
-        rows, _ = finder.find(MAX_POINTS, scans=((first, last - 1),))
+        first_scan, next_scan = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
+        rows, _ = finder.find(MAX_POINTS, scans=((first_scan, next_scan - 1),))
         image = np.zeros((1, 1, 4), np.uint8)
         limits = (0.0, 1.0)
-        number = int(sweeps.sensor[sweep])
+        sensor = int(sweeps.sensor[sweep])
         if len(rows):
             local = sweeps.in_sensor(sweep, positions(finder.points, rows))
             channels = None
             if "channel" in self.columns:
                 channels = finder.points.values("channel", rows).astype(np.int64)
             ranges = np.linalg.norm(local, axis=1)
-            if number not in self._range_limits:  # one scale for all sweeps of a sensor
+            if sensor not in self._range_limits:  # one scale for all sweeps of a sensor
                 lower, upper = np.percentile(ranges, [1, 99])
-                self._range_limits[number] = float(lower), float(upper)
-            limits = self._range_limits[number]
+                self._range_limits[sensor] = float(lower), float(upper)
+            limits = self._range_limits[sensor]
             image = range_image(local, ranges, channels, limits)
-        return {"low": limits[0], "high": limits[1], "sensor": number}, {"image": image}
+        return {"low": limits[0], "high": limits[1], "sensor": sensor}, {"image": image}
 
 
 def range_image(
     points: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
 ) -> Bytes:
-    """Return a range image of points in the sensor frame, RGBA (rows, columns, 4).
+    """Return a range image of points, RGBA (rows, columns, 4).
+
+    `points` (n, 3) are in the sensor frame, `ranges` (n,) their distances from the sensor, metres;
+    `channels` (n,) are None if unknown; `limits` are the ranges at the ends of the colour scale.
 
     Of several points in a pixel the nearest is shown. Rows are channels, the highest above, or
     steps of elevation if the sensor has few or very many channels. Columns are steps of azimuth
     from left to right. A sensor that looks down has a single row, of angles across its trajectory.
     Empty pixels are transparent.
     """
-    downwards = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
-    azimuth = np.arctan2(points[:, 1], -points[:, 2] if downwards else points[:, 0])
-    azimuth_left = float(azimuth.max())
-    azimuth_right = float(azimuth.min())
-    if azimuth_left - azimuth_right > _MAX_FIELD_RAD:
-        azimuth_left = math.pi
-        azimuth_right = -math.pi
-    field = azimuth_left - azimuth_right
-    if downwards:
+    looks_down = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
+    azimuth = np.arctan2(points[:, 1], -points[:, 2] if looks_down else points[:, 0])
+    left_rad = float(azimuth.max())
+    right_rad = float(azimuth.min())
+    if left_rad - right_rad > _MAX_FIELD_RAD:
+        left_rad = math.pi
+        right_rad = -math.pi
+    field_rad = left_rad - right_rad
+    if looks_down:
         row_count = 1
         row = np.zeros(len(points), np.int64)
     else:
         row, row_count = _image_rows(points, ranges, channels)
-    fullest = azimuth[row == np.bincount(row).argmax()]
-    spacing = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider
-    width = int(np.clip(_COLUMN_SHARE * field / max(spacing, 1e-9), 32, _IMAGE_WIDTH))
-    column = ((azimuth_left - azimuth) * (width / max(field, 1e-9))).astype(np.int64)
+    fullest_row_azimuth = azimuth[row == np.bincount(row).argmax()]
+    # Mean step of azimuth in the row with the most points; columns are a little wider.
+    spacing_rad = float(np.ptp(fullest_row_azimuth)) / len(fullest_row_azimuth)
+    width = int(np.clip(_COLUMN_SHARE * field_rad / max(spacing_rad, 1e-9), 32, _IMAGE_WIDTH))
+    column = ((left_rad - azimuth) * (width / max(field_rad, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
     image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]
@@ -558,7 +610,7 @@ def range_image(
 
 
 def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
-    """Return the rows (n,) of points in a range image, and the number of rows."""
+    """Return the rows (n,) of points in a range image, 0 at the top, and the number of rows."""
     if channels is not None:
         count = int(channels.max()) + 1
         if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
@@ -579,7 +631,10 @@ def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats]:
-    """Return an origin in whole metres close to the points, and their box without outliers."""
+    """Return an origin (3,) for points, and their local box (2, 3) without outliers, metres.
+
+    Each coordinate of the origin is 0, or whole metres for points farther than 10 km from 0.
+    """
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
         return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
@@ -615,6 +670,8 @@ class ShownSurface:
     ) -> tuple[dict[str, AnyArray], Legend | None]:
         """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and a legend.
 
+        Corners are local, metres; objects are indices of static objects.
+
         `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
         a sample of the hit points, (n, 3). There are no colours for "grey", which the page defines.
         """
@@ -640,7 +697,11 @@ class ShownSurface:
     def _coloured_by_hits(
         self, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays and the legend of `coloured` by hits (f,) of the scene's triangles."""
+        """Return the arrays and the legend of `coloured`, for hits per square metre.
+
+        `hit_counts` (f,) are of the original scene's triangles; `points` (n, 3) are a sample of
+        hits, local, metres. Large triangles are divided, so that pieces show where the hits are.
+        """
         is_shown = self._replacements >= 0
         hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
         max_pieces = len(self.corners) + MAX_PIECES
@@ -658,7 +719,10 @@ class ShownSurface:
 
 
 def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
-    """List the colourings of a scene, with reflectance and its own colours if there are any."""
+    """Return the names by which `ShownSurface.coloured` can colour a scene.
+
+    "reflectance" needs several values (objects,), "colour" a scene with colours.
+    """
     scene_colours = ("colour",) if scene.coloured else ()
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
@@ -690,7 +754,7 @@ def legend_of(colouring: Colouring) -> Legend:
 
 
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
-    """Return the legend of a scale of colours (n, 3), with evenly spread marks."""
+    """Return the legend of a scale of colours (n, 3), 0 to 1, with evenly spread marks."""
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
 
 
@@ -723,13 +787,15 @@ def show_view(view: View, *, port: int, browser: bool = True) -> None:
 
 
 def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
-    """Open results of a place as a view, with the scene, sensors and actors of the first result.
+    """Open results of surveys of the same scene as a view of all their points.
+
+    The scene, sensors and actors are those of the first result.
 
     The view can be played if the sweeps of all results start at the same times. LidarError if a
     result has no cloud, a damaged cloud, or points in the frames of the sensors.
     """
-    first, *further = views = [open_result(path, downloads) for path in paths]
-    if not further:
+    first, *other_views = views = [open_result(path, downloads) for path in paths]
+    if not other_views:
         return first
     if IN_SENSOR_AXES in (notes := [view.note for view in views]):
         raise LidarError(
