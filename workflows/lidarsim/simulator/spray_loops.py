@@ -106,7 +106,7 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 
 
 @compiled()
-def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: C901, PLR0914 - a compiled loop
+def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
     """Write where rays (6, n), which end at `reach` (n,), metres, cross boxes; return the number.
 
     Rows of rays are origins and directions; `pairs` are `CellPairs`. As many crossings are written

@@ -523,7 +523,7 @@ def _is_apart(apart, first, end):
 
 
 @compiled()
-def divide(hits, sigma_m, neighbours, parts):  # noqa: PLR0914 - a compiled loop
+def divide(hits, sigma_m, neighbours, parts):
     """Mark where waveforms start, and write the rows of waveforms to search; return their number.
 
     Hits that are together, and yet not narrow, are searched unless they are on one surface. `hits`
@@ -608,7 +608,7 @@ def _peak_of_hit(time, wave, stops, count):
 
 
 @compiled()
-def search(light, parts, sampling, starts, peaks, scratch):  # noqa: PLR0914 - a compiled loop
+def search(light, parts, sampling, starts, peaks, scratch):
     """Find the peaks of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` each.
 
     `light` is a `WaveLight`, `sampling` a `WaveSampling`, and `scratch` a `SearchScratch`. Writes
