@@ -266,7 +266,8 @@ class _Chunk:
     def _poses_and_boxes(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
         """Return the poses and the boxes of bodies (b,) of a shape at times (t,).
 
-        `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the bodies' paths.
+        `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of
+        bodies.
         """
         from .moving_loops import PADS_M
 

@@ -27,6 +27,7 @@ from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..scenario.build import Job
 from .cluster.cluster import Cluster
+from .cluster.watch import Watch
 from .job_source import JobMaker, failed_row
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
@@ -327,22 +328,8 @@ class RunLoop:
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
-            moved = False
-            if not pipeline.stages.closed:
-                moved = self.step()
-                if pipeline.progress:
-                    timeline.mark(timeline.FIRST_RECEIPT)
-                if self.finished:
-                    pipeline.close()
-                    self.times["survey"] = time.monotonic() - started
-                    timeline.mark(timeline.LAST_RECEIPT)
-                    watch.forget([GPU, LIDAR])
-            if self._trials is not None and "planning" not in self.times:
-                moved |= self._trials.step()
-                if self._trials.finished:
-                    self.times["planning"] = time.monotonic() - started
-                    timeline.mark(timeline.PLANNED)
-                    watch.forget([OTHER])
+            moved = self._step_survey(started, watch)
+            moved |= self._step_planning(started, watch)
             now_s = time.monotonic()
             if now_s - saved_at >= SAVE_EVERY_S:
                 saved_at = now_s
@@ -350,10 +337,7 @@ class RunLoop:
             watch.look()
             if now_s - shown_at >= PROGRESS_EVERY_S or self.finished:
                 shown_at = now_s
-                waits_for = LIDAR if pipeline.stages.waiting else ""
-                progress = replace(self._progress(), seconds=now_s - started, waits_for=waits_for)
-                self._cluster.call(show, progress)
-                self._cluster.call(self._page.on_progress, progress, self.under_way)
+                self._show_progress(show, now_s - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
             if pipeline.stages.ended:
                 time.sleep(pause_s)
@@ -362,6 +346,42 @@ class RunLoop:
                     pause_s, [future.key for tasks in tasks_beside for future in tasks.running]
                 )
         self._store.notes += watch.notes
+
+    def _step_survey(self, started: float, watch: Watch) -> bool:
+        """Step pipeline and writer until all jobs have ended; return True if anything moved.
+
+        `started` is the time when the loop started, by the monotonic clock, seconds.
+        """
+        pipeline = self._pipeline
+        if pipeline.stages.closed:
+            return False
+        moved = self.step()
+        if pipeline.progress:
+            timeline.mark(timeline.FIRST_RECEIPT)
+        if self.finished:
+            pipeline.close()
+            self.times["survey"] = time.monotonic() - started
+            timeline.mark(timeline.LAST_RECEIPT)
+            watch.forget([GPU, LIDAR])
+        return moved
+
+    def _step_planning(self, started: float, watch: Watch) -> bool:
+        """Step the trials until all have finished; return True if anything moved."""
+        if self._trials is None or "planning" in self.times:
+            return False
+        moved = self._trials.step()
+        if self._trials.finished:
+            self.times["planning"] = time.monotonic() - started
+            timeline.mark(timeline.PLANNED)
+            watch.forget([OTHER])
+        return moved
+
+    def _show_progress(self, show: Show, seconds: float) -> None:
+        """Show the counts of the run and its time so far, at the terminal and on the page."""
+        waits_for = LIDAR if self._pipeline.stages.waiting else ""
+        progress = replace(self._progress(), seconds=seconds, waits_for=waits_for)
+        self._cluster.call(show, progress)
+        self._cluster.call(self._page.on_progress, progress, self.under_way)
 
     def _save(self) -> None:
         """Store finished trials, and the number of frames handed out, in the run's database."""

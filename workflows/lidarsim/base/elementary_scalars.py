@@ -15,7 +15,7 @@ import numpy as np
 _POWERS_OF_TWO = np.ldexp(1.0, np.arange(-539, 514))
 
 
-def sin_cos_of(x: float) -> tuple[float, float]:
+def sin_cos_of(x: float) -> tuple[float, float]:  # noqa: PLR0914 - compiled loops inline it
     """Return sine and cosine of an angle in radians, below 2^50."""
     if not 0.0 < abs(x) < math.inf:
         return (x, 1.0) if x == 0.0 else (math.nan, math.nan)

@@ -112,7 +112,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
     of a task (`batch.share` is 0.5) counts as half a task, `per_task / 2`. A batch counts as 1 at
     least.
     """
-    return sum([max(1.0, per_task * batch.share) for batch in batches])
+    return sum(max(1.0, per_task * batch.share) for batch in batches)
 
 
 def max_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
