@@ -43,11 +43,12 @@ chaos: dev  ## 200 faults at every point of a survey, and damage of files; SEED=
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint: dev docs  ## format check, lint, types, layer contracts, documentation; prints lines per package
+lint: dev docs  ## format check, lint, types, layers, names, documentation; prints lines per package
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python .ci/readability.py
 	$(BIN)/python .ci/lines.py
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error
