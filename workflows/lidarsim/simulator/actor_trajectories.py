@@ -19,16 +19,19 @@ if TYPE_CHECKING:
 
 
 class _StraightTrack(NamedTuple):
-    """A straight track, or a station, which is a track of a single segment."""
+    """A track of s straight segments; poses of an actor that stands are a single segment."""
 
-    times_s: Floats  # (s + 1,): start of each segment, and the end
-    start_s: float  # start of the track by its clock
-    slack_s: float  # how far outside its times a pose may be asked for; inf for any time
-    segments: tuple[Floats, ...]  # see `Track.segments`
+    times_s: Floats  # (s + 1,): start of each segment, and end of the last, by the track's clock
+    start_s: float  # time of the track's clock at the survey's start, seconds
+    slack_s: float  # how far outside `times_s` poses are defined, seconds; inf for any time
+    segments: tuple[Floats, ...]  # the fields of `trajectory.Segments`; the first four are used
 
 
 def _straight_track(trajectory: Trajectory) -> _StraightTrack | None:
-    """Return the straight track of a trajectory or station; None for curved trajectories."""
+    """Return the straight track of a `Track` or of the first of `Stations`.
+
+    None for smooth tracks and for trajectories of other classes.
+    """
     if isinstance(trajectory, Track) and not trajectory.smooth:
         return _StraightTrack(
             trajectory.times_s,
@@ -46,9 +49,13 @@ def _straight_track(trajectory: Trajectory) -> _StraightTrack | None:
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of actors."""
+    """Trajectories of actors, by their numbers; or of a carrier alone.
 
-    animated: Mapping[int, Actor] = MappingProxyType({})  # {number: actor that deforms}
+    Only `from_actors` sets `animated`.
+    """
+
+    # {number of the actor: actor whose mesh an animation deforms}
+    animated: Mapping[int, Actor] = MappingProxyType({})
 
     @classmethod
     def from_actors(cls, actors: Iterable[Actor]) -> ActorTrajectories:
@@ -60,31 +67,36 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         }
         return trajectories
 
-    def deforming(self, number: Integers) -> Indices:
-        """Return the rows of `number` (n,) that are actors whose mesh has an animation."""
+    def deforming(self, actors: Integers) -> Indices:
+        """Return the rows (k,) of `actors` (n,), numbers, whose mesh an animation deforms."""
         animated = list(self.animated)
         if not animated:
             return np.zeros(0, np.intp)
-        return np.flatnonzero(np.isin(number, animated))
+        return np.flatnonzero(np.isin(actors, animated))
 
-    def played(self, number: Integers, times_ns: Floats | Ints) -> Floats:
-        """Return the frames of actors `number` (n,) at times (n,), and frames a second: (2, n)."""
-        frames = np.zeros((2, len(number)))
-        for actor in np.unique(number).tolist():
-            rows = np.flatnonzero(number == actor)
+    def played(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
+        """Return the positions in the animations of actors at times, and their rates: (2, n).
+
+        `actors` (n,) are numbers of actors with an animation; times (n,) are nanoseconds since the
+        survey's start. Positions are animation frames, with fractions; rates are frames per second.
+        """
+        frames = np.zeros((2, len(actors)))
+        for actor in np.unique(actors).tolist():
+            rows = np.flatnonzero(actors == actor)
             frames[:, rows] = self.animated[actor].played(times_ns[rows].astype(np.float64))
         return frames
 
     @cached_property
     def presence_ns(self) -> Floats:
-        """First and last time of each actor in the scene, nanoseconds: (w, 2)."""
+        """First and last time of each of w actors in the scene, nanoseconds: (w, 2)."""
         presence = [presence_ns(trajectory) for trajectory in self]
         return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
         """Return the poses of trajectories `number` (n,) at times (n,), nanoseconds: (12, n).
 
-        A pose is a position, and a rotation by rows, with the bits of `Trajectory.poses`.
+        A pose is a position, metres, and a rotation matrix by rows, with the bits of
+        `Trajectory.poses`. Times count from the start of the trajectory: for actors, the survey's.
 
         Raises
         ------
@@ -100,7 +112,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         outside = surface_loops.poses_on_tracks(
             owned(number, np.int64), owned(times_ns), tracks, table
         )
-        if outside >= 0:  # which raises the error
+        if outside >= 0:  # `poses` raises the LidarError
             self[number[outside]].poses(0, times_ns[number == number[outside]])
         not_straight = np.flatnonzero(tracks.member[number] < 0)
         for trajectory in np.unique(number[not_straight]).tolist():
@@ -126,11 +138,10 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Return the poses (12, m) of runs of rows, and the run of each row (n,).
+        """Return the poses (12, m) of runs of rows, as `table`, and the run of each row (n,).
 
-        In a run of rows, trajectory and time are equal.
-
-        Poses are positions, and rotations by rows. Rows with numbers below 0 have the run -1.
+        A run is rows that follow each other, with the same trajectory and time, and thus the same
+        pose. Rows with numbers below 0 have no trajectory: they have the run -1, and end no run.
         """
         from . import surface_loops
 
@@ -142,7 +153,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def _tracks(self) -> TrackTable:
-        """Straight tracks among the trajectories, for loops."""
+        """Straight tracks among the trajectories, for compiled loops."""
         from .surface_loops import TrackTable
 
         straight_tracks = [_straight_track(trajectory) for trajectory in self]
@@ -151,7 +162,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         counts = np.array([len(track.times_s) - 1 for track in tracks], np.int64)
 
         def joined(part: int, *shape: int) -> Floats:
-            """Concatenate a part of the segments of all tracks."""
+            """Concatenate field `part` of the segments of all tracks: (*shape, s)."""
             empty = np.zeros((*shape, 0))
             return np.concatenate([empty, *(track.segments[part] for track in tracks)], axis=-1)
 

@@ -1,4 +1,4 @@
-"""Columns of a batch: of the returns of its scans, station after station."""
+"""Columns of a batch, from the returns of its scans."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from .points import BatchPoints
 
 
 def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
-    """Return the columns of the returns of consecutive scans, with the hits of each triangle."""
+    """Return the stored columns of a batch, with the number of hits of each triangle.
+
+    `batches` are the returns of consecutive scans in order, as `Rig.cast` yields them: separate for
+    each sensor and station. All are of the same survey.
+    """
     columns = {
         column.name: _joined([returns.column(column) for returns in batches])
         for column in batches[0].survey.stored_columns
     }
-    triangles, hits = batches[0].tally
+    triangles, hits = batches[0].tally  # counters that are not 0, and their hits
     if len(batches) > 1:
         all_triangles, counts = map(
             np.concatenate, zip(*(returns.tally for returns in batches), strict=True)

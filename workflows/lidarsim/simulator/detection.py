@@ -1,4 +1,4 @@
-"""Detection: which signals of a receiver pass its threshold, and which returns are lost."""
+"""Detection: which signals pass the threshold of a receiver, and which returns drop out."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ LOSS = Purpose(5, "whether a return is lost")
 
 
 class DetectionStep(PulseStep):
-    """Drops weak returns of waveforms, and a share of all returns.
+    """Drops weak returns of waveforms, and a random share of all returns, `Noise.dropout`.
 
-    Without waveforms, `SeparationStep` drops them.
+    Without waveforms, `SeparationStep` drops the returns by the same function, `detected`.
     """
 
     role = Role.CHANGES
@@ -27,7 +27,7 @@ class DetectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the noise loses returns and returns are found in waveforms."""
+        """Return True if the noise can lose returns and returns are found in waveforms."""
         return setup.noise.loses and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
@@ -40,7 +40,10 @@ class DetectionStep(PulseStep):
 def detected(
     noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
 ) -> Bools:
-    """Return whether returns (n,) are detected: (n,).
+    """Return whether returns (n,) of some energy are detected: (n,).
+
+    `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (number in the
+    scan) and `number` (number in the ray, from 0) are the keys of the random numbers.
 
     The signal with its normally distributed noise has to pass a threshold: at an energy equal to
     the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a fifth of
@@ -60,6 +63,9 @@ def passes(
     ray: Integers,
     number: ArrayLike = 0,
 ) -> Bools:
-    """Return whether signals (n,) with their noise pass the threshold, see `detected`: (n,)."""
+    """Return whether signals (n,) with their noise pass the threshold: (n,).
+
+    The arguments are those of `detected`; the random numbers of the noise are of a purpose.
+    """
     signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
     return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

@@ -1,4 +1,4 @@
-"""Poses of a carrier at each firing, and its motion until the next firing."""
+"""Poses of a carrier or of a sensor's head at each firing, and the motion until the next firing."""
 
 from __future__ import annotations
 
@@ -18,24 +18,28 @@ from ..sensor import Mounted, ScanSpec, Sensor, Trajectory
 from ..sensor.trajectory import velocities
 from .actor_trajectories import ActorTrajectories
 
-RING = 16  # neighbours along a ring
+RING_FIRINGS = 16  # firings whose rays `along_rings` orders by rings
 
 
 @dataclass(frozen=True)
 class Clock:
     """Firing times of rays, in nanoseconds, and the trajectories that are followed meanwhile.
 
-    The times of actors count from the start of the survey, of a carrier from its station's start.
+    The times count from the start of the survey if the trajectories are of actors, and from the
+    start of the station if the trajectory is of the carrier.
     """
 
-    firing_starts: Floats  # (f,): of each firing
-    delays: Floats  # (m,): of each ray of a firing
+    firing_starts: Floats  # (f,): start of each firing, nanoseconds
+    delays: Floats  # (m,): of each of the m rays of a firing after its start, nanoseconds
     trajectories: ActorTrajectories  # of the actors, or of the carrier alone
-    start: int = 0  # number of the first ray
-    subrays: int = 1  # of each ray
+    start: int = 0  # number of the ray from which `times` counts, from 0 at the first firing
+    subrays: int = 1  # sub-rays of a ray, as `times` numbers them
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of rays (n,): (n,)."""
+        """Return the firing times of sub-rays (n,), nanoseconds: (n,).
+
+        Sub-ray k is of ray ``start + k // subrays``.
+        """
         from . import surface_loops  # not before: numba takes half a second to import
 
         times_ns = np.empty(len(ray))
@@ -50,7 +54,7 @@ class Clock:
         return times_ns
 
     def part(self, start: int, subrays: int) -> Clock:
-        """Return the clock of the sub-rays of the rays from number `start` on."""
+        """Return a clock whose `times` takes sub-rays, from 0 at ray `start`, `subrays` a ray."""
         return replace(self, start=start, subrays=subrays)
 
 
@@ -64,12 +68,15 @@ class Firings:
 
     @classmethod
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
-        """Return the firings of consecutive scans, all together `repetitions` times."""
+        """Return the firings of consecutive scans; the whole sequence `repetitions` times."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return cls(sensor, np.tile(numbers, repetitions), specs[0])
 
     def times(self, ray: Integers) -> Ints:
-        """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,)."""
+        """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,).
+
+        Rays are numbered from 0 at the first firing.
+        """
         clock = Clock(
             self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
         )
@@ -79,16 +86,19 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
+    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier.
 
-    positions: Floats  # (p, 3), or (3,) for all rays
-    rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays
+    Rotations are from the frame of the head or carrier to the scene frame.
+    """
+
+    positions: Floats  # (p, 3), or (3,) for all rays, metres
+    rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays; None for the identity
     rays_per_pose: int | None = None  # None for a single pose
-    motion: PoseMotion | None = None
-    clock: Clock | None = None  # of the actors
+    motion: PoseMotion | None = None  # from each pose to the next
+    clock: Clock | None = None  # of the actors; None without actors
     by_head: bool = False  # whether the poses are of the head
-    carrier: Clock | None = None  # of a carrier that moves; for its velocities
-    station: int = 0  # of the carrier
+    carrier: Clock | None = None  # of a carrier that moves, for its velocities; else None
+    station: int = 0  # of the trajectory of `carrier`
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
@@ -115,7 +125,11 @@ class CastPoses:
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
     def part(self, start: int, stop: int, subrays: int) -> CastPoses:
-        """Return the poses of the sub-rays of rays `start` to `stop`, both at ends of poses."""
+        """Return the poses of the sub-rays of rays `start` to `stop`, `subrays` of each ray.
+
+        Sub-rays are numbered from 0 at ray `start`. The rays are those of complete poses: `start`
+        is the first ray of a pose, and `stop` follows the last ray of a pose or of all rays.
+        """
         rays_per_pose = self.rays_per_pose
         motion = self.motion
         clock = None if self.clock is None else self.clock.part(start, subrays)
@@ -138,9 +152,11 @@ class CastPoses:
         )
 
     def drift(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities of the carrier at origins of rays (n, 3), m/s: (n, 3).
+        """Return the velocities of points of the carrier at origins of rays (n, 3), m/s: (n, 3).
 
-        The motion of a rotating head is left out: a sensor corrects its own rotation.
+        `ray` (n,) are the numbers of the rays, which have the times; origins and velocities are in
+        the scene frame; zeros if the carrier stands. The motion of a rotating head is left out: a
+        sensor corrects its own rotation.
         """
         if self.carrier is None:
             return np.zeros((len(ray), 3))
@@ -151,13 +167,21 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays of a pattern, see `raybeam.pattern_rays`."""
+        """Return origins and directions (n, 3) of rays (n,) of a pattern, in the scene frame.
+
+        Ray k is row ``start + k`` of the pattern, which repeats, see `raybeam.pattern_rays`.
+        """
         return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
 
-def along_rings(beam: Ints, channels: int) -> Indices:
-    """Return an order of beams in which `RING` neighbours along a ring are consecutive."""
-    ring = beam // (RING * channels) * channels + beam % channels
+def along_rings(ray: Ints, channels: int) -> Indices:
+    """Return the order of rays (n,) in which neighbours along a ring follow each other.
+
+    `ray` (n,) are numbers of rays, in the order of firings and channels. The rays of every
+    `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbours
+    are near each other in the scene.
+    """
+    ring = ray // (RING_FIRINGS * channels) * channels + ray % channels
     return np.argsort(ring.astype(np.uint16), kind="stable")  # uint16: a tenth of the time
 
 
@@ -176,15 +200,17 @@ def check_trajectory(path: Trajectory) -> None:
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
 ) -> CastPoses:
-    """Return the poses of a sensor's beams in firings `first` to `stop`.
+    """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
 
-    If a head turns all beams, the poses are of the head, and the rays of one firing serve for
-    all firings. Otherwise the poses are of the carrier.
+    If a head rotates all beams, see `Sensor.spins`, the poses are of the head, and the rays of one
+    firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
+    the first beam of a firing. If all beams start at the same point of a head, the positions are
+    those of this point, `Sensor.centre`, else of the head frame's origin.
 
     Later beams of a firing start from the carrier's position at the time of the beam: the carrier
     moves evenly from each firing to the next. A pose for each beam would take as long as casting.
 
-    There is no motion if the carrier stands, or if all beams of a firing are fired at once.
+    `motion` is None if the carrier stands, or if all beams of a firing are fired at once.
     `late_ns` nanoseconds are added to the times of the firings to find the carrier's poses.
     """
     sensor = carried.sensor
@@ -224,9 +250,10 @@ def poses_of_firings(
 
 
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
-    """Return the rotations of the head for rotations of the carrier (k, 3, 3).
+    """Return the rotations (k, 3, 3) from the head frame to the scene frame.
 
-    `spins` (2, k) are the cosines and sines of the head's azimuths.
+    `rotations` (k, 3, 3) are those from the carrier frame; `spins` (2, k) are the cosines and sines
+    of the head's azimuths.
     """
     if carried.mount.rotation is not None:
         rotations = matmul(rotations, carried.mount.rotation)
@@ -236,7 +263,7 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Multiply matrices (k, 3, 3) by rotations about z of cosines and sines (2, k)."""
+    """Return matrices (k, 3, 3) times rotations about z, of cosines and sines `spins` (2, k)."""
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
@@ -249,9 +276,10 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 
 
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
-    """Return the rotation vectors (k, 3), radians, between close matrices (k, 3, 3).
+    """Return the rotation vectors (k, 3), radians, from matrices to close matrices (k, 3, 3).
 
-    Half the sum of the cross products of corresponding axes: its length is the sine of the angle.
+    The vectors are in the scene frame, to which the matrices lead. They are half the sum of the
+    cross products of corresponding axes, whose length is the sine of the angle.
     """
     vectors = np.empty((3, len(earlier))).T
     for axis in range(3):

@@ -36,19 +36,26 @@ MAX_REFLECTIONS = 2  # of light, which a mirror may divide each time
 
 @dataclass
 class LightPaths:
-    """Light of sub-rays on its path: arrays (n,), vectors (n, 3)."""
+    """Straight pieces of the paths of sub-rays: arrays (n,), vectors (n, 3) in the scene frame.
 
-    ray: Ints  # number of the sub-ray
-    times: Floats
-    origins: Floats
-    directions: Floats
-    share: Floats  # of the energy that returns, without the scattering of the last surface
-    optical_start: Floats  # optical path up to the origin
-    # Products of the reflections so far, (n, 3, 3), if there are mirrors.
+    The first piece starts at the sensor, each later piece just behind a surface that transmits or
+    mirrors the light.
+    """
+
+    ray: Ints  # number of the sub-ray, from 0 at the start of the batch
+    times: Floats  # firing times, nanoseconds since the survey's start; 0 without actors
+    origins: Floats  # starts of the pieces, metres
+    directions: Floats  # unit vectors
+    # Share of the energy that the earlier surfaces pass, on the way out and back: 1 at the sensor.
+    share: Floats
+    optical_start: Floats  # optical path from the sensor to the origins, metres
+    # (n, 3, 3): product of the reflections so far, which turns directions as they were fired into
+    # directions of the pieces. None if no light is reflected, and for beams of a single sub-ray.
     mirror_matrices: Floats | None = None
     mirrored: Bytes | None = None  # number of reflections so far, if there are mirrors
     in_media: LightInMedia | None = None  # if there are media
-    # Growth of the optical path, m/s, without the motion of its end, if there are velocities.
+    # Growth of the optical path by the motions of the sensor and of the earlier surfaces, m/s, as
+    # if the next surface stood still; None if no column stores velocities.
     range_rate: Floats | None = None
 
     def take(self, rows: Integers) -> LightPaths:
@@ -56,90 +63,99 @@ class LightPaths:
         return LightPaths(*selected(vars(self).values(), rows))
 
     def optical_end(self, step_m: Floats) -> Floats:
-        """Return the optical paths up to distances (n,) from the origins, metres: (n,)."""
+        """Return the optical paths from the sensor to distances (n,) from the origins, metres."""
         return self.optical_start + (
             step_m if self.in_media is None else self.in_media.optical(step_m)
         )
 
     @property
     def index(self) -> Floats | float:
-        """Refractive index around the light."""
+        """Refractive index around the light (n,), or 1.0 without media."""
         return 1.0 if self.in_media is None else self.in_media.index
 
 
 class CastLight(NamedTuple):
-    """Light and the surfaces at its end: arrays (n,)."""
+    """Light that hits a surface, and the surfaces that it hits: arrays (n,)."""
 
     light: LightPaths
-    start_m: Floats  # where a hit may be at the nearest, metres from the origin
-    step_m: Floats  # distance of the surface from the origin, metres
-    triangle: Ints32
+    # Leaves are met from here on, metres from the origin: from the sensor's smallest range, or
+    # from the surface that the light left, which is at or below 0.
+    start_m: Floats
+    step_m: Floats  # distance of the hit from the origin, metres
+    triangle: Ints32  # number of the triangle, see `SceneCaster`
 
 
 class SurfaceHits(NamedTuple):
-    """Hits of light on surfaces and leaves: arrays (n,), vectors (n, 3)."""
+    """Hits of light, one for each row of the light: arrays (n,), vectors (n, 3)."""
 
-    step_m: Floats  # metres from the origin
-    triangle: Ints32
-    distance: Floats  # optical path
-    colour: UInts32 | None
-    normals: Floats
+    step_m: Floats  # metres from the origin of the last piece of the path
+    triangle: Ints32  # of a leaf: where the light entered the crown
+    distance: Floats  # optical path from the sensor, metres
+    colour: UInts32 | None  # packed, see `Surfaces.colours`; None if not needed
+    normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
     cosines: Floats  # of the angles between normals and directions, of either sign
-    kinds: Ints32  # rows of the table of materials
-    energy: Floats  # received
-    film: Bools | None  # whether there may be a film of water
-    leaves: Indices  # rows where light meets a leaf within a crown
+    kinds: Ints32  # kinds of surfaces: rows of the table of materials
+    energy: Floats  # that the sensor receives, in the unit of `Surfaces.energy`
+    film: Bools | None  # whether there may be a film of water; None if no surface is wet
+    leaves: Indices  # (l,): rows where light meets a leaf within a crown
     velocities: Floats  # of the surfaces; (0, 3) if they are not needed
 
 
 class VisibleHits(NamedTuple):
-    """Hits that the sensor may see, and the surfaces from which light continues."""
+    """The k hits that the sensor may see, and where the light of all n hits continues."""
 
-    hits: PulseReturns
-    normals: Floats  # (k, 3): of the hits, as the sensor sees them
-    transmits: Bools  # (n,): whether light continues through a surface
-    mirrors: Bools  # (n,): whether a surface mirrors light
+    hits: PulseReturns  # k rows; all hits, unless there are media
+    normals: Floats  # (k, 3): of the hits, mirrored back into the directions as fired
+    transmits: Bools  # (n,): whether light continues through the surface
+    mirrors: Bools  # (n,): whether the surface mirrors a part of the light
 
 
 class Crossings(NamedTuple):
-    """Surfaces that transmit or mirror light: arrays (n,), vectors (n, 3)."""
+    """Surfaces that transmit or mirror light: arrays (n,), vectors (n, 3).
+
+    A surface that does both is in two rows.
+    """
 
     step_m: Floats  # metres from the origin
-    distance: Floats  # optical path
+    distance: Floats  # optical path from the sensor, metres
     triangle: Ints32
     normals: Floats
     cosines: Floats  # of the angles between normals and directions, of either sign
-    reflected: Bools  # whether the surface mirrors the light
-    velocities: Floats | None  # of the surfaces: a moving surface that bends light shifts the range
+    reflected: Bools  # whether the light of the row is mirrored, else transmitted
+    # Velocities of the surfaces, m/s: a moving surface that bends light changes the range rate.
+    velocities: Floats | None
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues: arrays (k,)."""
+    """Rows of light that continues: arrays (k,); a row occurs twice where the light divides."""
 
     rows: Indices
-    reflected: Bools  # whether a surface mirrors the light
-    share: Floats  # of the energy that returns
+    reflected: Bools  # whether the light of the row is mirrored, else transmitted
+    share: Floats  # as `LightPaths.share`, behind the surface
 
 
 class Deflection(NamedTuple):
     """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
 
     directions: Floats
-    share: Floats  # of the energy that returns
+    share: Floats  # as `LightPaths.share`, behind the surface
     mirrored: Bools  # whether light is mirrored, also by total reflection
     twice_normals: Floats  # normals times 2 where light is mirrored, else 0
 
 
 class OnwardLight(NamedTuple):
-    """Light behind the surfaces of its last hits: arrays (n,)."""
+    """Light behind the surfaces of its last hits, before its next cast: arrays (n,)."""
 
     light: LightPaths
-    start_m: Floats  # distances of the surfaces from the origins, metres, at or below 0
-    path: Pattern
+    start_m: Floats  # positions of those surfaces along the light, metres, at or below 0
+    path: Pattern  # the rays to cast: origins and directions of `light`
 
 
 class CastStep(PulseStep):
-    """Casts the sub-rays, and makes hits of the surfaces that their light meets."""
+    """Casts the sub-rays, and makes hits where their light meets surfaces and leaves.
+
+    Light that a surface transmits or mirrors is cast again from the surface, and makes more hits.
+    """
 
     role = Role.FRAME
     effects = (
@@ -160,9 +176,10 @@ class CastStep(PulseStep):
         filled = table.leafy.any() or table.refracts.any()
         air = self._light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
-        # Ghosts of less energy are left out.
+        # Light that can return no more energy than this is not cast again, if there are mirrors.
         self._faintest = FAINTEST * setup.noise.threshold
         white = np.ones(len(table.reflectance))
+        # Largest energy that a kind of surface sends back from 10 m.
         self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
@@ -181,7 +198,7 @@ class CastStep(PulseStep):
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """Return the greatest number of ghosts of a pulse: each reflection may add a ghost."""
+        """Return the number of ghosts that a pulse can have, an upper bound of the mean number."""
         return MAX_REFLECTIONS * setup.has_mirrors
 
     @staticmethod
@@ -212,14 +229,14 @@ class CastStep(PulseStep):
 
     @property
     def _reach_m(self) -> float:
-        """Length of cast rays, metres.
+        """Greatest length of a cast ray, metres; inf if there are crowns.
 
-        The way through a crown ends at the far side of the crown, at any distance.
+        The path through a crown ends at the surface on its far side, at any distance.
         """
         return np.inf if self._leafy else self.setup.sensor.max_range_m
 
     def _draw(self, batch: PulseBatch) -> Draw:
-        """Return the function that draws random bits of sub-rays for a purpose."""
+        """Return the function `draw(purpose, ray)` of random bits of sub-rays `ray` (n,): (n,)."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
             scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
@@ -232,7 +249,8 @@ class CastStep(PulseStep):
     def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
         """Cast the sub-rays of a batch; return the light that hits a surface, and all rays.
 
-        The rays are origins, if they are needed, and directions: (6, n) or (3, n).
+        The rays are origins, if they are needed, and unit directions of all sub-rays of the batch,
+        in the scene frame: (6, s) or (3, s). The light has a row for each of the sub-rays that hit.
         """
         poses = batch.subray_poses
         first, stop = batch.window
@@ -252,7 +270,10 @@ class CastStep(PulseStep):
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light of rays that hit a surface, at the sensor."""
+        """Return the light at the sensor of sub-rays `ray` (n,) of a batch that hit a surface.
+
+        `rays` are all sub-rays of the batch, see `_cast_first`.
+        """
         setup = self.setup
         poses = batch.subray_poses
         directions = rays[-3:].take(ray, axis=1).T
@@ -279,7 +300,10 @@ class CastStep(PulseStep):
     # -- hits --------------------------------------------------------------------------------
 
     def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
-        """Return the hits of light on surfaces, or on leaves before the surfaces."""
+        """Return the hits of light on surfaces, or on leaves before the surfaces.
+
+        Moves the media of `cast.light` to the hits.
+        """
         surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories
         light = cast.light
@@ -301,7 +325,8 @@ class CastStep(PulseStep):
             colour,
         )
         if leaves is not None and len(leaves.rows):
-            normals[leaves.rows] = light.directions[leaves.rows]  # no leaf continues another leaf
+            # Leaves face the light: two leaves behind each other are then never one surface.
+            normals[leaves.rows] = light.directions[leaves.rows]
             energy[leaves.rows] = self._leaf_energy(leaves, triangle, distance, colour)
         energy *= light.share
         if light.in_media is not None:
@@ -322,7 +347,10 @@ class CastStep(PulseStep):
         )
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
-        """Move the ends of light that meets a leaf to the leaf; None if there are no media."""
+        """Return light that ends at the leaves that it meets, and the leaves.
+
+        The leaves are None if there are no media.
+        """
         light = cast.light
         if light.in_media is None:
             return cast, None
@@ -343,7 +371,10 @@ class CastStep(PulseStep):
     def _leaf_energy(
         self, leaves: Leaves, triangle: Ints32, distance: Floats, colour: UInts32 | None
     ) -> Floats:
-        """Return the energies received from leaves (k,), from the arrays (n,) of all hits."""
+        """Return the energies received from leaves (k,).
+
+        `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
+        """
         rows = leaves.rows
         leaf_colour = None if colour is None else colour[rows]
         return self.surfaces.energy(
@@ -370,7 +401,10 @@ class CastStep(PulseStep):
         )
 
     def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
-        """Return the hits that the sensor may see, and the surfaces from which light continues."""
+        """Return the hits that the sensor may see, and where light continues.
+
+        With media, hits on the surfaces of crowns and hits beyond the sensor's range are left out.
+        """
         materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
@@ -418,7 +452,10 @@ class CastStep(PulseStep):
         visible: VisibleHits,
         subrays_per_beam: int,
     ) -> OnwardLight | None:
-        """Return the light that surfaces transmit or mirror; None if there is no such light."""
+        """Return the light that surfaces transmit or mirror, ready to cast; None if there is none.
+
+        Rows that are transmitted and mirrored are taken twice, and ordered along rings.
+        """
         if not self.setup.has_onward_light:
             return None
         transmitted = np.flatnonzero(visible.transmits)
@@ -444,9 +481,11 @@ class CastStep(PulseStep):
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
     ) -> OnwardRows:
-        """Compute the energy of light that surfaces transmit or mirror; drop faint light.
+        """Compute the share of light that surfaces transmit or mirror; drop faint light.
 
-        The arrays `rows` and `reflected` are overwritten.
+        `rows` are rows of the light; `reflected` says which of them are mirrored. Both are
+        overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
+        light is refracted, its energy may exceed the limit that is computed here.
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -485,7 +524,10 @@ class CastStep(PulseStep):
         return OnwardRows(rows[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
-        """Cast the light behind surfaces; return the light that hits a surface within the range."""
+        """Cast the light behind surfaces; return the light that hits a surface within the range.
+
+        With crowns, hits beyond the range are returned too: there may be leaves before them.
+        """
         light, start_m, path = onward
         max_range_m = self.setup.sensor.max_range_m
         # Light takes no time: it travels 300 m in a microsecond.
@@ -509,9 +551,11 @@ class CastStep(PulseStep):
     def _join(
         self, batch: PulseBatch, parts: list[VisibleHits], rays: Floats, first_light: LightPaths
     ) -> PulseReturns:
-        """Leave all hits to the later steps, in the order of sub-rays, with their planes.
+        """Return the hits of all passes in the order of sub-rays, and set them in the batch.
 
-        `rays` are all sub-rays, and `first_light` is the light of the rays that hit a surface.
+        `parts` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams have
+        several sub-rays. `rays` are all sub-rays, see `_cast_first`; `first_light` is the light of
+        those that hit a surface.
         """
         hits = joined([part.hits for part in parts])
         normals = parts[0].normals
@@ -523,13 +567,17 @@ class CastStep(PulseStep):
         batch.hits = hits
         if batch.subrays_per_beam > 1:
             directions = first_light.directions
-            if parts[1:] or len(hits.ray) != len(first_light.ray):  # hits beyond the range are out
+            # The rows differ from `first_light` after several passes, or if hits were left out.
+            if parts[1:] or len(hits.ray) != len(first_light.ray):
                 directions = rays[-3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits
 
     def _cross(self, light: LightPaths, crossings: Crossings) -> OnwardLight:
-        """Return the light behind surfaces that transmit or mirror the light."""
+        """Return the light behind surfaces that transmit or mirror the light.
+
+        The new origins are a small distance behind the surfaces, so as not to hit them again.
+        """
         incoming_index = light.index
         deflection = self._deflect(light, crossings)
         outgoing = deflection.directions
@@ -565,7 +613,10 @@ class CastStep(PulseStep):
         return OnwardLight(behind, -clear_m, path)
 
     def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
-        """Return the directions and shares of light behind surfaces that refract or mirror."""
+        """Return the directions and shares of light behind surfaces that refract or mirror.
+
+        Moves the light into the media behind the surfaces.
+        """
         outgoing = light.directions
         share = light.share
         mirrored = crossings.reflected
@@ -579,7 +630,7 @@ class CastStep(PulseStep):
                 crossings.reflected,
             )
             outgoing = refraction.directions
-            share = share * refraction.shares**2
+            share = share * refraction.shares**2  # on the way out and back
             mirrored = mirrored | refraction.totally_reflected
         twice_normals = 2 * mirrored[:, None] * crossings.normals
         outgoing = outgoing - crossings.cosines[:, None] * twice_normals
@@ -592,9 +643,11 @@ def _range_rate_behind(
     velocities: Floats | None,
     outgoing: Floats,
 ) -> Floats | None:
-    """Return the growth of the optical path behind moving surfaces and mirrors, m/s: (n,).
+    """Return `LightPaths.range_rate` behind moving surfaces that bend or mirror light, m/s: (n,).
 
-    `incoming_index` is the refractive index before the surfaces, `light.index` behind them.
+    `light` has the directions before the surfaces, `outgoing` (n, 3) are those behind the surfaces.
+    `velocities` (n, 3) are the velocities of the surfaces, m/s. `incoming_index` is the refractive
+    index before the surfaces, `light.index` behind them.
     """
     if light.range_rate is None or velocities is None:
         return light.range_rate
@@ -608,7 +661,8 @@ def _path_behind(
 ) -> tuple[Pattern, Floats]:
     """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).
 
-    `outgoing` are the directions of the rays, (n, 3).
+    Light ends at distances `step_m` (n,) from its origins, metres. `outgoing` (n, 3) are the
+    directions of the rays, of any length close to 1.
     """
     from . import surface_loops
 

@@ -25,7 +25,8 @@ from .pulses import PulseCaster
 from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 
-PATTERN_RAYS = 20_000_000  # stored rays of a head's period at most; 24 bytes each
+# Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
+PATTERN_RAYS = 20_000_000
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
 MAX_PATTERNS = 8  # patterns of firings that are stored for the next images
 
@@ -42,7 +43,9 @@ class _Rays(NamedTuple):
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
     """Return whether a sensor's rays are computed once and cast repeatedly, and whether by head.
 
-    Rays by head are the rays of a firing in the frame of the head; each firing has a pose.
+    `moves` says that the carrier moves. Rays by head are the rays of one firing in the frame of
+    the head, with a pose for each firing; other repeated rays are those of a period of the head in
+    the frame of the carrier.
     """
     fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
     by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
@@ -50,7 +53,10 @@ def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
 
 
 class Rig:
-    """Scene, survey and ray caster, ready to cast; the options are arguments of `RayCaster`."""
+    """Scene, survey and ray caster, ready to cast scans of the survey.
+
+    `backend`, `threads` and `device` are arguments of `RayCaster`.
+    """
 
     def __init__(
         self,
@@ -70,6 +76,7 @@ class Rig:
         options: dict[str, Any],
         shared_caster: SceneCaster | None,
     ) -> None:
+        """Set all attributes; trees are built, unless `shared_caster` has those of the scene."""
         self.scene = scene
         self.survey = survey
         self.options = options
@@ -80,15 +87,18 @@ class Rig:
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)
-        # {(sensor, whether it moves): rays}
+        # {(number of the sensor, whether the carrier moves): rays}
         self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
-        # {(sensor, first firing, stop): rays}
+        # {(number of the sensor, first firing, stop of firings): rays}
         self._patterns: dict[tuple[int, int, int], Pattern] = {}
         for number in range(len(survey.carried)):
             self._rays_of_sensor(number, survey.path.moves)
 
     def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
-        """Return the rays of a sensor that are cast repeatedly, computed on first use."""
+        """Return the rays of sensor `number` that are cast repeatedly, computed on first use.
+
+        `moves` says that the carrier moves.
+        """
         rays = self._repeated_rays.get((number, moves))
         if rays is None:
             sensor = self.survey.carried[number].sensor
@@ -120,7 +130,10 @@ class Rig:
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
-        """Raise LidarError unless the trajectories of all actors cover a span of time."""
+        """Raise LidarError unless the trajectories of all actors cover a span of time.
+
+        The times are nanoseconds since the survey's start.
+        """
         moving = np.flatnonzero([trajectory.moves for trajectory in self._actor_trajectories])
         try:
             times = np.repeat([begin_ns, end_ns], len(moving)).astype(np.float64)
@@ -133,20 +146,24 @@ class Rig:
     def moved(self, owner: int, pose: Pose) -> Rig:
         """Return a rig with the instances of an object at a pose, see `Scene.moved`.
 
-        The trees are shared: this rig must not cast afterwards, and no cast may be under way.
+        `owner` is the number of the object. The trees are shared: this rig must not cast
+        afterwards, and no cast may be under way.
         """
         rig = copy(self)
         rig.scene = self.scene.moved(owner, pose)
-        shared = rig.scene.instances
-        assert shared is not None
-        rows = np.flatnonzero(shared.owner == owner)
+        instances = rig.scene.instances
+        assert instances is not None
+        rows = np.flatnonzero(instances.owner == owner)
         rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._caster.move_instances(rig._surfaces, shared, rows)
+        rig._caster.move_instances(rig._surfaces, instances, rows)
         rig._prepare()
         return rig
 
     def _prepare(self) -> None:
-        """Create the casters of pulses and of columns, which depend on the surfaces' positions."""
+        """Create the casters of pulses and of columns, which know where surfaces are.
+
+        Columns are computed on a CUDA device if it casts the rays and no sensor has steps.
+        """
         caster = self._caster
         scene = self.scene
         survey = self.survey
@@ -166,7 +183,10 @@ class Rig:
         return self._caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings `first` to `stop` of a sensor, in the frame of its carrier."""
+        """Return the rays of firings `first` to `stop` of sensor `number`, in the carrier's frame.
+
+        The rays are in the order of firings and beams; firings count from the station's start.
+        """
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
         mount = carried.mount
@@ -179,8 +199,12 @@ class Rig:
         return Pattern(directions, origins)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
-        """Cast scans `first` to `stop` of the survey; yield the returns of each run of scans."""
-        specs: list[ScanSpec] = []
+        """Cast scans `first` to `stop` of the survey; yield the returns of each group of scans.
+
+        A group is scans of one sensor and station whose firings follow each other. A frozen sensor
+        casts the older scans that it sends again, see `Survey.sent_scan`.
+        """
+        specs: list[ScanSpec] = []  # of the group
         for spec in map(self.survey.sent_scan, range(first, stop)):
             sequence = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
             last = specs[-1] if specs else spec
@@ -194,9 +218,10 @@ class Rig:
     def returns(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0, *, tally: bool = True
     ) -> BatchPoints | DevicePoints:
-        """Cast consecutive scans of a station.
+        """Cast consecutive scans of one sensor and station; return their points.
 
-        The carrier's poses are `late_ns` nanoseconds after the times of the firings. Hits of each
+        At a firing `t` nanoseconds after the start of the station, the carrier is at the pose of
+        `path` at `t + late_ns`; actors are at their poses at the time of the firing. Hits of each
         triangle are counted if `tally`.
         """
         number = specs[0].sensor
@@ -209,7 +234,7 @@ class Rig:
         poses = self._poses(firings, path, late_ns, by_head=by_head)
         if repeated is not None:
             pattern = repeated
-            start = first * channels % len(repeated)
+            start = first * channels % len(repeated)  # row of the first ray in the pattern
         else:
             pattern = self.pattern(number, first, stop)
             start = 0
@@ -217,8 +242,9 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
+        first_key = specs[0].scan + specs[0].ahead  # a scan's number in keys of random numbers
         scanned = self._pulses[number].scan(
-            specs[0].scan + specs[0].ahead, pattern, poses, window, groups, firings, tally=tally
+            first_key, pattern, poses, window, groups, firings, tally=tally
         )
         return BatchPoints(
             self.scene,
@@ -234,7 +260,10 @@ class Rig:
     def _poses(
         self, firings: Firings, path: Trajectory, late_ns: float, *, by_head: bool
     ) -> CastPoses:
-        """Return the poses of consecutive firings on a path, with the clocks that motion needs."""
+        """Return the poses of consecutive firings on a path, with the clocks that motion needs.
+
+        With `by_head` the poses are of the head, else of the carrier. `late_ns` is as in `returns`.
+        """
         spec = firings.spec
         carried = self.survey.carried[spec.sensor]
         if path.moves or by_head:
@@ -263,10 +292,11 @@ class Rig:
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Cast the same firings from several poses of a static carrier.
+        """Return the ranges of the same firings from several poses of a static carrier.
 
-        `specs` are consecutive scans of one station; the scans of the next pose have the next
-        numbers. The poses, (k, 3) and (k, 3, 3), have been checked. Returns the ranges of the
+        `specs` are consecutive scans of one station; for random numbers, the scans of the next pose
+        have the next numbers. The poses are positions (k, 3), metres, and rotations (k, 3, 3) from
+        the carrier frame to the scene frame; they are not checked here. Ranges are those of the
         nearest reported returns, metres: float32 (k, firings, channels); inf without a return.
         """
         sensor = self.survey.carried[specs[0].sensor].sensor
@@ -292,10 +322,11 @@ class Rig:
         first_scan: int,
         image: Floats32,
     ) -> None:
-        """Write the ranges of the same firings from several poses into `image`.
+        """Write the ranges of the same firings from several poses into `image` (poses * rays,).
 
-        `image` has the rays of a pose behind those of the pose before; `first_scan` is the number
-        of the first scan, counted from `specs[0]`.
+        `pattern` are the rays of the firings, in the carrier's frame; `image` has the rays of a
+        pose behind those of the pose before. `first_scan` is added to the number of `specs[0]`, for
+        random numbers.
         """
         sensor = self.survey.carried[specs[0].sensor].sensor
         rays = len(pattern)
@@ -321,7 +352,7 @@ class Rig:
         image[returns.ray[nearest]] = returns.reported[nearest]
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings in the frame of the carrier, stored for the next images."""
+        """Return the rays of firings in the frame of the carrier, stored for the next calls."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first

@@ -44,24 +44,28 @@ REACHED = 1e-3  # share of a distance: a ray that ends this close before a point
 
 
 class _NearestHits(NamedTuple):
-    """Nearest hits of rays: arrays (k,), in the order of rays."""
+    """Nearest hits of the rays that hit: arrays (k,), in the order of rays."""
 
-    ray: Ints
+    ray: Ints  # number of the ray, from 0 at the window's start
     distance: Floats  # metres
     triangle: Ints32
 
 
 class _ActorShapes(NamedTuple):
-    """Shapes of actors; actors of the same mesh share a shape."""
+    """The s shapes of the a actors of a scene; actors of the same mesh share a shape.
 
-    casters: tuple[RayCaster | Deforming, ...]
-    boxes: Floats  # (s, 2, 3): bounds of the shapes, metres
-    part_triangles: Ints32  # (s, p): first triangle of each part of a shape
+    A mesh has a part for its opaque triangles, and a part for each mask, see `parts_of`; a part is
+    an instance of the shape's caster.
+    """
+
+    casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
+    boxes: Floats  # (s, 2, 3): bounds of the shapes, metres, also of all frames of animations
+    part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
     shape: Indices  # (a,): shape of each actor
 
 
 def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
-    """Refuse a backend that this machine lacks, before a local cluster is started."""
+    """Raise LidarError if this machine lacks a backend of casting; `advice` ends the message."""
     # An interrupt during the import of an extension module would look like a missing module.
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
@@ -75,11 +79,21 @@ def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
 class SceneCaster:
     """Casts scans like `RayCaster.scan`, including hits on actors.
 
-    Triangles of instances are numbered after the triangles of the scene, triangles of actors after
+    Triangles of instances are numbered after the faces of the scene, triangles of actors after
     both. Rays that touch no actor give the same bits as without actors. The poses of a scan have
-    the trajectories of the actors. A tally is by the counters of `surfaces`. `options` are
-    arguments of `RayCaster`. `like` is a caster of the same scene, possibly with other actors,
-    whose trees are shared.
+    the trajectories of the actors.
+
+    Parameters
+    ----------
+    scene
+        Faces, instances and actors to hit.
+    surfaces
+        Surfaces of the scene; a tally counts hits by `Surfaces.counter`.
+    shared_caster
+        Caster of the same scene, possibly with other actors. Its trees of static bodies are shared
+        if the same surfaces enclose media.
+    options
+        Arguments of `RayCaster`.
     """
 
     def __init__(
@@ -90,19 +104,24 @@ class SceneCaster:
         **options: Any,
     ) -> None:
         self._surfaces = surfaces
-        self._shared = scene.instances
-        self._first_triangles: Ints32 | None = None  # of each body of the caster
-        self._faces = faces = len(scene.faces)
-        if self._shared is not None:
-            first_triangles = faces + np.cumsum([0, *self._shared.sizes[:-1]])
-            self._first_triangles = np.append([0] * bool(faces), first_triangles).astype(np.int32)
-            faces += self._shared.triangles
+        self._instances = scene.instances
+        # First triangle of each instance of the caster: of the scene's faces, if any, and then of
+        # the scene's instances. None if the scene has no instances.
+        self._first_triangles: Ints32 | None = None
+        self._face_count = static_triangles = len(scene.faces)
+        if self._instances is not None:
+            first_triangles = static_triangles + np.cumsum([0, *self._instances.sizes[:-1]])
+            self._first_triangles = np.append([0] * bool(static_triangles), first_triangles).astype(
+                np.int32
+            )
+            static_triangles += self._instances.triangles
         # Distance behind a surface at which light continues, so as not to hit the surface again:
         # Embree's rounding is up to a quarter of this distance.
         reach = np.float32(np.abs(scene.bounds).max())
         self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
         self._media = surfaces.media
         if shared_caster is None or shared_caster._media != self._media:
+            # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
             vertices = surfaces.spread_out(1.5 * self.clear_m)
             self.caster: RayCaster = _caster_of(scene, vertices, options)
         else:
@@ -110,25 +129,33 @@ class SceneCaster:
         self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         # First triangle of each actor.
-        self._actor_triangles = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
+        self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def move_instances(self, surfaces: Surfaces, shared: Instances, rows: Indices) -> None:
-        """Move instances `rows` to their transforms in `shared`; no scan may be under way."""
-        first = self.caster.instance_count - len(shared)
+    def move_instances(self, surfaces: Surfaces, instances: Instances, rows: Indices) -> None:
+        """Move instances `rows` to their transforms in `instances`; no scan may be under way.
+
+        `surfaces` are the surfaces of the scene with the moved instances.
+        """
+        first = self.caster.instance_count - len(instances)
         for row in rows:
-            self.caster.move(first + int(row), shared.transforms[row])
+            self.caster.move(first + int(row), instances.transforms[row])
         self._surfaces = surfaces
-        self._shared = shared
+        self._instances = instances
 
     def counters(self) -> tuple[Ints, int]:
-        """Return the counters of bodies for `RayCaster.visit`, and their number.
+        """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
 
-        Each instance has a counter, see `Scene.counters`. Array (bodies, 2).
+        The table is int64 (bodies, 2): a hit of triangle t of body i counts in the counter
+        ``table[i, 0] + table[i, 1] * t``, see `Scene.counters`. The bodies are the faces of the
+        scene, if any, with a counter for each triangle; then each instance, with one counter; and
+        last all actors as one body, whose triangles are numbered after the scene's faces alone.
         """
-        shared = 0 if self._shared is None else len(self._shared)
-        static_count = self.caster.instance_count - shared
-        rows = [[0, 1]] * static_count + [[self._faces + number, 0] for number in range(shared)]
-        return np.array([*rows, [shared, 1]], np.int64), self._surfaces.counters
+        instance_count = 0 if self._instances is None else len(self._instances)
+        static_count = self.caster.instance_count - instance_count
+        table = [[0, 1]] * static_count + [
+            [self._face_count + number, 0] for number in range(instance_count)
+        ]
+        return np.array([*table, [instance_count, 1]], np.int64), self._surfaces.counters
 
     @property
     def backend(self) -> str:
@@ -150,7 +177,17 @@ class SceneCaster:
     ) -> ScanReturns:
         """Cast rays of a pattern as `RayCaster.scan`, and also on actors.
 
-        The arguments are those of `RayCaster.scan`. If there are actors, the poses have a clock.
+        The arguments are those of `RayCaster.scan`; if there are actors, `poses` have a clock.
+        `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
+        `t_min` to `t_max`, metres; of each group of rays every n-th is returned, by `keep_every`.
+        `groups` are the first rays of the groups. `room` is output for all rays.
+
+        Returns
+        -------
+        ScanReturns
+            Ray numbers are from 0 at the window's start. Triangles are numbered as in
+            `SceneCaster`, and the tally is by `Surfaces.counter`. With instances or actors,
+            `instance` is 0.
         """
         common: dict[str, Any] = {
             **poses.caster_arguments,
@@ -187,8 +224,8 @@ class SceneCaster:
             ray = ray[rows]
             distance = distance[rows]
             triangle = triangle[rows]
-        none = np.zeros(len(ray), np.int32)
-        return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
+        instance = np.zeros(len(ray), np.int32)  # not needed: triangles tell the instance
+        return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, instance)
 
     def is_visible(
         self,
@@ -198,9 +235,10 @@ class SceneCaster:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Return whether points are visible from origins (n, 3), at firing times (n,): (n,).
+        """Return whether points are visible from origins (n, 3), in the scene frame: (n,).
 
-        `towards` are vectors from the origins to the points, (n, 3), of lengths `distance` (n,).
+        `towards` are vectors from the origins to the points, (n, 3), of lengths `distance` (n,),
+        metres. `times` (n,) are the times of the actors, nanoseconds since the survey's start.
         """
         visible = np.ones(len(distance), np.bool_)
         if len(distance):
@@ -210,7 +248,7 @@ class SceneCaster:
         return visible
 
     def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
-        """Return the nearest hits on static bodies and actors."""
+        """Return the nearest hits of a scan on static bodies, which are known, and on actors."""
         from . import surface_loops  # not before: numba takes half a second to import
 
         static_distance = np.full(len(scan), np.inf)
@@ -231,7 +269,7 @@ class SceneCaster:
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
-        """Find the nearest hits of rays on actors."""
+        """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
         hits, shapes = self._nearest(scan, poses)
         ray = np.flatnonzero(hits.body >= 0)
         actor = hits.body[ray]
@@ -243,12 +281,15 @@ class SceneCaster:
     def _nearest(
         self, scan: Scan, poses: CastPoses, limit: Floats | None = None
     ) -> tuple[Nearest, _ActorShapes]:
-        """Return the nearest hits on actors, before distances `limit` (n,), and the shapes."""
+        """Return the nearest hits of all rays (n,) on actors, and the shapes of the actors.
+
+        Hits count before distances `limit` (n,), metres.
+        """
         assert self._shapes is not None
         trajectories = poses.actor_trajectories
 
         def frames(actor: Ints, times: Floats) -> Floats:
-            """Return the frames of animations of actors at times, which deform their meshes."""
+            """Return the positions in the animations of actors at times, in animation frames."""
             return trajectories.played(actor, times)[0]
 
         moving = Moving(
@@ -263,7 +304,7 @@ class SceneCaster:
 
 
 def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
-    """Build the trees of static bodies, with `vertices` of the scene's faces."""
+    """Build the caster of static bodies; `vertices` (v, 3) are those of the scene's faces."""
     if scene.instances is None:
         return RayCaster(vertices, scene.faces, **options)
     static_instances = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
@@ -282,7 +323,10 @@ def _mesh_of(part: MeshPart) -> Mesh:
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
-    """Build the casters of the shapes of actors; None without actors."""
+    """Build the casters of the shapes of actors; None without actors.
+
+    `options` are arguments of `RayCaster`.
+    """
     if not actors:
         return None
     meshes, shape = distinct_meshes(actors)

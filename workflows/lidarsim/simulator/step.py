@@ -36,8 +36,10 @@ class Role(Flag):
     AIMS = auto()  # deflects beams before they are cast
     ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
     CHANGES = auto()  # a ray may then have no return, several, a changed energy or a waveform
-    RECEIVES = auto()  # as CHANGES, by returns that the receiver adds or joins before it selects
-    ON_REPORTED = auto()  # acts on the reported returns of all batches together
+    # as CHANGES, by returns that the receiver adds or joins before `SelectionStep`
+    RECEIVES = auto()
+    # acts once on the selected and thinned-out returns of all pulses that are cast together
+    ON_REPORTED = auto()
     FRAME = auto()  # casts rays, makes returns of hits or selects returns, for the other steps
 
 
@@ -68,12 +70,12 @@ class Setup:
 
     @property
     def half_pulse_m(self) -> float:
-        """Half of the pulse's length, metres."""
+        """Half of the pulse's length in space, metres: the smallest gap between two returns."""
         return self.reporting.min_gap_m(self.sensor.optics)
 
     @property
     def has_velocities(self) -> bool:
-        """Whether returns have radial velocities."""
+        """Whether a stored column needs the radial velocities of returns."""
         return any(column.name == VELOCITY for column in self.survey.stored_columns)
 
     @property
@@ -141,19 +143,20 @@ class Setup:
 class Sizes(NamedTuple):
     """Numbers of rays and returns in memory, if all rays hit a surface."""
 
-    rays: int
-    beams: float  # cast at a time
-    subrays: int  # of the beams that are cast at a time
-    returns: float  # of all rays
-    points: float  # returns that become points
+    rays: int  # of all scans whose memory is estimated
+    beams: float  # of one `PulseBatch`
+    subrays: int  # of one `PulseBatch`
+    returns: float  # of `rays`
+    points: float  # returns that become points: every n-th, see `Survey.keep_every`
 
 
 class Memory(NamedTuple):
     """Peak memory of casting, in bytes."""
 
-    retained: float = 0.0  # until columns are made
-    casting: float = 0.0  # while the beams of a batch are cast
-    counting: float = 0.0  # afterwards, while all returns are counted and thinned out
+    retained: float = 0.0  # from the step until columns are made of the returns
+    casting: float = 0.0  # while the beams of a `PulseBatch` are cast
+    # after all are cast: while returns are counted, and every n-th is kept
+    counting: float = 0.0
 
 
 class Emitter:
@@ -169,6 +172,7 @@ class Emitter:
         self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:
+        """Return the number of sub-rays of a beam."""
         return len(self.beam)
 
     def subrays_of(
@@ -186,7 +190,8 @@ class Emitter:
         pattern
             Rays in the middles of the beams.
         offsets
-            (n, 2): angles that are added to the directions of the beams, radians.
+            (n, 2): angles that are added to the directions of the n divided beams, radians, see
+            `PulseBatch.deflect`.
         rows
             (n,): rows of `pattern` that are divided; by default all.
         by_head
@@ -201,23 +206,30 @@ class Emitter:
 
 @dataclass(eq=False)
 class PulseBatch:
-    """Consecutive beams, and the results of steps for later steps."""
+    """Consecutive rays of scans that are cast together, and results of steps for later steps.
 
-    keys: Keys
-    start: int  # number of the first beam, counted as in the keys
+    `PulseCaster.scan` divides the rays of its scans into such batches. A beam is here a ray of the
+    scans, numbered from 0 at the first scan; a batch has the beams `start` to `stop`.
+    """
+
+    keys: Keys  # scans and ray numbers of all beams of the scans, for random numbers
+    start: int  # number of the batch's first beam
     stop: int  # one past the last
-    pattern: Pattern  # rays of beams
-    first: int  # row of the beam with number 0 in the pattern
-    poses: CastPoses  # of all beams of the keys
-    firings: Firings  # of all beams of the keys
+    pattern: Pattern  # rays of beams, in the frame of the head or the carrier
+    first: int  # row of beam 0 in the pattern, which repeats
+    poses: CastPoses  # of all beams of the scans
+    firings: Firings  # of all beams of the scans
     emitter: Emitter
-    offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
-    hits: PulseReturns | None = None  # of all sub-rays with surfaces
-    planes: Planes | None = None  # of `hits`
-    air: PulseReturns | None = None  # hits in the air, apart from `hits`
+    # (stop - start, 2): angles added to the directions of beams, radians, see `deflect`
+    offsets: Floats | None = None
+    # Hits of sub-rays on surfaces, with waveforms also in the air, in the order of sub-rays, which
+    # are numbered from 0 at the batch's start.
+    hits: PulseReturns | None = None
+    planes: Planes | None = None  # of `hits`; None if beams have a single sub-ray
+    air: PulseReturns | None = None  # hits in the air that are not among `hits`
 
     def deflect(self, offsets: Floats) -> None:
-        """Add angles to the directions of the beams before they are cast, (n, 2), radians.
+        """Add angles to the directions of the batch's beams before they are cast: (n, 2), radians.
 
         With `Role.ABOUT_AXIS` the angles are azimuth and elevation, else across and up.
         """
@@ -240,7 +252,10 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the beams; without offsets, of the whole pattern: see `window`."""
+        """Sub-rays of the batch's beams; without offsets, of all rays of the pattern.
+
+        The rows of the batch are those of `window`.
+        """
         rows = np.arange(self.first + self.start, self.first + self.stop)
         pattern_rows = None if self.offsets is None else rows
         return self.emitter.subrays_of(
@@ -249,24 +264,27 @@ class PulseBatch:
 
     @property
     def rows(self) -> slice:
-        """Rows of the beams' firings; a batch consists of complete firings."""
+        """Rows of the batch's firings in `firings`; a batch consists of complete firings."""
         channels = self.firings.sensor.channels
         return slice(self.start // channels, self.stop // channels)
 
     @property
     def window(self) -> tuple[int, int]:
-        """Rows of the sub-rays of this batch in `beams`: start and stop."""
+        """Start and stop of the batch's sub-rays in the rows of `beams`, which repeat."""
         row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
         return row, row + (self.stop - self.start) * self.subrays_per_beam
 
     @cached_property
     def subray_poses(self) -> CastPoses:
-        """Poses of the sub-rays."""
+        """Poses of the batch's sub-rays, which are numbered from 0."""
         return self.poses.part(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins and directions (n, 3) of the rays in the middles of the beams."""
+        """Origins (n, 3), metres, and directions (n, 3) of the first sub-ray of each beam.
+
+        The first sub-ray is in the middle of the beam. In the scene frame.
+        """
         rows = np.arange(self.stop - self.start) * self.subrays_per_beam
         origins, directions = self.subray_poses.rays(self.beams, rows, self.window[0])
         return np.broadcast_to(origins, directions.shape), directions
@@ -279,9 +297,9 @@ class PulseStep(ABC):
     """
 
     role: ClassVar[Role]
-    effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about it
-    reads: ClassVar[tuple[str, ...]] = ()  # columns of returns
-    writes: ClassVar[tuple[str, ...]] = ()
+    effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about the step
+    reads: ClassVar[tuple[str, ...]] = ()  # fields of `PulseReturns` that the step uses
+    writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
     causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` of the returns that the step adds
     purposes: ClassVar[tuple[Purpose, ...]] = ()  # of the random numbers of the step
 
@@ -301,7 +319,7 @@ class PulseStep(ABC):
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """Return the mean number of returns that the step adds to a pulse."""
+        """Return the mean number of returns that the step adds to a pulse, or an upper bound."""
         return 0.0
 
     @staticmethod
@@ -313,6 +331,7 @@ class PulseStep(ABC):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch after the step.
 
-        Before returns are made of hits, `returns` are the hits of sub-rays. A step that changes
-        the hits assigns the result to `batch.hits` as well, and selects hits by `batch.select`.
+        Before `SeparationStep` or `WaveformStep` makes returns of hits, `returns` are the hits of
+        sub-rays, with sub-ray numbers in `ray`. A step that changes the hits assigns the result to
+        `batch.hits` as well, and selects hits by `batch.select`.
         """

@@ -31,8 +31,8 @@ STEPS: list[type[PulseStep]] = [
     WeatherStep,  # rain, snow, fog and dust
     SprayStep,
     DirtStep,  # on the window
-    SeparationStep,  # makes returns of hits; or
-    WaveformStep,
+    SeparationStep,  # makes returns of hits, if there are no waveforms
+    WaveformStep,  # makes returns of hits otherwise
     DetectionStep,
     StrayLightStep,
     FalseAlarmStep,
@@ -59,7 +59,10 @@ def steps_of(setup: Setup) -> list[type[PulseStep]]:
 
 
 def received_causes() -> list[int]:
-    """Return the causes of returns that the receiver adds: no light returned from their points."""
+    """Return the causes, indices into `CAUSES`, of returns that steps of `Role.RECEIVES` add.
+
+    At the points of such returns is nothing that sent light back, so they have no velocity.
+    """
     return [cause for step in STEPS if Role.RECEIVES in step.role for cause in step.causes]
 
 
@@ -127,8 +130,8 @@ _POSITIONS = (
     (Role.RECEIVES, SaturationStep),
     (Role.CHANGES, SeparationStep),
 )
-# Roles, and the steps between which they have an effect: returns are received once there are
-# returns, and before the mode selects some.
+# (role, first, last): a step of the role acts only after step `first` and not after step `last`.
+# Returns are received once there are returns, and before `SelectionStep` selects returns.
 _SPANS = (
     (Role.RECEIVES, DetectionStep, SelectionStep),
     (Role.CHANGES, CastStep, RangeNoiseStep),
