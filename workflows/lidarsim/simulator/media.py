@@ -45,9 +45,9 @@ Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 class Rays(NamedTuple):
     """Light of sub-rays at its origin, and the trajectories of actors."""
 
-    origins: Floats  # (n, 3)
-    directions: Floats  # (n, 3)
-    times: Floats  # (n,)
+    origins: Floats  # (n, 3): metres, scene frame
+    directions: Floats  # (n, 3): unit vectors, scene frame
+    times: Floats  # (n,): nanoseconds, for the poses of actors
     actor_trajectories: ActorTrajectories
 
 
@@ -68,7 +68,10 @@ class MediaStack:
         return MediaStack(self.kinds[rows], self.triangles[rows])
 
     def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium within the media around light: a medium for each of `rows`."""
+        """Add a medium within the media around light: a medium for each of `rows`.
+
+        A full stack loses its outermost medium.
+        """
         for table, values in ((self.kinds, kinds), (self.triangles, triangles)):
             table[rows, 1:] = table[rows, :-1]
             table[rows, 0] = values
@@ -108,8 +111,8 @@ class RayDifferentials:
     def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
         """Return the differentials of light at its origin, from directions (n, 3)."""
         derivatives = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
-        none = np.zeros(len(derivatives))
-        return cls(index.copy(), index, none, np.zeros_like(derivatives), derivatives)
+        zeros = np.zeros(len(derivatives))
+        return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 
     def __getitem__(self, rows: Integers) -> RayDifferentials:
         """Return the differentials of selected sub-rays."""
@@ -161,7 +164,11 @@ class RayDifferentials:
 
 
 class Media:
-    """The media of a scene; `air_extinction` is the extinction of its air, 1/m."""
+    """The media of a scene.
+
+    `table` are the materials at the wavelength of the light, and `air_extinction` is the extinction
+    of the scene's air, 1/m.
+    """
 
     def __init__(
         self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air_extinction: float = 0.0
@@ -175,6 +182,7 @@ class Media:
         self.grids = surfaces.grids
         self.instances = surfaces.instances
         owners = surfaces.material_kinds.object
+        # (kinds + 1,): whether the leaves are in grids of voxels; the last entry is of kind -1.
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
         # The value of the kind -1, no surface, is 0: the last entry.
@@ -191,7 +199,8 @@ class Media:
                     "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
                     "or a sphere."
                 )
-        # Where sensors may be within media: an actor may be anywhere, and below a sheet is water.
+        # Boxes in which sensors may be within media. A surface of water that is an open sheet has
+        # water below at any depth; an actor that holds a medium may be anywhere.
         is_static = owners < len(scene.object_bounds)
         static_kinds = np.flatnonzero(self.filled & is_static)
         bounds = scene.object_bounds[owners[static_kinds]]
@@ -273,10 +282,10 @@ class Media:
     ) -> None:
         """Update the stacks of a search for probes `rows` that cross triangles."""
         kinds = self._surfaces.kinds(triangles)
-        media = self.filled[kinds]
-        entering = self.enters(kinds, cosines) & media
+        at_medium = self.filled[kinds]
+        entering = self.enters(kinds, cosines) & at_medium
         entered.enter(rows[entering], kinds[entering], triangles[entering])
-        leaving = np.flatnonzero(media & ~entering)
+        leaving = np.flatnonzero(at_medium & ~entering)
         was_entered = entered.leave(rows[leaving], kinds[leaving])
         leaving = leaving[~was_entered]
         surrounding.surround(rows[leaving], kinds[leaving], triangles[leaving])
@@ -296,12 +305,12 @@ class Media:
     def index(self, stack: MediaStack) -> Floats:
         """Return the refractive index of the innermost medium with an index: (n,)."""
         indices = self._index[stack.kinds]
-        return _first(indices, indices > 0, 1.0)
+        return _first_masked(indices, indices > 0, 1.0)
 
     def attenuation(self, stack: MediaStack) -> Floats:
         """Return the extinction, 1/m: (n,): of the innermost refracting medium, or of the air."""
         refracts = self._index[stack.kinds] > 0
-        return _first(self._attenuation[stack.kinds], refracts, self.air_extinction)
+        return _first_masked(self._attenuation[stack.kinds], refracts, self.air_extinction)
 
     def behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
@@ -319,25 +328,30 @@ class Media:
     def density(self, stack: MediaStack, upright: Floats) -> Floats:
         """Return the optical depth of leaves per metre, in each medium around light.
 
-        `upright` (n,) are the vertical parts of the light's directions. Returns (n, MAX_MEDIA).
+        `upright` (n,) are cosines between the light and the vertical, 0 to 1. Returns
+        (n, MAX_MEDIA); for grids of voxels, values are for a leaf area density of 1 m²/m³.
         """
         density = self._area[stack.kinds]
         if density.any():
             for number, angle in enumerate(self._angles):
-                crossing = projection(angle, upright)[:, None]
-                density *= np.where(self._angle[stack.kinds] == number, crossing, 1)
+                projected_area = projection(angle, upright)[:, None]
+                density *= np.where(self._angle[stack.kinds] == number, projected_area, 1)
         return density
 
     def leaf_cosines(self, kinds: Ints32, upright: Floats) -> Floats:
-        """Return the mean cosine between light and the leaves of crowns of kinds (n,): (n,)."""
+        """Return the mean cosine between light and the normals of the leaves that it hits: (n,).
+
+        `kinds` (n,) are kinds of crowns (closed surfaces with leaves), and `upright` (n,) cosines
+        between the light and the vertical, 0 to 1.
+        """
         cosines = np.ones(len(kinds))
         for number, angle in enumerate(self._angles):
             cosines = np.where(self._angle[kinds] == number, brightness(angle, upright), cosines)
         return cosines
 
 
-class GridPassage(NamedTuple):
-    """Passage of light through grids of voxels: arrays (k,)."""
+class LightInGrids(NamedTuple):
+    """Light among all that passes grids of voxels: arrays (k,)."""
 
     rows: Indices  # of the light
     metres: Floats  # to the leaf that the light meets; inf if there is no leaf
@@ -348,7 +362,8 @@ class Refraction(NamedTuple):
     """Light behind surfaces: arrays (n,), vectors (n, 3)."""
 
     directions: Floats
-    shares: Floats | float  # of the energy: transmitted, or mirrored where light is reflected
+    # Share of the light, on one way: transmitted, or mirrored where light is reflected.
+    shares: Floats | float
     totally_reflected: Bools  # with directions as if there were no surface
 
 
@@ -394,10 +409,14 @@ class LightInMedia:
         ray: Ints,
         draw: Draw,
     ) -> Leaves:
-        """Return the leaves that light meets between distances from its origins, metres (n,)."""
+        """Return the leaves that light meets between distances from its origins.
+
+        Distances `starts_m` and `ends_m` are metres (n,), `ray` are numbers of sub-rays (n,), and
+        `draw` draws random bits that choose among crowns that overlap. Reduces `remaining_depth`.
+        """
         if self.remaining_depth is None:
-            none = np.zeros(0, np.intp)
-            return Leaves(none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
+            no_rows = np.zeros(0, np.intp)
+            return Leaves(no_rows, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
         upright = np.minimum(np.abs(directions[:, 2]), 1)
         density = self.media.density(self.stack, upright)
         length = ends_m - starts_m
@@ -412,7 +431,7 @@ class LightInMedia:
         return Leaves(rows, metres, self.stack.triangles[rows, layer], cosines)
 
     def _advance_to_leaves(
-        self, density: Floats, length: Floats, passage: GridPassage | None
+        self, density: Floats, length: Floats, passage: LightInGrids | None
     ) -> tuple[Indices, Floats]:
         """Reduce the remaining depth over lengths (n,), metres, of a density (n,), 1/m.
 
@@ -434,11 +453,12 @@ class LightInMedia:
 
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
-    ) -> GridPassage:
+    ) -> LightInGrids:
         """Follow light through grids of voxels, and write their densities into `density`.
 
-        Before, `density` (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area
-        density of 1; afterwards, for the density of the grids.
+        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. Before, `density`
+        (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area density of 1 m²/m³;
+        afterwards, for the voxel in which light meets a leaf, or 0. Other media keep their values.
         """
         grids = self.media.grids
         stack = self.stack
@@ -446,24 +466,27 @@ class LightInMedia:
         gridded = self.media.gridded[stack.kinds]
         rows = np.flatnonzero(gridded.any(axis=1))
         gridded = gridded[rows]
-        layers = np.argsort(~gridded, axis=1, kind="stable")
-        layers = layers[:, : gridded.sum(axis=1).max(initial=1)]
-        used = np.take_along_axis(gridded, layers, axis=1)
-        triangles = np.take_along_axis(stack.triangles[rows], layers, axis=1)
-        row_density = np.where(gridded, 0, density[rows])
+        # Columns of the stack: grids first, as many columns as the most grids around any light.
+        grid_layers = np.argsort(~gridded, axis=1, kind="stable")
+        grid_layers = grid_layers[:, : gridded.sum(axis=1).max(initial=1)]
+        is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
+        triangles = np.take_along_axis(stack.triangles[rows], grid_layers, axis=1)
+        media_density = np.where(gridded, 0, density[rows])
         metres, remaining_depth, grid_density = grids.through(
-            np.where(used, self.media.instances(triangles), -1),
+            np.where(is_grid, self.media.instances(triangles), -1),
             starts[rows],
             directions[rows],
-            np.take_along_axis(density[rows], layers, axis=1),
-            np.cumsum(row_density, axis=1)[:, -1],
+            np.take_along_axis(density[rows], grid_layers, axis=1),
+            np.cumsum(media_density, axis=1)[:, -1],
             length[rows],
             self.remaining_depth[rows],
         )
-        layer_density = np.where(used, grid_density, np.take_along_axis(row_density, layers, 1))
-        np.put_along_axis(row_density, layers, layer_density, 1)
-        density[rows] = row_density
-        return GridPassage(rows, metres, remaining_depth)
+        layer_density = np.where(
+            is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
+        )
+        np.put_along_axis(media_density, grid_layers, layer_density, 1)
+        density[rows] = media_density
+        return LightInGrids(rows, metres, remaining_depth)
 
     def advance(self, step: Floats) -> None:
         """Move the light straight on by steps (n,), metres."""
@@ -487,22 +510,25 @@ class LightInMedia:
     ) -> Refraction:
         """Transmit light through surfaces (n,), or reflect the light of the mask `reflected`.
 
-        `cosines` are between normals and directions. Reflected light keeps its direction here.
+        `cosines` are between normals and directions. Updates the stacks of media: transmitted light
+        enters or leaves a medium; reflected and totally reflected light stays in its media.
+        Reflected light keeps its direction here. At surfaces of `Media.mirrors`, mirrored light has
+        rows of its own in `reflected`, so totally reflected light in other rows has the share 0.
         """
-        outer = self.stack
+        stack_before = self.stack
         self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
         if self.differentials is None:
             return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
         ratio = self.media.index(self.stack) / self.differentials.index
-        behind = refracted(directions, normals, cosines, ratio)
-        stays = behind.totally_reflected | reflected
-        self.stack.kinds[stays] = outer.kinds[stays]
-        self.stack.triangles[stays] = outer.triangles[stays]
+        refraction = refracted(directions, normals, cosines, ratio)
+        keeps_media = refraction.totally_reflected | reflected
+        self.stack.kinds[keeps_media] = stack_before.kinds[keeps_media]
+        self.stack.triangles[keeps_media] = stack_before.triangles[keeps_media]
         mirrors = self.media.mirrors[kinds]
-        shares = np.where(behind.totally_reflected & mirrors, 0.0, behind.shares)
+        shares = np.where(refraction.totally_reflected & mirrors, 0.0, refraction.shares)
         shares = np.where(reflected, np.where(mirrors, 1 - shares, 1.0), shares)
-        outgoing = np.where(reflected[:, None], directions, behind.directions)
-        return Refraction(outgoing, shares, behind.totally_reflected)
+        outgoing = np.where(reflected[:, None], directions, refraction.directions)
+        return Refraction(outgoing, shares, refraction.totally_reflected)
 
     def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
         """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3)."""
@@ -533,7 +559,8 @@ def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Float
 def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
     """Choose the crown of each leaf in proportion to the crowns' densities, by random bits (k,).
 
-    `cumulative` (k, MAX_MEDIA) are cumulative sums of densities. Returns indices in the stack.
+    `cumulative` (k, MAX_MEDIA) are cumulative sums of the densities of the media in the stacks.
+    Returns columns of `MediaStack`, (k,).
     """
     share = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
     return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
@@ -545,9 +572,9 @@ def depths(bits: NDArray[np.uint64]) -> Floats:
     The logarithm is computed from the binary exponent and a table of 32,768 logarithms: fast.
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
-    part, halvings = np.frexp(share)
-    row = ((part - 0.5) * (2 * len(_logs()))).astype(np.intp)
-    return np.asarray(_logs()[row] - halvings * float(np.float32(log_of(2.0))))
+    mantissa, exponent = np.frexp(share)
+    row = ((mantissa - 0.5) * (2 * len(_logs()))).astype(np.intp)
+    return np.asarray(_logs()[row] - exponent * float(np.float32(log_of(2.0))))
 
 
 @cache
@@ -562,7 +589,7 @@ def _away_from_zero(cosine: Floats) -> Floats:
     return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
 
 
-def _first(values: Floats, mask: AnyArray, default: float) -> Floats:
+def _first_masked(values: Floats, mask: AnyArray, default: float) -> Floats:
     """Return the first value of each row that is in the mask, or a default: (n,)."""
     column = mask.argmax(axis=1)
     rows = np.arange(len(values))

@@ -58,13 +58,13 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Triangles that were hit and their hits, (k,) each: counts of all triangles of the scene
-        # would take much memory, since they are stored for each station of a batch.
-        hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
-        triangles = np.flatnonzero(hits)
-        self.tally = triangles, hits[triangles]
+        # Counters that are not 0, see `Surfaces.counter`, and their hits, (k,) each: counts of all
+        # triangles of the scene would take much memory, since each station of a batch stores them.
+        counter_hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
+        counters = np.flatnonzero(counter_hits)
+        self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.hits = scanned.hits  # (scans,): hits of each scan, also without a reported return
+        self.hits = scanned.hits  # (scans,): returns of each scan, also if they are not kept
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -130,12 +130,15 @@ class BatchPoints:
 
     @cached_property
     def time(self) -> Ints:
-        """Time of the ray by the sensor's clock, nanoseconds since the survey's start."""
+        """Time of the ray by the sensor's clock, nanoseconds since the survey's start.
+
+        A frozen sensor sends an old sweep again, with the times of the sweep that it replaces.
+        """
         spec = self.specs[0]
         stamp = self._firing_times_ns
         if spec.repeats is not None:
-            first, repeated = map(self.survey.begins_ns, spec.repeats)
-            stamp = stamp + round(repeated - first)
+            repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
+            stamp = stamp + round(current_start_ns - repeated_start_ns)
         jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
         return sum((jump.jumps_ns(stamp) for jump in jumps), stamp)
 
@@ -179,12 +182,16 @@ class BatchPoints:
     def positions(self) -> Floats:
         """Ends of the rays, metres, the scene's local coordinates: (n, 3).
 
-        Points of a frozen sensor stay fixed in the sensor frame, and move with the sensor.
+        The points that a frozen sensor sends again stay fixed in the sensor frame, and move with
+        the sensor.
         """
         return self._moved_with_sensor(self._scene_positions)
 
     def _moved_with_sensor(self, points: Floats) -> Floats:
-        """Move points (n, 3) with a frozen sensor from the repeated sweep to the current sweep."""
+        """Move points (n, 3) with a frozen sensor from the old sweep to the sweep that it replaces.
+
+        Points are in the scene frame; points of a sensor that is not frozen are returned unchanged.
+        """
         if self.specs[0].repeats is None:
             return points
         frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
@@ -283,7 +290,11 @@ class BatchPoints:
         return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
-        """Rotate vectors (n, 3) from the frame of the carrier, or the head, to the sensor frame."""
+        """Rotate vectors (n, 3), a vector for each return, to the sensor frame.
+
+        Vectors are in the frame of the pattern: of the head, where the pattern is a single firing
+        that each pose turns (`CastPoses.by_head`), else of the carrier.
+        """
         if self._poses.by_head:
             spins = self.sensor.spins(self._firings.numbers)
             assert spins is not None  # or the rig would not cast by head
@@ -362,10 +373,10 @@ class BatchPoints:
             facing = surfaces.normals(
                 triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
             )
-            products_with_rays = products(facing.T, self.directions[block].T)
-            facing[products_with_rays > 0] *= -1
+            signed_cosines = products(facing.T, self.directions[block].T)
+            facing[signed_cosines > 0] *= -1
             normals[block] = facing
-            cosines[block] = np.abs(products_with_rays)
+            cosines[block] = np.abs(signed_cosines)
         return normals, cosines
 
     @cached_property
@@ -498,6 +509,7 @@ class BatchPoints:
                 velocity[np.isin(returns.cause, received_causes())] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
+            # A frozen sensor sends an older scan again, with the random numbers of the older scan.
             scan = self.scan.astype(np.int64) + self.specs[0].ahead
             errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
             velocity = velocity + noise.velocity_m_s * errors
@@ -520,13 +532,13 @@ class BatchPoints:
 
     @property
     def waveform(self) -> Records:
-        """Recorded waveform, see `lidarsim.columns.waveforms.record`."""
+        """Recorded waveform, with location and direction: `lidarsim.columns.waveforms.record`."""
         table = required(self.pulse_returns.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
-        ahead = self.directions if world else self._sensor_directions
-        table["toward"] = -ahead * (LIGHT_M_NS / 2000)
+        ray_directions = self.directions if world else self._sensor_directions
+        table["toward"] = -ray_directions * (LIGHT_M_NS / 2000)
         return table.view(column_type(table.dtype["samples"].shape[0]))
 
     @property

@@ -94,8 +94,11 @@ def thin_out(ray, scan_starts, keep_every, counts, rows, number, returns):
 
 
 @inlined
-def _half_way(hit, neighbour, inverse_m, neighbours):
-    """Return the range of the plane of a hit half-way to a neighbouring hit, metres."""
+def _half_way(hit, neighbour, inverse_distance, neighbours):
+    """Return the range of the plane of a hit half-way to a neighbouring hit, metres.
+
+    `hit` and `neighbour` are rows in `Neighbours`; `inverse_distance` is of the hit, 1/m.
+    """
     normals = neighbours.normals
     directions = neighbours.directions
     x = normals[0, hit]
@@ -108,7 +111,7 @@ def _half_way(hit, neighbour, inverse_m, neighbours):
     ratio = 1 + neighbour_cosine / hit_cosine
     if ratio < 1e-9:  # and not if it is unknown
         ratio = 1e-9
-    return 2 / (inverse_m * ratio)
+    return 2 / (inverse_distance * ratio)
 
 
 @stage
@@ -120,6 +123,9 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     the planes through the two hits meet half-way between the hits, within `gap_m` or half of the
     distance between the hits. The inverse range of a plane is linear in the ray's direction, so two
     hits on one plane always meet, whatever the angle; half of the distance allows for rough ground.
+
+    A sub-ray may have several hits, each behind the panes of glass that it hit before: the hits of
+    neighbouring sub-rays behind the same number of panes are compared.
     """
     subrays = neighbours.subrays
     solid = marks.solid
@@ -133,7 +139,9 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     panes = 0
     for k in range(count * subrays):
         subray_hits[k] = -1
-    for k in range(begin, stop):  # subray_hits: by panes of glass before the hit, then by sub-rays
+    # subray_hits: row of the hit of each sub-ray behind 0, 1, … panes of glass, or -1; a block of
+    # `subrays` for each number of panes.
+    for k in range(begin, stop):
         changes[k - begin] = 0
         if solid[k]:
             pane = 0
@@ -141,12 +149,12 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
                 pane += 1
             subray_hits[pane * subrays + hits.subray[k] % subrays] = k
             panes = max(panes, pane + 1)
-    changes[count] = 0
-    first = begin
+    changes[count] = 0  # changes[k]: change of the number of surfaces that continue at hit k
+    first_hit = begin
     for k in range(begin, stop):  # row[k, 1]: the first hit of the return of hit k
         if starts_return[k]:
-            first = k
-        row[k, 1] = first
+            first_hit = k
+        row[k, 1] = first_hit
     for pane in range(panes):
         for pair in range(len(neighbours.pairs)):
             hit = subray_hits[pane * subrays + neighbours.pairs[pair, 0]]
@@ -161,8 +169,8 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
             if abs(hit_m - neighbour_m) <= max(gap_m, SLOPE * between_m):
                 changes[min(hit, neighbour) + 1 - begin] += 1
                 changes[max(hit, neighbour) + 1 - begin] -= 1
-    inside = 0
+    continuing = 0
     for k in range(begin, stop):
-        inside += changes[k - begin]
-        if inside > 0:
+        continuing += changes[k - begin]
+        if continuing > 0:
             apart[k] = False

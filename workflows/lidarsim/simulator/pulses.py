@@ -34,12 +34,17 @@ class Scanned(NamedTuple):
 
 
 class PulseCaster:
-    """Caster of the scans of a sensor."""
+    """Caster of the scans of a sensor, by its number in the survey, with its steps."""
 
     def __init__(
-        self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
+        self,
+        sensor_number: int,
+        caster: SceneCaster,
+        scene: Scene,
+        survey: Survey,
+        surfaces: Surfaces,
     ) -> None:
-        self._setup = setup = setup_of(scene, survey, number)
+        self._setup = setup = setup_of(scene, survey, sensor_number)
         self._caster = caster
         self._surfaces = surfaces
         self.emitter = Emitter(setup)
@@ -51,7 +56,7 @@ class PulseCaster:
         pattern: Pattern,
         poses: CastPoses,
         window: tuple[int, int],
-        groups: Ints,
+        scan_starts: Ints,
         firings: Firings,
         *,
         tally: bool = True,
@@ -61,43 +66,46 @@ class PulseCaster:
         Parameters
         ----------
         scan
-            Number of the first scan.
+            Number of the first scan, by which random numbers are drawn: of a frozen sensor, the
+            number of the older scan that is sent again.
         pattern
             Rays of the beams.
         poses
             Poses of the beams.
         window
             First row of the beams in `pattern`, and one past the last.
-        groups
-            (scans,): first beam of each scan.
+        scan_starts
+            (scans,): first beam of each scan, counted from 0 at the first row of the window.
         firings
             Firings of the beams.
         tally
-            Whether hits are counted by `Surfaces.counter`.
+            Whether returns from surfaces are counted by `Surfaces.counter`.
         """
-        first = window[0]
-        rays = window[1] - window[0]
+        first_row = window[0]
+        beam_count = window[1] - window[0]
 
         def batch(start: int, stop: int) -> PulseBatch:
-            keys = Keys(scan, groups)
-            return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
+            keys = Keys(scan, scan_starts)
+            return PulseBatch(keys, start, stop, pattern, first_row, poses, firings, self.emitter)
 
-        all_beams = batch(0, rays)
+        all_beams = batch(0, beam_count)
         if self._setup.has_several_returns:
-            unit = poses.rays_per_pose or self._setup.sensor.channels
-            size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
-            chunk_starts = range(0, rays, size)
-            chunks = [self._pulses(batch(k, min(k + size, rays))) for k in chunk_starts]
-            scanned = self._thin_out(joined(chunks), groups, tally)
+            pose_beams = poses.rays_per_pose or self._setup.sensor.channels
+            chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
+            chunk_starts = range(0, beam_count, chunk_beams)
+            chunks = [
+                self._pulses(batch(k, min(k + chunk_beams, beam_count))) for k in chunk_starts
+            ]
+            scanned = self._thin_out(joined(chunks), scan_starts, tally)
         else:
-            scanned = self._cast_once(all_beams, groups, tally)
+            scanned = self._cast_once(all_beams, scan_starts, tally)
         returns = scanned.returns
         for step in self.steps:
             if Role.ON_REPORTED in step.role:
                 returns = step.apply(returns, all_beams)
-        return self._within_range(scanned._replace(returns=returns), groups)
+        return self._within_range(scanned._replace(returns=returns), scan_starts)
 
-    def _within_range(self, scanned: Scanned, groups: Ints) -> Scanned:
+    def _within_range(self, scanned: Scanned, scan_starts: Ints) -> Scanned:
         """Remove the returns whose ranges, with noise, are outside of the sensor's range.
 
         The counts and the numbers of the other returns are as if the removed ones were undetected.
@@ -111,18 +119,18 @@ class PulseCaster:
         if in_range.all():
             return scanned
         removed = np.flatnonzero(~in_range)
-        group = np.searchsorted(groups, returns.ray[removed], "right") - 1
-        hits = scanned.hits - np.bincount(group, minlength=len(groups))
+        removed_scan = np.searchsorted(scan_starts, returns.ray[removed], "right") - 1
+        hits = scanned.hits - np.bincount(removed_scan, minlength=len(scan_starts))
         tally = scanned.tally
         if tally is not None:
             triangle = returns.triangle[removed]
             counter = self._surfaces.counter(triangle[triangle != NO_SURFACE])
             tally = tally - np.bincount(counter, minlength=len(tally))
-        first = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
-        last = np.searchsorted(returns.ray, returns.ray, "right")
+        start = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
+        stop = np.searchsorted(returns.ray, returns.ray, "right")
         removed_before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
-        number = required(returns.number) - (removed_before[:-1] - removed_before[first])
-        count = required(returns.returns) - (removed_before[last] - removed_before[first])
+        number = required(returns.number) - (removed_before[:-1] - removed_before[start])
+        count = required(returns.returns) - (removed_before[stop] - removed_before[start])
         renumbered = returns._replace(
             number=number.astype(np.uint8), returns=count.astype(np.uint8)
         )
@@ -136,11 +144,11 @@ class PulseCaster:
                 returns = step.apply(returns, batch)
         return returns
 
-    def _cast_once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
+    def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> Scanned:
         """Cast rays that have a single return each, counted and thinned out by the caster.
 
-        Energies are computed only for kept returns, and only if steps turn beams; else they follow
-        from the reported directions.
+        Energies are computed only for kept returns, and only if steps deflect beams before they are
+        cast (`Role.AIMS`); else `BatchPoints` computes energies by the reported directions.
         """
         setup = self._setup
         poses = batch.poses
@@ -154,7 +162,7 @@ class PulseCaster:
             t_min=setup.sensor.min_range_m,
             t_max=setup.sensor.max_range_m,
             keep_every=setup.survey.keep_every,
-            groups=groups,
+            groups=scan_starts,
             tally=tally,
         )
         returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
@@ -163,7 +171,7 @@ class PulseCaster:
         return Scanned(returns, hits.hits, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add energy, colour and velocity to returns, by the directions in which rays were cast."""
+        """Add energy, colour and velocity to returns of deflected beams, by cast directions."""
         surfaces = self._surfaces
         setup = self._setup
         poses = batch.poses
@@ -187,18 +195,18 @@ class PulseCaster:
         )
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
-    def _thin_out(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
+    def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan, and keep every n-th return of a scan."""
         from . import pulse_loops  # not before: numba takes half a second to import
 
         keep_every = self._setup.survey.keep_every
         size = len(returns.ray)
-        hits = np.zeros(len(groups), np.int64)
+        hits = np.zeros(len(scan_starts), np.int64)
         rows = np.empty(size, np.int64)
         number, returns_of_pulse = np.empty((2, size), np.uint8)
         count = pulse_loops.thin_out(
             owned(returns.ray, np.int64),
-            owned(groups, np.int64),
+            owned(scan_starts, np.int64),
             keep_every,
             hits,
             rows,

@@ -52,16 +52,18 @@ class PulseReturns(NamedTuple):
     ray: Integers
     distance: Floats  # metres, without noise
     triangle: Ints32
-    # Received, see `Surfaces.energy`; None if it follows from the rays as they are reported.
+    # Received, see `Surfaces.energy`; None if `BatchPoints` computes it from the reported rays.
     energy: Floats | None = None
-    # Packed, see `Surfaces.colours`; None if it is taken at the rays' ends, or not needed.
+    # Packed, see `Surfaces.colours`; None if it is not needed, or `BatchPoints` looks it up at the
+    # ends of the rays.
     colour: UInts32 | None = None
     cause: Bytes | None = None  # indices into `CAUSES`; None if all hits are on surfaces
     velocity: Floats | None = None  # radial, m/s, if a column stores it; NaN if unknown
     # Full width at half maximum in the waveform, ns, and its height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
-    waveform: Records | None = None  # recorded, but for the location
+    # Recorded, see `columns.waveforms.record`; `BatchPoints` adds `location_ps` and `toward`.
+    waveform: Records | None = None
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
     returns: Bytes | None = None  # number of reported returns of its pulse
     reported: Floats | None = None  # distance with noise, metres
@@ -89,8 +91,8 @@ class PulseReturns(NamedTuple):
         return required(self.energy if self.amplitude is None else self.amplitude)
 
 
-# Normals of the surfaces of hits, as they are seen in mirrors, and directions of the hits' rays:
-# (n, 3) each.
+# Normals of the surfaces of hits, and directions of the sub-rays at the sensor: (n, 3) each. The
+# normals of surfaces that are seen in mirrors are reflected, as the surfaces appear to the sensor.
 Planes = tuple[Floats, Floats]
 
 
@@ -125,18 +127,21 @@ def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
 
 
 def returns_without_surface(
-    returns: PulseReturns, ray: Ints, distance: Floats, energy: Floats, cause: int
+    template: PulseReturns, ray: Ints, distance: Floats, energy: Floats, cause: int
 ) -> PulseReturns:
-    """Return rows (n,) that are not from a surface, with the columns of a table of returns."""
+    """Return a table of returns (n,) that are not from a surface, all of one cause.
+
+    The table has the columns `colour` and `amplitude` if the table `template` has these columns.
+    """
     count = len(ray)
     return PulseReturns(
         ray,
         distance,
         np.full(count, NO_SURFACE, np.int32),
         energy,
-        None if returns.colour is None else np.full(count, packed(GREY[0])[0]),
+        None if template.colour is None else np.full(count, packed(GREY[0])[0]),
         np.full(count, cause, np.uint8),
-        amplitude=None if returns.amplitude is None else energy,
+        amplitude=None if template.amplitude is None else energy,
     )
 
 
@@ -152,7 +157,7 @@ def merged(returns: PulseReturns, additions: PulseReturns) -> PulseReturns:
 class Keys:
     """Keys of the random numbers of rays."""
 
-    scan: int  # number of the first scan
+    scan: int  # number of the first scan; of a frozen sensor, of the older scan that is sent again
     scan_starts: Ints  # (scans,): first ray of each scan
 
     def scan_and_number(self, ray: Integers) -> tuple[Ints, Ints]:

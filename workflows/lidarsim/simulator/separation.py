@@ -42,7 +42,7 @@ class Reporting(NamedTuple):
     mode: Mode = "all"
     noise: Noise | None = None  # by which returns are lost; None if all are detected
     keys: Keys | None = None
-    first: int = 0  # number of the first beam for the keys
+    first: int = 0  # number, counted as in `keys`, of the beam of sub-ray 0 of the hits
 
 
 def separated(
@@ -168,7 +168,10 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
 
 
 def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> SubrayHits:
-    """Return hits for loops, with velocities on request."""
+    """Return hits for loops, with velocities on request.
+
+    `solid` (n,) says whether hits are on surfaces; empty for hits in the air.
+    """
     from .separation_loops import SubrayHits
 
     velocity = hits.velocity if with_velocity else None
@@ -194,7 +197,7 @@ def neighbours_of(subrays: int, planes: Planes | None) -> Neighbours:
 
 
 class SeparationStep(PulseStep):
-    """Makes returns of hits by their distances, and detects and reports the returns."""
+    """Makes returns of hits by their distances, and keeps the detected and reported returns."""
 
     role = Role.FRAME
     reads = "ray", "distance", "triangle", "energy", "velocity"

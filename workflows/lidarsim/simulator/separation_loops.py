@@ -129,7 +129,7 @@ def _single_return(hits, rows, beam, receiver, count, output):
     """
     nearest_m = np.inf
     farthest_m = -np.inf
-    best = rows.start
+    strongest = rows.start
     has_energy = False
     sum_energy = 0.0
     sum_distance = 0.0
@@ -142,14 +142,14 @@ def _single_return(hits, rows, beam, receiver, count, output):
             sum_distance += hits.energy[k] * hits.distance[k]
             if receiver.with_velocity:
                 sum_velocity += hits.energy[k] * hits.velocity[k]
-            if not has_energy or hits.energy[k] > hits.energy[best]:
-                best = k
+            if not has_energy or hits.energy[k] > hits.energy[strongest]:
+                strongest = k
             has_energy = True
     if not farthest_m - nearest_m <= receiver.gap_m:
         return False, count
     if has_energy:
         output.beam[count] = beam
-        output.row[count] = best
+        output.row[count] = strongest
         output.distance[count] = sum_distance / sum_energy
         output.energy[count] = sum_energy / receiver.subrays
         if receiver.with_velocity:
@@ -250,7 +250,7 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
     velocity = scratch.velocity
     k = 0
     while k < hit_count:
-        best = k
+        strongest = k
         sum_energy = 0.0
         sum_distance = 0.0
         sum_velocity = 0.0
@@ -259,13 +259,13 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
             sum_distance += energy[k] * distance[k]
             if receiver.with_velocity:
                 sum_velocity += energy[k] * velocity[k]
-            if energy[k] > energy[best]:
-                best = k
+            if energy[k] > energy[strongest]:
+                strongest = k
             k += 1
             if k == hit_count or starts_return[k]:
                 break
         output.beam[count] = beam
-        output.row[count] = row[best, 0]
+        output.row[count] = row[strongest, 0]
         output.distance[count] = sum_distance / sum_energy
         output.energy[count] = sum_energy / receiver.subrays
         if receiver.with_velocity:
@@ -286,46 +286,62 @@ def _keep(output, k, count):
 
 
 @inlined
-def _detected(energy, scan, beam, number, receiver, starts):
-    """Return whether a return is detected, as `detection.detected` does."""
+def _detected(energy, scan, number_in_scan, return_index, receiver, hash_starts):
+    """Return whether a return is detected, as `detection.detected` does.
+
+    `scan`, the beam's `number_in_scan` and the `return_index` within the beam, from 0, are the key
+    of the random numbers; `hash_starts` are the starts of the hashes for loss and for detection.
+    """
     quantiles = receiver.quantiles
-    detected = receiver.dropout == 0 or uniform(starts[0], scan, beam, number) >= receiver.dropout
+    detected = (
+        receiver.dropout == 0
+        or uniform(hash_starts[0], scan, number_in_scan, return_index) >= receiver.dropout
+    )
     if detected and receiver.threshold > 0:
         signal = receiver.threshold_sigmas * (energy / receiver.threshold - 1)
         detected = signal + quantiles[0] > 0  # whatever is drawn
         if not detected and signal + quantiles[-1] > 0:
-            index = np.int64(bits(starts[1], scan, beam, number) >> SHIFT_TO_INDEX)
+            index = np.int64(
+                bits(hash_starts[1], scan, number_in_scan, return_index) >> SHIFT_TO_INDEX
+            )
             detected = signal + quantiles[index] > 0
     return detected
 
 
 @inlined
-def _keep_detected(begin, stop, scan, number_in_scan, receiver, starts, output):
-    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row."""
+def _keep_detected(begin, stop, scan, number_in_scan, receiver, hash_starts, output):
+    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row.
+
+    `scan` and the beam's `number_in_scan` are keys of random numbers, see `_detected`.
+    """
     count = begin
     for k in range(begin, stop):
-        if _detected(output.energy[k], scan, number_in_scan, k - begin, receiver, starts):
+        if _detected(output.energy[k], scan, number_in_scan, k - begin, receiver, hash_starts):
             count = _keep(output, k, count)
     return count
 
 
 @stage
 def _mark(energy, begin, stop, mode, shown):
-    """Mark which returns of a pulse a mode reports; the nearest of equally strong returns."""
-    best = begin
-    second = -1
+    """Mark which returns of a pulse a mode reports; the nearest of equally strong returns.
+
+    "Dual" reports the strongest and the last return; if the strongest is the last, also the
+    strongest return before the last.
+    """
+    strongest = begin
+    strongest_before_last = -1
     for k in range(begin + 1, stop):
-        if energy[k] > energy[best]:
-            best = k
-    if mode == DUAL and best == stop - 1:
+        if energy[k] > energy[strongest]:
+            strongest = k
+    if mode == DUAL and strongest == stop - 1:
         for k in range(begin, stop - 1):
-            if second < 0 or energy[k] > energy[second]:
-                second = k
+            if strongest_before_last < 0 or energy[k] > energy[strongest_before_last]:
+                strongest_before_last = k
     for k in range(begin, stop):
-        shown[k] = mode == ALL or k == second
+        shown[k] = mode == ALL or k == strongest_before_last
     shown[begin] |= mode == FIRST
     shown[stop - 1] |= mode in (LAST, DUAL)
-    shown[best] |= mode in (STRONGEST, DUAL)
+    shown[strongest] |= mode in (STRONGEST, DUAL)
 
 
 @inlined
@@ -358,7 +374,8 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - 
     """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
 
     `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
-    `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost.
+    `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost. Beams
+    are numbered from 0 at sub-ray 0; beam 0 is beam `keys.first` of the scans in `keys`.
     Returns the number of returns.
     """
     subrays = receiver.subrays

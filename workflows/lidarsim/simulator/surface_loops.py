@@ -43,10 +43,10 @@ class TriangleOwners(NamedTuple):
 class HitSurfaces(NamedTuple):
     """Surfaces of hits: (n,) each."""
 
-    row: Ints  # of the normal among stored triangles, or `~row` among deformed triangles
+    row: Ints  # of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
     kind: Ints32  # of the surface
     instance: Ints  # or -1
-    run: Ints  # row of the actor's pose, or -1; empty without actors
+    run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
 
 
 class NormalTables(NamedTuple):
@@ -55,15 +55,17 @@ class NormalTables(NamedTuple):
     stored: Floats32  # (f, 3): unit normals of stored triangles
     deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
     instances: Floats  # (i, 3, 3): from normals of parts to normals of instances, of any length
-    poses: Floats  # (12, m): of actors, by runs: position, and rotation by rows
+    # (12, m): poses of actors, position and rotation by rows; a column for each run of hits that
+    # have equal actors and times.
+    poses: Floats
 
 
 class Incidence(NamedTuple):
     """Incidence of rays on surfaces."""
 
-    normals: Floats  # (3, n): unit normals
+    normals: Floats  # (3, n): unit normals, scene frame
     cosines: Floats  # (n,): products of normals and directions, of either sign
-    back: Floats  # (n,): light that is sent back at a distance of 10 m
+    back: Floats  # (n,): energy that is received from the surface at a distance of 10 m
 
 
 class WaterFilm(NamedTuple):
@@ -79,7 +81,7 @@ class OnwardOptics(NamedTuple):
 
     specular: Floats  # share of light that is mirrored at normal incidence
     passes: Bools  # whether light passes as through glass
-    straight: Bools  # whether light is not refracted
+    straight: Bools  # whether the surface bounds no refracting medium, so that light is not bent
     leafy: Bools  # whether the surface bounds leaves, and sends nothing back
 
 
@@ -89,24 +91,27 @@ class OnwardHits(NamedTuple):
     kind: Ints32
     cosines: Floats  # of either sign
     film: Bools  # whether there may be water; empty without water
-    share: Floats  # of the light that arrives, out and back
-    distance: Floats  # metres
+    share: Floats  # of the energy, after the earlier surfaces: light passes each out and back
+    distance: Floats  # optical path from the sensor, metres
 
 
 class OnwardLimits(NamedTuple):
     """Water and detection of light that goes on."""
 
     wet: float  # share of surfaces with a film that is below water
-    brightest: float  # largest energy at a distance of 10 m
+    brightest: float  # largest energy that any surface returns at a distance of 10 m
     extinction: float  # 1/m
     faintest: float  # light that can return no more energy is dropped
 
 
 class ActorTriangles(NamedTuple):
-    """Numbers of the triangles of actors."""
+    """Numbers of the triangles of actors.
 
-    parts: Ints32  # (shapes, parts): first triangle of each part of a shape
-    shape: Ints  # (actors,)
+    A shape is a distinct mesh, which actors may share; its parts are cast separately.
+    """
+
+    parts: Ints32  # (shapes, parts): first triangle of each part, numbered within the shape
+    shape: Ints  # (actors,): row of `parts`
     firsts: Ints32  # (actors,): first triangle of each actor
 
 
@@ -121,17 +126,19 @@ class JoinedHits(NamedTuple):
 class TrackTable(NamedTuple):
     """Straight tracks among trajectories, with their segments in the order of tracks."""
 
-    member: Ints  # (w,): number among the tracks of each trajectory, -1 for other trajectories
+    member: Ints  # (w,): for each trajectory its track, 0 to t - 1; -1 for curved trajectories
     first: Ints  # (t,): first segment of each track
     segments: Ints  # (t,): number of segments of each track
     # (4, t): seconds: start by the track's clock, first and last time of its poses, and how far
     # outside these a time may be; inf for any time.
     limits: Floats
     times: Floats  # (s,): start of each segment, seconds
-    start: Floats  # (3, s), and the following as `Track.segments`
-    speed: Floats  # (3, s)
-    rotation: Floats  # (3, 9, s)
-    rates: Floats  # (s,)
+    start: Floats  # (3, s): position at the start of each segment, metres
+    speed: Floats  # (3, s): velocity, m/s
+    # (3, 9, s): a rotation, by rows, is term 0 + sin(a) term 1 + cos(a) term 2, where a is the
+    # angle since the start of the segment: see `Segments`.
+    rotation: Floats
+    rates: Floats  # (s,): growth of the angle a, rad/s
 
 
 @inlined
@@ -267,42 +274,47 @@ def fade(distance, extinction, energy):
 
 
 @compiled()
-def soak(up, cosines, kinds, shares, water, film, back):
-    """Mark hits where there may be water in `film`, and multiply their light by that below water.
+def soak(normals_z, cosines, kinds, shares, water, film, back):
+    """Mark hits where there may be water in `film`, and reduce their energies `back` by the water.
 
-    `up` are z of the normals, `shares` the shares of light that surfaces scatter, `water` is a
-    `WaterFilm`, and `back` the light that is sent back: (n,) each.
+    `normals_z` are z of the normals, `shares` the shares of light that surfaces scatter, and `back`
+    the received energies: (n,) each. `water` is a `WaterFilm`. The share `WaterFilm.wet` of marked
+    surfaces scatters as below water, which mirrors a part of the light on the way in and out.
     """
     level = water.level
     wet = water.wet
     dry = water.dry
-    for k in range(len(up)):
-        upright = up[k] if cosines[k] < 0 else -up[k]
-        film[k] = upright >= level and not dry[kinds[k]]
+    for k in range(len(normals_z)):
+        visible_z = normals_z[k] if cosines[k] < 0 else -normals_z[k]
+        film[k] = visible_z >= level and not dry[kinds[k]]
         if film[k]:
             mirrored = fresnel(abs(cosines[k]), WATER_INDEX)
             back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
 
 
 @compiled()
-def divide_light(rows, reflected, hits, shares, optics, limits, share):
+def divide_light(rows, reflected, hits, shares, optics, limits, onward_share):
     """Write the share of light that goes on from `rows` of hits, through surfaces or reflected.
 
-    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`; `shares` (k,) are
-    the shares of light that surfaces scatter. Where light is refracted, a surface's mirrored light
-    is neither taken off nor alone. Light that is too faint is dropped: overwrites `rows` and
-    `reflected` by the remaining light, and writes its `share`, out and back. Returns the number of
-    rows.
+    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`. For each of the
+    `rows` (k,), `reflected` (k,) is True for light that the surface mirrors, False for light that
+    passes the surface, and `shares` (k,) is the share of light that the surface scatters. At
+    surfaces of refracting media, light is not divided here into mirrored and transmitted light:
+    `LightInMedia.cross` divides it. Light that is too faint is dropped: overwrites `rows` and
+    `reflected` by the remaining light, and writes its `onward_share`: of the energy, since light
+    passes the surface out and back. Returns the number of remaining rows.
     """
     count = 0
     for j in range(len(rows)):
         k = rows[j]
         kind = hits.kind[k]
         cosine = abs(hits.cosines[k])
-        first = optics.specular[kind]
+        specular = optics.specular[kind]
         grazing = 1 - min(cosine, 1.0)
         square = grazing * grazing
-        mirrored = first + (1 - first) * (grazing * (square * square)) if first > 0 else 0.0
+        mirrored = (
+            specular + (1 - specular) * (grazing * (square * square)) if specular > 0 else 0.0
+        )
         if optics.passes[kind]:
             mirrored = fresnel(cosine, GLASS_INDEX)
         onward = mirrored if reflected[j] else 1 - mirrored if optics.passes[kind] else 1.0
@@ -315,7 +327,7 @@ def divide_light(rows, reflected, hits, shares, optics, limits, share):
         if onward * brightest > limits.faintest:
             rows[count] = k
             reflected[count] = reflected[j]
-            share[count] = onward
+            onward_share[count] = onward
             count += 1
     return count
 
@@ -347,9 +359,10 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of rays (n,), of which `subrays` are of a beam, from beam `start` on.
+    """Write the firing times of sub-rays `ray` (n,) to `times`.
 
-    `firing_starts` are by firings, `delays` by the beams of a firing.
+    Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
+    times of firings, and `delays` the times of the beams of a firing after its start.
     """
     first_beam = 0
     firing = -1
@@ -367,14 +380,15 @@ def merge(ray, triangle, nearest, actors, output):
     """Write the nearest hits of rays, on static bodies and actors, to `output`, `JoinedHits`.
 
     `ray` and `triangle` (k,) are hits on static bodies, in the order of rays. `nearest` are the
-    nearest hits of all rays on actors, `raybeam.crossing.Nearest`, with distances to static bodies
-    for rays that miss all actors; `actors` are `ActorTriangles`. Returns the number of hits.
+    nearest hits of all rays on actors, `raybeam.crossing.Nearest`: the body is the actor, or below
+    0 for rays that miss all actors, whose distance is then the distance to static bodies. `actors`
+    are `ActorTriangles`. Returns the number of hits.
     """
-    bodies = nearest.body
+    hit_actors = nearest.body
     i = 0
     count = 0
-    for k in range(len(bodies)):
-        actor = bodies[k]
+    for k in range(len(hit_actors)):
+        actor = hit_actors[k]
         hit = i < len(ray) and ray[i] == k
         if actor >= 0:
             part_triangle = actors.parts[actors.shape[actor], nearest.instance[k]]
@@ -390,21 +404,22 @@ def merge(ray, triangle, nearest, actors, output):
 
 
 @compiled()
-def find_runs(number, times, first, run):
-    """Write the run of each row, and the first row of each run; return the number of runs.
+def find_runs(trajectory, times, first_rows, run_numbers):
+    """Write the number of each row's run, and the first row of each run; return the number of runs.
 
-    In a run, actors and times are equal; rows with actors below 0 have the run -1.
+    In a run, trajectories and times are equal. `trajectory` (n,) are numbers of trajectories; rows
+    with numbers below 0 have the run -1, and do not end a run.
     """
     count = 0
     last = -1
-    for k in range(len(number)):
-        run[k] = -1
-        if number[k] < 0:
+    for k in range(len(trajectory)):
+        run_numbers[k] = -1
+        if trajectory[k] < 0:
             continue
-        if last < 0 or number[k] != number[last] or times[k] != times[last]:
-            first[count] = k
+        if last < 0 or trajectory[k] != trajectory[last] or times[k] != times[last]:
+            first_rows[count] = k
             count += 1
-        run[k] = count - 1
+        run_numbers[k] = count - 1
         last = k
     return count
 
@@ -413,14 +428,14 @@ def find_runs(number, times, first, run):
 def _segment_at(tracks, track, time_s):
     """Return the last segment of a track that has started at a time, by binary search."""
     segment = tracks.first[track]
-    room = tracks.segments[track] - 1
-    while room:
-        half = (room + 1) // 2
+    later_segments = tracks.segments[track] - 1
+    while later_segments:
+        half = (later_segments + 1) // 2
         if tracks.times[segment + half] <= time_s:
             segment = segment + half
-            room = room - half
+            later_segments = later_segments - half
         else:
-            room = half - 1
+            later_segments = half - 1
     return segment
 
 
@@ -437,18 +452,18 @@ def _write_pose(tracks, segment, elapsed_s, poses, k):
 
 
 @compiled()
-def poses_on_tracks(number, times_ns, tracks, poses):
+def poses_on_tracks(trajectory, times_ns, tracks, poses):
     """Write poses (12, n) of trajectories on straight tracks, with the operations of `Track.poses`.
 
-    `number` (n,) are trajectories, and `tracks` is a `TrackTable`; other trajectories are left out.
-    Returns the first row whose time is outside of its track, or -1.
+    `trajectory` (n,) are numbers of trajectories, and `tracks` is a `TrackTable`; columns of curved
+    trajectories are not written. Returns the first row whose time is outside of its track, or -1.
     """
     limits = tracks.limits
-    for k in range(len(number)):
-        track = tracks.member[number[k]]
+    for k in range(len(trajectory)):
+        track = tracks.member[trajectory[k]]
         if track < 0:
             continue
-        if k and number[k] == number[k - 1] and times_ns[k] == times_ns[k - 1]:
+        if k and trajectory[k] == trajectory[k - 1] and times_ns[k] == times_ns[k - 1]:
             for part in range(12):
                 poses[part, k] = poses[part, k - 1]
             continue

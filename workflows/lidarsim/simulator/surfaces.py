@@ -56,10 +56,10 @@ class _Corners(NamedTuple):
 class LitHits(NamedTuple):
     """Hits of rays on surfaces."""
 
-    normals: Floats  # (n, 3)
+    normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
     cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
-    kinds: Ints32  # (n,): rows of the table of materials
-    energy: Floats  # (n,): see `Surfaces.energy`
+    kinds: Ints32  # (n,): kinds of surfaces, rows of the table of materials
+    energy: Floats  # (n,): see `Surfaces.energy`; less below a film of water
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 
@@ -84,8 +84,12 @@ class Surfaces:
     """Optical properties of triangles.
 
     Triangles are numbered by the scene's faces, then instance by instance, then by actors. Stored
-    triangles are the scene's faces, then the meshes of actors, then the parts of instances, each
-    once. `wavelengths` are the wavelengths of all sensors, nanometres.
+    triangles are the scene's faces, then the distinct meshes of actors, then the parts of meshes
+    that instances place, each once: instances of a part share its stored triangles. `wavelengths`
+    are the wavelengths of all sensors, nanometres.
+
+    A kind of surface is an object, or a material of an object whose files have several materials;
+    it is a row of the table of materials. Objects of actors follow the static objects.
 
     Raises
     ------
@@ -109,25 +113,27 @@ class Surfaces:
         }
         self.material_kinds = kinds
         self.grids = Grids.from_instances(scene.instances)
-        shared = scene.instances
-        plain = len(scene.faces)
-        sizes = np.zeros(0, np.int64) if shared is None else shared.sizes
+        instances = scene.instances
+        face_count = len(scene.faces)
+        instance_sizes = np.zeros(0, np.int64) if instances is None else instances.sizes
         # First triangle of each instance, and of actors.
-        self._instance_starts = plain + np.cumsum([0, *sizes])
-        moving = [len(actor.mesh.faces) for actor in scene.actors]
-        self._meshes, self._actor_shape = distinct_meshes(scene.actors)
+        self._instance_starts = face_count + np.cumsum([0, *instance_sizes])
+        actor_sizes = [len(actor.mesh.faces) for actor in scene.actors]
+        self._meshes, self._actor_mesh = distinct_meshes(scene.actors)
         mesh_sizes = [len(mesh.faces) for mesh in self._meshes]
-        self._shape_starts = starts = plain + np.cumsum([0, *mesh_sizes])
-        actor_starts = self._instance_starts[-1] + np.cumsum([0, *moving])[:-1]
-        # By actors: from the numbers of triangles to stored rows.
-        self._actor_shifts = starts[self._actor_shape] - actor_starts
-        self._parts_start = int(starts[-1])
-        owners = np.arange(self._static_objects, self._static_objects + len(moving), dtype=np.int32)
+        self._mesh_starts = mesh_starts = face_count + np.cumsum([0, *mesh_sizes])
+        actor_starts = self._instance_starts[-1] + np.cumsum([0, *actor_sizes])[:-1]
+        # (actors,): add to the number of an actor's triangle for its row among stored triangles.
+        self._actor_shifts = mesh_starts[self._actor_mesh] - actor_starts
+        self._parts_start = int(mesh_starts[-1])
+        owners = np.arange(
+            self._static_objects, self._static_objects + len(actor_sizes), dtype=np.int32
+        )
         # Objects of the triangles of faces and of actors; the last is of no triangle.
-        objects = [scene.face_object, np.repeat(owners, moving), np.full(1, -1, np.int32)]
+        objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(objects)
         self._normal_matrices = (
-            np.zeros((0, 3, 3)) if shared is None else _normal_matrices(shared.transforms)
+            np.zeros((0, 3, 3)) if instances is None else _normal_matrices(instances.transforms)
         )
 
     @property
@@ -140,7 +146,7 @@ class Surfaces:
         return self._tables[wavelength_nm]
 
     def moved(self, scene: Scene, rows: Indices) -> Surfaces:
-        """Return surfaces of a scene whose instances `rows` are placed anew."""
+        """Return the surfaces of a scene in which the instances `rows` have new transforms."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
@@ -164,14 +170,16 @@ class Surfaces:
         """Numbers of triangles, objects and instances, for loops."""
         from .surface_loops import TriangleNumbers
 
-        shared = self._scene.instances
+        instances = self._scene.instances
         no_instances = np.zeros(0, np.int64)
         return TriangleNumbers(
             instance_starts=owned(self._instance_starts, np.int64),
             owners=owned(self.owners, np.int32),
-            instance_objects=owned(no_instances if shared is None else shared.owner, np.int32),
+            instance_objects=owned(
+                no_instances if instances is None else instances.owner, np.int32
+            ),
             instance_rows=owned(
-                no_instances if shared is None else self._part_starts[shared.part], np.int64
+                no_instances if instances is None else self._part_starts[instances.part], np.int64
             ),
             actor_shifts=owned(self._actor_shifts, np.int64),
             static_objects=self._static_objects,
@@ -180,9 +188,10 @@ class Surfaces:
     def normals(
         self, triangle: Integers, times: Floats | Ints, trajectories: ActorTrajectories
     ) -> Floats:
-        """Return the unit normals of triangles (n,): (n, 3), in single precision.
+        """Return the unit normals of triangles (n,) in the scene frame: float64 (n, 3).
 
-        Normals of actors are rotated by the poses of the actors at times (n,), nanoseconds.
+        The normals are as exact as single precision. Normals of actors are rotated by the poses of
+        the actors at times (n,), nanoseconds.
         """
         directions = np.zeros((len(triangle), 3))
         incidence, _ = self._meet(triangle, directions, self.materials, times, trajectories)
@@ -196,9 +205,10 @@ class Surfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> tuple[Incidence, Ints32]:
-        """Return how rays with directions (n, 3) meet triangles (n,), and kinds of surfaces (n,).
+        """Return the incidence of rays on triangles (n,), and the kinds of their surfaces (n,).
 
-        The light that is sent back is that of surfaces that are neither textured nor rough.
+        `directions` (n, 3) are in the scene frame, and `times` (n,) are nanoseconds, for the poses
+        of actors. `Incidence.back` assumes surfaces that are neither textured nor rough.
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -215,7 +225,7 @@ class Surfaces:
                     row[deforming], actors[deforming], times[deforming], trajectories
                 )
                 deformed_normals = _normals(deformed.corners)
-                row[deforming] = ~np.arange(len(deforming))
+                row[deforming] = ~np.arange(len(deforming))  # rows of `deformed_normals`
         cosines, back = np.empty((2, len(row)))
         incidence = surface_loops.Incidence(np.empty((3, len(row))), cosines, back)
         surface_loops.meet(
@@ -240,12 +250,14 @@ class Surfaces:
         trajectories: ActorTrajectories,
         colours: UInts32 | None = None,
     ) -> LitHits:
-        """Return how rays (n,) with unit directions (n, 3) meet triangles, and their energies.
+        """Return normals, cosines, kinds of surfaces and received energies of hits of rays (n,).
 
         Parameters
         ----------
         triangle, distance
-            (n,): triangles on which the rays end, and the distances in metres.
+            (n,): triangles on which the rays end, and the rays' lengths (optical paths), metres.
+        directions
+            (n, 3): unit directions of the rays, scene frame.
         light
             Light of the sensor.
         times
@@ -285,23 +297,23 @@ class Surfaces:
         """
         corners, corner_velocities, at_rest = np.empty((3, len(rows), 3, 3))
         frames, frame_rates = trajectories.played(actors, times)
-        shapes = self._actor_shape[actors]
-        for shape in np.unique(shapes).tolist():
-            mesh = self._meshes[shape]
-            of_shape = np.flatnonzero(shapes == shape)
+        mesh_numbers = self._actor_mesh[actors]
+        for mesh_number in np.unique(mesh_numbers).tolist():
+            mesh = self._meshes[mesh_number]
+            with_mesh = np.flatnonzero(mesh_numbers == mesh_number)
             assert mesh.animation is not None
-            vertex = mesh.faces[rows[of_shape] - self._shape_starts[shape]]
-            corners[of_shape], steps = mesh.animation.vertices_at(frames[of_shape], vertex)
-            corner_velocities[of_shape] = steps * frame_rates[of_shape, None, None]
-            at_rest[of_shape] = mesh.vertices[vertex]
+            vertex_rows = mesh.faces[rows[with_mesh] - self._mesh_starts[mesh_number]]
+            corners[with_mesh], steps = mesh.animation.vertices_at(frames[with_mesh], vertex_rows)
+            corner_velocities[with_mesh] = steps * frame_rates[with_mesh, None, None]
+            at_rest[with_mesh] = mesh.vertices[vertex_rows]
         return _Corners(corners, corner_velocities, at_rest)
 
     def _actor_rows(
         self, triangle: Integers, trajectories: ActorTrajectories
     ) -> tuple[Indices, Integers]:
-        """Return the rows of triangles (n,) that belong to actors, and the actors: (k,) each.
+        """Return the indices in `triangle` (n,) of actors' triangles, and the actors: (k,) each.
 
-        Without trajectories, there are no rows.
+        Without trajectories, there are no actors, and the arrays are empty.
         """
         if not trajectories:
             return _NO_ROWS, _NO_ROWS
@@ -317,6 +329,7 @@ class Surfaces:
     ) -> UInts32:
         """Return the colours of points (n, 3) on triangles (n,), packed: (n,).
 
+        Points are in the scene frame, metres. Without colours in the scene, all points are grey.
         Actors have their poses at times (n,), nanoseconds.
         """
         if self._lookup is None:
@@ -340,9 +353,11 @@ class Surfaces:
             points = points.copy()
         if len(on_instances):
             assert self._scene.instances is not None
-            placed = instance[on_instances]
-            from_origins = points[on_instances] - self._scene.instances.transforms[placed, :, 3]
-            points[on_instances] = into_axes(from_origins, self._normal_matrices[placed])
+            instance_numbers = instance[on_instances]
+            from_origins = (
+                points[on_instances] - self._scene.instances.transforms[instance_numbers, :, 3]
+            )
+            points[on_instances] = into_axes(from_origins, self._normal_matrices[instance_numbers])
         on_actors, actor = self._actor_rows(triangle, trajectories)
         if len(on_actors):
             positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
@@ -392,7 +407,10 @@ class Surfaces:
         actor: Integers,
         trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities of points by the deformation of actors: (n, 3), m/s."""
+        """Return the velocities of points by the deformation of actors: (n, 3), m/s.
+
+        Points (n, 3) and velocities are in the scene frame; `actor` (n,) are the deforming actors.
+        """
         times_ns = times.astype(np.float64)
         positions, rotations = trajectories.poses(actor, times_ns)
         deformed = self._deformed(self._locate(triangle).row, actor, times_ns, trajectories)
@@ -428,15 +446,17 @@ class Surfaces:
             (b, 3, 3): matrices from normals in `unit_normals` to normals in the scene frame, of any
             length.
         """
-        plain, actors = self._instance_starts[[0, -1]]
+        face_count, actors_start = self._instance_starts[[0, -1]]
         identity = np.eye(3)[None]
-        bodies: list[Any] = [[[actors - plain, -1, -1]]]
+        bodies: list[Any] = [[[actors_start - face_count, -1, -1]]]
         normal_matrices = [identity]
-        if (shared := self._scene.instances) is not None:
-            firsts = self._part_starts[shared.part]
-            bodies.insert(0, np.stack([self._instance_starts[:-1], shared.owner, firsts], axis=1))
+        if (instances := self._scene.instances) is not None:
+            first_rows = self._part_starts[instances.part]
+            bodies.insert(
+                0, np.stack([self._instance_starts[:-1], instances.owner, first_rows], axis=1)
+            )
             normal_matrices.insert(0, self._normal_matrices)
-        if plain:
+        if face_count:
             bodies.insert(0, [[0, -1, 0]])
             normal_matrices.insert(0, identity)
         return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
@@ -450,7 +470,7 @@ class Surfaces:
     def kinds(self, triangle: Integers) -> Ints32:
         """Return the kinds of surfaces of triangles (n,): (n,); -1 without a surface.
 
-        Kinds are rows of the table of materials.
+        Names of materials that match the same material of the survey, in an object, are one kind.
         """
         if self._kind_in_object is None:
             return self.objects(triangle)
@@ -458,7 +478,10 @@ class Surfaces:
         return self._kinds_of(rows, objects)
 
     def _kinds_of(self, rows: Indices, objects: Ints32) -> Ints32:
-        """Return the kinds of surfaces of stored triangles, by rows and objects: (n,)."""
+        """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
+
+        Objects are an argument because instances that share stored triangles may differ in object.
+        """
         if self._kind_in_object is None:
             return objects
         kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
@@ -476,8 +499,10 @@ class Surfaces:
         parts = () if scene.instances is None else scene.instances.parts
         meshes = [(len(mesh.faces), mesh.materials) for mesh in self._meshes]
         meshes += [(len(part.faces), part.materials) for part in parts]
-        plain = None if scene.materials is None else scene.materials.index
-        numbers = [np.zeros(len(scene.faces), np.int32) if plain is None else plain]
+        face_materials = None if scene.materials is None else scene.materials.index
+        numbers = [
+            np.zeros(len(scene.faces), np.int32) if face_materials is None else face_materials
+        ]
         for size, materials in meshes:
             index = None if materials is None else materials.index
             numbers.append(np.zeros(size, np.int32) if index is None else index)
@@ -501,28 +526,34 @@ class Surfaces:
     def _material_kind(self) -> Ints32:
         """First kind of the same object that has the same material, for each kind: (kinds,).
 
-        A surface with several names is one surface where a single material is for all names:
-        closed, if the surface holds a medium.
+        Several names of materials in an object's files may match a single material of the survey.
+        Their faces are then a single kind, so that a body of water or leaves whose faces have
+        several names is closed.
         """
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)
         keys = np.stack([kinds.object, first], axis=1)
-        _, rows, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        return rows[which.reshape(-1)].astype(np.int32)
+        _, rows, combination = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        return rows[combination.reshape(-1)].astype(np.int32)
 
     def instances(self, triangle: Integers) -> Indices:
         """Return the instances of triangles (n,), which all belong to instances: (n,)."""
         return np.searchsorted(self._instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
-        """Return the counters of hits on triangles (n,), see `Scene.counters`: (n,)."""
+        """Return the rows of hit counters (n,), in which hits on triangles (n,) are counted.
+
+        Each of the scene's faces has a counter, each instance has a single counter for all its
+        triangles, and each triangle of an actor has a counter, in this order: `Scene.counters`.
+        """
         if self._scene.instances is None:
             return triangle
-        plain, actors = self._instance_starts[[0, -1]]
+        face_count, actors_start = self._instance_starts[[0, -1]]
         instance = self._locate(triangle).instance
-        shift = actors - plain - (len(self._instance_starts) - 1)  # an instance has one counter
-        face_or_actor = np.where(triangle >= actors, triangle - shift, triangle)
-        return np.where(instance >= 0, plain + instance, face_or_actor)
+        # Triangles of instances, less one counter for each instance.
+        shift = actors_start - face_count - (len(self._instance_starts) - 1)
+        face_or_actor = np.where(triangle >= actors_start, triangle - shift, triangle)
+        return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def energy(
         self,
@@ -553,24 +584,24 @@ class Surfaces:
         scene = self._scene
         closed = np.ones(len(table.reflectance), np.bool_)
         volume = np.zeros(len(closed))
-        for number in np.flatnonzero(table.leafy | table.refracts).tolist():
+        for kind in np.flatnonzero(table.leafy | table.refracts).tolist():
             bodies: list[tuple[Floats, Integers]] = []
-            owner = int(self.material_kinds.object[number])
+            owner = int(self.material_kinds.object[kind])
             if owner >= self._static_objects:
                 mesh = scene.actors[owner - self._static_objects].mesh
-                bodies.append((mesh.vertices, self._of_kind(number, mesh.faces, mesh.materials)))
+                bodies.append((mesh.vertices, self._of_kind(kind, mesh.faces, mesh.materials)))
             else:
-                bodies.append((scene.vertices, self._faces_of(number)))
+                bodies.append((scene.vertices, self._faces_of(kind)))
             if scene.instances is not None:
                 for row in np.unique(scene.instances.part[scene.instances.owner == owner]):
                     part = scene.instances.parts[row]
-                    faces = self._of_kind(number, part.faces, part.materials)
+                    faces = self._of_kind(kind, part.faces, part.materials)
                     bodies.append((part.vertices, faces))
             for vertices, faces in bodies:
                 if not len(faces):
                     continue
-                closed[number] &= _closed(vertices, faces)
-                volume[number] += _volume(vertices, faces)
+                closed[kind] &= _closed(vertices, faces)
+                volume[kind] += _volume(vertices, faces)
         return closed, closed & (volume < 0)
 
     @cached_property
@@ -580,24 +611,24 @@ class Surfaces:
         order = np.argsort(owners, kind="stable")
         return order, np.searchsorted(owners[order], np.arange(self._static_objects + 1))
 
-    def _faces_of(self, number: int) -> Integers:
+    def _faces_of(self, kind: int) -> Integers:
         """Return the scene's faces of a kind of surface, (f, 3)."""
         order, starts = self._faces_by_object
-        owner = int(self.material_kinds.object[number])
+        owner = int(self.material_kinds.object[kind])
         rows = order[starts[owner] : starts[owner + 1]]
         if self._scene.materials is None:
             return self._scene.faces[rows]
         materials = self._scene.materials.of_object(owner, rows)
-        return self._of_kind(number, self._scene.faces[rows], materials)
+        return self._of_kind(kind, self._scene.faces[rows], materials)
 
-    def _of_kind(self, number: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
+    def _of_kind(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
         """Select the faces of a kind of surface from faces of an object, (f, 3)."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds
         index = 0 if materials is None or materials.index is None else materials.index
-        kind = self._material_kind[kinds.first[kinds.object[number]] + index]
-        return faces[np.broadcast_to(kind == number, len(faces))]
+        face_kinds = self._material_kind[kinds.first[kinds.object[kind]] + index]
+        return faces[np.broadcast_to(face_kinds == kind, len(faces))]
 
     @cached_property
     def media(self) -> tuple[int, ...]:
@@ -618,8 +649,8 @@ class Surfaces:
             return self._scene.vertices
         vertices = self._scene.vertices.copy()
         inwards = self.solids[1]
-        for number in self.media:
-            faces = self._faces_of(number)
+        for kind in self.media:
+            faces = self._faces_of(kind)
             if not len(faces):
                 continue
             vertex_rows, corners = np.unique(faces, return_inverse=True)
@@ -629,7 +660,7 @@ class Surfaces:
             vertex_position = vertex_position.reshape(-1)
             corners = vertex_position[corners.reshape(-1)].reshape(-1, 3)
             a, b, c = positions[corners].transpose(1, 0, 2)
-            normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
+            normals = np.cross(b - a, c - a) * (-1 if inwards[kind] else 1)
             normals /= np.maximum(length(normals)[:, None], 1e-300)
             # Least squares: a vertex moves to where all its triangles are `by_m` further out.
             squares = np.zeros((len(positions), 3, 3))
