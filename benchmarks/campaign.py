@@ -69,9 +69,9 @@ class Samples:
 
     def __call__(self, progress: Progress) -> None:
         """Take a sample, if it is time to."""
-        now = time.monotonic()
-        if now >= self._next or progress.jobs_done == progress.jobs:
-            self._next = now + EVERY_S
+        now_s = time.monotonic()
+        if now_s >= self._next or progress.jobs_done == progress.jobs:
+            self._next = now_s + EVERY_S
             self.jobs.append(progress.jobs_done)
             self.driver.append(self._me.memory_info().rss / MIB)
             self.lidar.append(self._worker.memory_info().rss / MIB)
@@ -89,11 +89,11 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
         casting = sum(bool(resources.get(GPU)) for resources, _ in pids.values())
         samples = Samples(lidar)
-        used = time.process_time()
+        driver_s = time.process_time()
         run = campaign.run(folder / "dataset", client=client, on_progress=samples)
-        used = time.process_time() - used
+        driver_s = time.process_time() - driver_s
     wall = samples.seconds
-    beside = (wall - run.casting_seconds / casting) / jobs
+    overhead_s = (wall - run.casting_seconds / casting) / jobs
     figures = {
         "jobs": run.done,
         "failed": len(run.failed),
@@ -101,8 +101,8 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         "wall_s": wall,
         "casting_s": run.casting_seconds,
         "casting_workers": casting,
-        "beside_rays_ms_a_job": 1000 * beside,
-        "driver_and_scheduler_ms_a_job": 1000 * used / jobs,
+        "beside_rays_ms_a_job": 1000 * overhead_s,
+        "driver_and_scheduler_ms_a_job": 1000 * driver_s / jobs,
         "finishing_s": run.seconds - wall,
         "casting_tasks": next((s.tasks for s in run.stages if s.stage == "intersect"), 0),
         "misplaced": sum(stage.violations for stage in run.stages),

@@ -28,7 +28,7 @@ from lidarpool import Scene, Sensor, Survey, simulate
 UPKEEP = {"heartbeat", "setup", "transfers"}
 
 
-class Counted:
+class TrafficCounts:
     """Bytes of messages by kind, by the address at this end of their connection."""
 
     def __init__(self) -> None:
@@ -36,8 +36,8 @@ class Counted:
 
     def add(self, message: Any, frames: list[Any]) -> None:
         """Count a message."""
-        here = self._bytes.setdefault(_here.get(), Counter())
-        here[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
+        counts_of_address = self._bytes.setdefault(_local_address.get(), Counter())
+        counts_of_address[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
 
     @property
     def scheduler(self) -> Counter[str]:
@@ -46,8 +46,10 @@ class Counted:
 
     def work(self, *, driver: bool = False) -> int:
         """Bytes that came with work: at the scheduler, or at all other ends in this process."""
-        ends = self._bytes.values()
-        counted = [counts for counts in ends if (counts is not self.scheduler) == driver]
+        counts_by_address = self._bytes.values()
+        counted = [
+            counts for counts in counts_by_address if (counts is not self.scheduler) == driver
+        ]
         return sum(n for counts in counted for kind, n in counts.items() if kind not in UPKEEP)
 
 
@@ -61,13 +63,15 @@ def _kind(message: Any) -> str:
     return op
 
 
-_here: ContextVar[str] = ContextVar("_here", default="")  # address at this end of a connection
+_local_address: ContextVar[str] = ContextVar(
+    "_here", default=""
+)  # address at this end of a connection
 
 
 @contextmanager
-def counting() -> Iterator[Counted]:
+def count_traffic() -> Iterator[TrafficCounts]:
     """Count what this process sends and receives while the body runs."""
-    counted = Counted()
+    counted = TrafficCounts()
     to_frames = tcp.to_frames
     from_frames = tcp.from_frames
     read = tcp.TCP.read
@@ -84,11 +88,11 @@ def counting() -> Iterator[Counted]:
         return message
 
     async def reads(self: Any, *args: Any, **kwargs: Any) -> Any:
-        _here.set(self.local_address)
+        _local_address.set(self.local_address)
         return await read(self, *args, **kwargs)
 
     async def writes(self: Any, *args: Any, **kwargs: Any) -> Any:
-        _here.set(self.local_address)
+        _local_address.set(self.local_address)
         return await write(self, *args, **kwargs)
 
     with (
@@ -103,7 +107,7 @@ def counting() -> Iterator[Counted]:
 def small_survey(scans: int, keep_every: int) -> Survey:
     """Describe scans of 128 rays."""
     sensor = Sensor.grid(rays_per_revolution=360, layers=32, step_deg=4)
-    poses = [(0.01 * place, 0.0, 1.0) for place in range(-(-scans // 90))]
+    poses = [(0.01 * index, 0.0, 1.0) for index in range(-(-scans // 90))]
     return Survey(sensor, poses, steps=90, keep_every=keep_every)
 
 
@@ -116,25 +120,25 @@ def count_bytes(scans: int) -> None:
     }
     work: dict[str, Counter[str]] = {}
     for side, (count, keep_every) in sides.items():
-        what = small_survey(count, keep_every)
-        with counting() as counted:
-            result = simulate(Scene.seed(), what)
+        survey = small_survey(count, keep_every)
+        with count_traffic() as counted:
+            result = simulate(Scene.seed(), survey)
         upkeep = sum(counted.scheduler[kind] for kind in UPKEEP)
         work[side] = Counter({k: n for k, n in counted.scheduler.items() if k not in UPKEEP})
         print(
-            f"{side:16} {what.scan_count:,} scans, {len(result.points):,} points: "
+            f"{side:16} {survey.scan_count:,} scans, {len(result.points):,} points: "
             f"{sum(work[side].values()) / 1e6:.2f} MB in and out of the scheduler, the scene's "
             f"among them, and {upkeep / 1e6:.2f} MB of heartbeats and set-up"
         )
-    one = work["every 5th point"]
-    more = work["twice the scans"]
+    base = work["every 5th point"]
+    doubled = work["twice the scans"]
     points = work["all points"]
-    for kind, count in (more - one).most_common(5):
+    for kind, count in (doubled - base).most_common(5):
         print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
-    added = (sum(more.values()) - sum(one.values())) / scans
+    added = (sum(doubled.values()) - sum(base.values())) / scans
     print(
         f"a further scan adds {added:.0f} bytes; five times the points add "
-        f"{(sum(points.values()) - sum(one.values())) / scans:.0f} bytes a scan"
+        f"{(sum(points.values()) - sum(base.values())) / scans:.0f} bytes a scan"
     )
 
 
@@ -145,12 +149,14 @@ def single_scans() -> Any:
 
 def count_batches(batches: int) -> None:
     """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
-    ends = {}
+    bytes_by_batches = {}
     for count in (batches, 3 * batches):
-        with counting() as counted, single_scans():
+        with count_traffic() as counted, single_scans():
             simulate(Scene.seed(), small_survey(count, 5))
-        ends[count] = counted.work(), counted.work(driver=True)
-    scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
+        bytes_by_batches[count] = counted.work(), counted.work(driver=True)
+    scheduler, driver = (np.array(bytes_by_batches[3 * batches]) - bytes_by_batches[batches]) / (
+        2 * batches
+    )
     print(
         f"a further batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
         f"{driver:,.0f} at the driver"
@@ -161,9 +167,9 @@ def main() -> None:
     """Count both."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
-    given = parser.parse_args()
-    count_bytes(given.scans)
-    count_batches(min(360, given.scans))
+    options = parser.parse_args()
+    count_bytes(options.scans)
+    count_batches(min(360, options.scans))
 
 
 if __name__ == "__main__":

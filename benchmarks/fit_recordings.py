@@ -30,7 +30,7 @@ from lidarsim.simulator.range_noise import noisy_ranges
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
 
-def half(recording: Recording, first: int) -> Recording:
+def every_second_sweep(recording: Recording, first: int) -> Recording:
     """Every second sweep of a recording."""
     numbers = range(first, recording.count, 2)
     return replace(
@@ -38,17 +38,17 @@ def half(recording: Recording, first: int) -> Recording:
     )
 
 
-def simulated(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
+def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
     """Ranges of rays in sweeps, (s, k), NaN where lost."""
     keys = np.arange(len(rays.row))
-    out = np.full((sweeps, len(keys)), np.nan)
+    result = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
         across, _ = angle_errors(noise, np.full(len(keys), scan), keys)
         ranges = rays.distance + rays.slope * across  # along the steepest slope
         moved = noisy_ranges(noise, ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
-        seen = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
-        out[scan] = np.where(seen, moved, np.nan)
-    return out
+        detected_rays = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
+        result[scan] = np.where(detected_rays, moved, np.nan)
+    return result
 
 
 def deviations(ranges: Any) -> Any:
@@ -57,7 +57,7 @@ def deviations(ranges: Any) -> Any:
     return 1000 * steps[np.isfinite(steps)]
 
 
-def compared(
+def compare_halves(
     recording: Recording, model: str | None, white: float | None
 ) -> tuple[dict[str, Any], ...]:
     """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity.
@@ -65,57 +65,59 @@ def compared(
     LidarError if a half cannot be fitted.
     """
     SweepStack.read(recording)  # refuses a sensor that moves, which halves may not show
-    found = fit(half(recording, 0), model=model, white=white)
-    other = SweepStack.read(half(recording, 1))
-    rays = select_smooth_rays(other, other.rough_sigma, 0.002)
+    fit_result = fit(every_second_sweep(recording, 0), model=model, white=white)
+    test_stack = SweepStack.read(every_second_sweep(recording, 1))
+    rays = select_smooth_rays(test_stack, test_stack.rough_sigma, 0.002)
     with warnings.catch_warnings(action="ignore"):  # of cells without a return
-        middle = np.nanmedian(other.ranges, axis=0)
-    azimuth_slope = find_surfaces(other, middle, other.rough_sigma).azimuth_slope
+        median_ranges = np.nanmedian(test_stack.ranges, axis=0)
+    azimuth_slope = find_surfaces(test_stack, median_ranges, test_stack.rough_sigma).azimuth_slope
     energy = np.maximum(rays.intensity / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
-    fitted = found.model.datasheet().noise
-    sheet = Noise()
+    fitted_noise = fit_result.model.datasheet().noise
+    datasheet_noise = Noise()
     if model is not None:
         with suppress(LidarError):  # the model states no performance
-            sheet = read_model(model).datasheet().noise
+            datasheet_noise = read_model(model).datasheet().noise
     cell = rays.row, rays.column
-    recorded = other.ranges[:, *cell].astype(float)
-    recorded -= azimuth_slope[cell] * np.nan_to_num(other.azimuth_offsets[:, *cell])
+    recorded = test_stack.ranges[:, *cell].astype(float)
+    recorded -= azimuth_slope[cell] * np.nan_to_num(test_stack.azimuth_offsets[:, *cell])
     sweeps = len(recorded)
-    ranges = {"recorded": recorded, "data sheet": simulated(sheet, rays, energy, sweeps),
-              "fitted": simulated(fitted, rays, energy, sweeps)}  # fmt: skip
-    light = other.intensities[:, *cell].astype(float)
+    ranges = {"recorded": recorded, "data sheet": simulate_ranges(datasheet_noise, rays, energy, sweeps),
+              "fitted": simulate_ranges(fitted_noise, rays, energy, sweeps)}  # fmt: skip
+    light = test_stack.intensities[:, *cell].astype(float)
     steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.intensity, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
-    lost = {name: float(np.isnan(one).mean()) for name, one in ranges.items()}
+    lost = {name: float(np.isnan(values).mean()) for name, values in ranges.items()}
     lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps
-    return {name: deviations(one) for name, one in ranges.items()}, lost, spread
+    return {name: deviations(values) for name, values in ranges.items()}, lost, spread
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="+", metavar="RECORDING[=MODEL[,WHITE]]")
     parser.add_argument("--picture", type=Path)
-    given = parser.parse_args()
-    figure = Figure(figsize=(3.2 * len(given.recordings), 2.8), layout="constrained")
+    options = parser.parse_args()
+    figure = Figure(figsize=(3.2 * len(options.recordings), 2.8), layout="constrained")
     print("| recording | | noise: 50 %, 95 %, 99 % of deviations, mm | pulses lost | intensity |")
     print("|---|---|--:|--:|--:|")
-    for number, text in enumerate(given.recordings):
+    for number, text in enumerate(options.recordings):
         path, _, model = text.partition("=")
         model, _, white = model.partition(",")
         try:
             recording = open_recording(path)
-            off, lost, spread = compared(recording, model or None, float(white) if white else None)
+            deviations_mm, lost, spread = compare_halves(
+                recording, model or None, float(white) if white else None
+            )
         except LidarError as error:
             print(f"| {Path(path).name} | refused | {error} | | |", flush=True)
             continue
-        axes = figure.add_subplot(1, len(given.recordings), number + 1)
-        limit = 1.5 * np.quantile(np.abs(off["recorded"]), 0.98)
-        for name, values in off.items():
-            low, middle, high = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
-            seen = f"{100 * spread[name]:.1f} %" if name in spread else "0"
-            print(f"| {Path(path).name} | {name} | {low:.1f}, {middle:.1f}, {high:.1f} "
-                  f"| {100 * lost[name]:.2f} % | {seen} |", flush=True)  # fmt: skip
+        axes = figure.add_subplot(1, len(options.recordings), number + 1)
+        limit = 1.5 * np.quantile(np.abs(deviations_mm["recorded"]), 0.98)
+        for name, values in deviations_mm.items():
+            median, percentile_95, percentile_99 = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
+            intensity_text = f"{100 * spread[name]:.1f} %" if name in spread else "0"
+            print(f"| {Path(path).name} | {name} | {median:.1f}, {percentile_95:.1f}, {percentile_99:.1f} "
+                  f"| {100 * lost[name]:.2f} % | {intensity_text} |", flush=True)  # fmt: skip
             if values.any():  # without noise there is nothing to draw
                 share = np.full(len(values), 1 / len(values))
                 axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
@@ -123,8 +125,8 @@ def main() -> None:
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
     if figure.axes:
         figure.axes[0].legend(fontsize=7, frameon=False)
-    if given.picture:
-        figure.savefig(given.picture, dpi=110)
+    if options.picture:
+        figure.savefig(options.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -30,13 +30,15 @@ def joined(meshes: list[Mesh]) -> Mesh:
 def six_objects() -> Mesh:
     """Six surfaces of revolution, 80 by 80, as in the default survey."""
     polar = np.linspace(0, np.pi, 80)[:, None]
-    around = np.arange(80) * 2 * np.pi / 80
+    azimuth = np.arange(80) * 2 * np.pi / 80
     radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
     height = np.broadcast_to(2 - 2 * np.cos(polar), (80, 80))
-    one = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1).reshape(-1, 3)
-    places = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    vertices = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1).reshape(
+        -1, 3
+    )
+    positions = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
     faces = grid_faces(80, 80, wrap=True)
-    return joined([(one + np.array([x, y, 0]), faces) for x, y in places])
+    return joined([(vertices + np.array([x, y, 0]), faces) for x, y in positions])
 
 
 def city(triangles: int, seed: int = 0) -> Mesh:
@@ -48,8 +50,8 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     side = 2 * round((np.sqrt(triangles / (5 * 2 * panels**2 + 2)) - 1) / 2) + 1
     line = np.linspace(-1, 1, panels + 1)
     a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
-    one = np.ones_like(a)
-    sides = [(a, b, one), (a, one, b), (a, -one, b), (one, a, b), (-one, a, b)]
+    unit = np.ones_like(a)
+    sides = [(a, b, unit), (a, unit, b), (a, -unit, b), (unit, a, b), (-unit, a, b)]
     face = grid_faces(panels + 1, panels + 1)
     box, faces = joined([(np.stack(points, axis=-1), face) for points in sides])
     x, y = (c.ravel() for c in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))

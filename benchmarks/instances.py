@@ -38,22 +38,22 @@ def tree(leaves: int) -> tuple[Float, NDArray[np.int64]]:
     return corners.reshape(-1, 3), np.arange(3 * leaves).reshape(-1, 3)
 
 
-def places(trees: int) -> Float:
+def tree_transforms(trees: int) -> Float:
     """Make transforms (trees, 3, 4): a square grid, each tree turned and of its own size."""
     rng = np.random.default_rng(2)
     side = int(np.ceil(np.sqrt(trees)))
     angle = rng.uniform(0, 2 * np.pi, trees)
     size = rng.uniform(0.8, 1.2, trees)
     number = np.arange(trees)
-    out = np.zeros((trees, 3, 4))
-    out[:, 0, 0] = out[:, 1, 1] = size * np.cos(angle)
-    out[:, 1, 0] = size * np.sin(angle)
-    out[:, 0, 1] = -out[:, 1, 0]
-    out[:, 2, 2] = size
-    out[:, 0, 3] = _APART * (number % side)
-    out[:, 1, 3] = _APART * (number // side)
-    out[:, :2, 3] -= _APART * (side - 1) / 2
-    return out
+    transforms = np.zeros((trees, 3, 4))
+    transforms[:, 0, 0] = transforms[:, 1, 1] = size * np.cos(angle)
+    transforms[:, 1, 0] = size * np.sin(angle)
+    transforms[:, 0, 1] = -transforms[:, 1, 0]
+    transforms[:, 2, 2] = size
+    transforms[:, 0, 3] = _APART * (number % side)
+    transforms[:, 1, 3] = _APART * (number // side)
+    transforms[:, :2, 3] -= _APART * (side - 1) / 2
+    return transforms
 
 
 def peak() -> float:
@@ -65,42 +65,45 @@ def peak() -> float:
 
 def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> dict[str, Any]:
     """Build a forest and scan it; call this in a new process."""
-    one = tree(leaves)
-    matrices = places(trees)
+    tree_mesh = tree(leaves)
+    matrices = tree_transforms(trees)
     reach = _APART * np.sqrt(trees) + 50
     ground = np.diag([reach, reach, 1.0, 1.0])
     RayCaster(*_GROUND, backend, threads=1)  # loads the backend
-    before = peak()
+    memory_before = peak()
     start = time.process_time()
     if shared:
-        mesh = Mesh(*one)
+        mesh = Mesh(*tree_mesh)
         instances = [Instance(mesh, matrix) for matrix in matrices]
-        given = [Instance(Mesh(*_GROUND), ground), *instances]
-        caster = RayCaster.from_instances(given, backend, threads=1)
+        forest = [Instance(Mesh(*_GROUND), ground), *instances]
+        caster = RayCaster.from_instances(forest, backend, threads=1)
     else:
-        points = [one[0] @ m[:, :3].T + m[:, 3] for m in matrices]
-        faces = [one[1] + k * len(one[0]) for k in range(trees)]
-        low = [_GROUND[0] * [reach, reach, 1], np.array(_GROUND[1]) + trees * len(one[0])]
-        whole = np.concatenate([*points, low[0]]), np.concatenate([*faces, low[1]])
+        points = [tree_mesh[0] @ m[:, :3].T + m[:, 3] for m in matrices]
+        faces = [tree_mesh[1] + k * len(tree_mesh[0]) for k in range(trees)]
+        ground_mesh = [
+            _GROUND[0] * [reach, reach, 1],
+            np.array(_GROUND[1]) + trees * len(tree_mesh[0]),
+        ]
+        merged = np.concatenate([*points, ground_mesh[0]]), np.concatenate([*faces, ground_mesh[1]])
         del points, faces
-        caster = RayCaster(*whole, backend, threads=1)
-        del whole
+        caster = RayCaster(*merged, backend, threads=1)
+        del merged
     built = time.process_time() - start
-    memory = peak() - before
+    memory = peak() - memory_before
     pattern = Pattern(beam_directions(_BEAMS, rays))
     rng = np.random.default_rng(3)
     spots = np.column_stack([rng.uniform(-30, 30, (_POSES, 2)), np.full(_POSES, 2.0)])
-    taken = []
+    seconds = []
     hits = 0
     for spot in (spots[0], *spots):  # the first one twice: to warm up
         start = time.process_time()
         hits += int(caster.scan(pattern, spot).hits.sum())
-        taken.append(time.process_time() - start)
+        seconds.append(time.process_time() - start)
     return {
         "triangles": trees * leaves + 2,
         "memory_mb": memory,
         "build_s": built,
-        "mrays_s": len(pattern) / float(np.median(taken[1:])) / 1e6,
+        "mrays_s": len(pattern) / float(np.median(seconds[1:])) / 1e6,
         "hit_share": hits / len(pattern) / (_POSES + 1),
     }
 
@@ -114,13 +117,15 @@ def main(arguments: list[str] | None = None) -> int:
     if reason := available_backends()[chosen.backend]:
         print(f"Nothing was measured: {reason}", file=sys.stderr)
         return 2
-    many, few, leaves, rays = (20, 4, 500, 2_000) if chosen.quick else (1000, 32, 50_000, 115_200)
+    large_count, small_count, leaves, rays = (
+        (20, 4, 500, 2_000) if chosen.quick else (1000, 32, 50_000, 115_200)
+    )
     context = multiprocessing.get_context("spawn")
     print("| trees | as | triangles | memory, MB | build, s | Mrays/s | hits |")
-    for trees, shared in ((many, True), (few, True), (few, False)):
+    for trees, shared in ((large_count, True), (small_count, True), (small_count, False)):
         with context.Pool(1) as pool:
-            given = (trees, leaves, shared, rays, chosen.backend)
-            row = pool.apply(measure, given)
+            job = (trees, leaves, shared, rays, chosen.backend)
+            row = pool.apply(measure, job)
         print(
             f"| {trees:,} | {'instances' if shared else 'one mesh'} | {row['triangles']:,} | "
             f"{row['memory_mb']:,.0f} | {row['build_s']:.2f} | {row['mrays_s']:.2f} | "

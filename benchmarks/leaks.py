@@ -70,8 +70,8 @@ def terrain_box(triangles: int) -> Closed:
     a, b = edges[first[times == 1]].T  # the rim: edges of one triangle only
     walls = np.concatenate([np.stack([b, a, a + n], -1), np.stack([b, a + n, b + n], -1)])
     inside = np.array([0.0, 0.0, points[:, 2].max() + 20])
-    whole = np.concatenate([faces, faces[:, ::-1] + n, walls])
-    return Closed("terrain box", np.concatenate([points, lid]), whole, inside, 10.0)
+    all_faces = np.concatenate([faces, faces[:, ::-1] + n, walls])
+    return Closed("terrain box", np.concatenate([points, lid]), all_faces, inside, 10.0)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -38,13 +38,13 @@ class Costs:
     Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
     """
 
-    each: dict[str, tuple[float, float]]
+    per_step: dict[str, tuple[float, float]]
     member: float
 
     def step(self, number: int, gpus: int, batches: int) -> float:
         """Seconds of a step of a task with so many batches."""
         name = STEPS[number]
-        task, receipt = self.each[name]
+        task, receipt = self.per_step[name]
         task += gpus * self.member if name == "scheduler" else 0
         seconds = task / STEPS.count(name) + (batches * receipt if number >= RECEIPT - 1 else 0)
         return seconds / (1 - HEARTBEATS) if name == "scheduler" else seconds
@@ -63,41 +63,43 @@ def batches_a_second(
     Their processes share `cores`; None: each has its own.
     """
     batches = batches_per_task([(seconds, 1)], gpus)
-    takes = [costs.step(number, gpus, batches) for number in range(len(STEPS))]
+    step_seconds = [costs.step(number, gpus, batches) for number in range(len(STEPS))]
     free: Counter[Any] = Counter()  # {process: when it is free}
     idle = [0.0] * (cores or 0)  # when each core is free: a heap
     slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
     vary = Random(1).uniform
     number = count()
-    done = 0
-    most = shards * max_under_way(gpus, collectors_of(gpus))
+    finished_tasks = 0
+    tasks_under_way = shards * max_under_way(gpus, collectors_of(gpus))
     begin = 0.0
-    events = [(0.0, next(number), n % shards, 0) for n in range(most)]
-    while done < ROUNDS * most:
-        now, _, shard, step = heapq.heappop(events)
+    events = [(0.0, next(number), n % shards, 0) for n in range(tasks_under_way)]
+    while finished_tasks < ROUNDS * tasks_under_way:
+        now_s, _, shard, step = heapq.heappop(events)
         process: Any = STEPS[step], shard
         if process[0] == "casting":
-            now = max(now, heapq.heappop(slots[shard]))
+            now_s = max(now_s, heapq.heappop(slots[shard]))
         else:
             if process[0] == "collectors":
-                those = product([process], range(collectors_of(gpus)))
-                process = min(those, key=free.__getitem__)
-            now = max(now, free[process])
+                collector_slots = product([process], range(collectors_of(gpus)))
+                process = min(collector_slots, key=free.__getitem__)
+            now_s = max(now_s, free[process])
         if cores:
-            now = max(now, heapq.heappop(idle))
-            heapq.heappush(idle, now + takes[step])
-        now += takes[step]
+            now_s = max(now_s, heapq.heappop(idle))
+            heapq.heappush(idle, now_s + step_seconds[step])
+        now_s += step_seconds[step]
         if process[0] == "casting":
-            now += batches * seconds * vary(1 - VARY, 1 + VARY)
-            heapq.heappush(slots[shard], now)
+            now_s += batches * seconds * vary(1 - VARY, 1 + VARY)
+            heapq.heappush(slots[shard], now_s)
         else:
-            free[process] = now
+            free[process] = now_s
         following = (step + 1) % len(STEPS)
-        done += not following
-        if done == most and not following:  # the first tasks all came at a time
-            begin = now
-        heapq.heappush(events, (now, next(number), shard, following))
-    return batches * (done - most) / (now - begin)
+        finished_tasks += not following
+        if (
+            finished_tasks == tasks_under_way and not following
+        ):  # the first tasks all came at a time
+            begin = now_s
+        heapq.heappush(events, (now_s, next(number), shard, following))
+    return batches * (finished_tasks - tasks_under_way) / (now_s - begin)
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
@@ -116,10 +118,10 @@ def limit(gpus: int, seconds: float, costs: Costs) -> str:
     return load.most_common(1)[0][0]
 
 
-def schedulers(gpus: int, seconds: float, costs: Costs, least: float = 0.9) -> int:
+def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -> int:
     """How many clusters, each with a scheduler and driver, keep all GPUs so busy."""
     shards = 1
-    while busy(-(-gpus // shards), seconds, costs) < least:
+    while busy(-(-gpus // shards), seconds, costs) < min_busy:
         shards += max(1, shards // 8)
     return shards
 
@@ -133,9 +135,9 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
     for seconds, colour in zip(SECONDS, ("#e4752e", "#2a6fb0", "#3b8f5a"), strict=True):
         shares = [100 * busy(gpus, seconds, costs) for gpus in GPUS]
         axes.plot(GPUS, shares, color=colour, label=f"batches of {seconds:g} s")
-        there = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
-        places = [run["gpus"] for run in there], [100 * run["busy"] for run in there]
-        axes.plot(*places, "o", color=colour)
+        runs = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
+        points = [run["gpus"] for run in runs], [100 * run["busy"] for run in runs]
+        axes.plot(*points, "o", color=colour)
     axes.plot([], [], "o", color="0.4", label="read")
     axes.set(xscale="log", xlabel="GPU workers of one scheduler", ylim=(0, 105))
     axes.set_ylabel("time that they cast, %")
@@ -158,8 +160,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--cores", type=int, help="of the machine of those")
     parser.add_argument("--picture", type=Path, help="draw the busy share here")
     chosen = parser.parse_args(arguments)
-    each = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
-    costs = Costs(each, chosen.member / 1e6)
+    per_step = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
+    costs = Costs(per_step, chosen.member / 1e6)
     rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
     read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():

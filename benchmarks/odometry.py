@@ -137,14 +137,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a toy size, for tests")
     parser.add_argument("--sweeps", type=int, default=64)
     parser.add_argument("--model", default="ouster/os1-64")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     if find_spec("kiss_icp") is None:
         print("This needs KISS-ICP: pip install kiss-icp.", file=sys.stderr)
         return 1
-    if given.quick:
-        given.sweeps = 14
-        given.model = "velodyne/vlp16"
-    results = measured(given.model, given.sweeps, 20_000 if given.quick else 200_000)
+    if options.quick:
+        options.sweeps = 14
+        options.model = "velodyne/vlp16"
+    results = measured(options.model, options.sweeps, 20_000 if options.quick else 200_000)
     print("| deskewing | median, m | 95 %, m |")
     print("|---|--:|--:|")
     for deskew, errors in results.items():

@@ -84,7 +84,7 @@ class Tasks:
         self.name = f"tasks{next(_numbers)}"
         self.count = 0
 
-    def place(self, number: int) -> tuple[list[Any], float]:
+    def assign(self, number: int) -> tuple[list[Any], float]:
         """Place tasks; returns their states and the seconds that it took."""
         states = []
         for _ in range(number):
@@ -118,7 +118,7 @@ def cost_us(scheduler: Any, partition: bool, number: int) -> float:
     tasks = Tasks(scheduler, partition)
     rounds = []
     for _ in range(3):
-        states, seconds = tasks.place(number)
+        states, seconds = tasks.assign(number)
         tasks.end(states)
         rounds.append(seconds / number * 1e6)
     return min(rounds)
@@ -140,33 +140,33 @@ def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
     queues: dict[Any, deque[Any]] = defaultdict(deque)  # {worker: states of its tasks}
     events: list[tuple[float, int, Any]] = []  # heap: end, number of the task, worker
     numbers: dict[Any, int] = {}  # {state of a task: its number}
-    ends: list[float] = []
+    end_times: list[float] = []
     longest_queue = 0
 
-    def start_next(worker: Any, now: float) -> None:
+    def start_next(worker: Any, time_s: float) -> None:
         if queues[worker]:
             number = numbers[queues[worker][0]]
-            heapq.heappush(events, (now + durations[number], number, worker))
+            heapq.heappush(events, (time_s + durations[number], number, worker))
 
-    def add(count: int, now: float) -> None:
+    def add(count: int, time_s: float) -> None:
         nonlocal longest_queue
-        states, _ = tasks.place(min(count, len(durations) - len(numbers)))
+        states, _ = tasks.assign(min(count, len(durations) - len(numbers)))
         for state in states:
             numbers[state] = len(numbers)
             queue = queues[state.processing_on]
             queue.append(state)
             longest_queue = max(longest_queue, len(queue))
             if len(queue) == 1:
-                start_next(state.processing_on, now)
+                start_next(state.processing_on, time_s)
 
     add(workers * 3 // 2, 0.0)
     while events:
         now, _, worker = heapq.heappop(events)
-        ends.append(now)
+        end_times.append(now)
         tasks.end([queues[worker].popleft()])
         start_next(worker, now)
         add(1, now)
-    return Flow(sum(ends) / len(ends), longest_queue)
+    return Flow(sum(end_times) / len(end_times), longest_queue)
 
 
 async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, Any]:

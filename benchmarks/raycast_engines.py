@@ -26,7 +26,7 @@ class Engine(ABC):
     """One way to cast rays."""
 
     name: ClassVar[str]
-    ours: ClassVar[bool] = False
+    is_raybeam: ClassVar[bool] = False
     # Brute force is not what anybody would use instead; it is there to be divided by.
     peer: ClassVar[bool] = True
 
@@ -46,10 +46,10 @@ class Engine(ABC):
         return job.rays
 
 
-class _Ours(Engine):
+class _RaybeamEngine(Engine):
     """Poses in, hits out: makes the rays, casts them and gathers the hits."""
 
-    ours = True
+    is_raybeam = True
     peer = False
 
     def missing(self) -> str:
@@ -65,19 +65,19 @@ class _Ours(Engine):
         )
 
 
-class Numpy(_Ours):
+class Numpy(_RaybeamEngine):
     """The numpy backend."""
 
     name = "numpy"
 
 
-class Embree(_Ours):
+class Embree(_RaybeamEngine):
     """The embree backend."""
 
     name = "embree"
 
 
-class Cuda(_Ours):
+class Cuda(_RaybeamEngine):
     """The cuda backend, hits copied to the host."""
 
     name = "cuda"
@@ -100,22 +100,22 @@ class BruteForce(Engine):
     def prepare(self, job: Job) -> Cast:
         """See `Engine.prepare`."""
         first, second, third = (job.vertices[job.faces[:, k]] for k in range(3))
-        edge = second - first
-        other = third - first
+        first_edge = second - first
+        second_edge = third - first
         step = len(job.directions) // self.rays(job)
-        some = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
-        away = job.origins[0] - first
-        q = np.cross(away, edge)
-        height = (other * q).sum(axis=1)
+        directions = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
+        from_corner = job.origins[0] - first
+        q = np.cross(from_corner, first_edge)
+        height = (second_edge * q).sum(axis=1)
 
-        def one(direction: Float) -> bool:
+        def is_hit(direction: Float) -> bool:
             # Moeller and Trumbore (1997); what depends on the origin only is worked out before.
-            p = np.cross(direction, other)
+            p = np.cross(direction, second_edge)
             with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = 1 / (edge * p).sum(axis=1)
-                u = (away * p).sum(axis=1) * inverse
+                inverse = 1 / (first_edge * p).sum(axis=1)
+                u = (from_corner * p).sum(axis=1) * inverse
                 v = (q @ direction) * inverse
                 t = height * inverse
             return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any())
 
-        return lambda: sum(map(one, some))
+        return lambda: sum(map(is_hit, directions))

@@ -47,7 +47,7 @@ class Open3D(Engine):
         return cast
 
 
-class Open3DWhole(Open3D):
+class Open3DWithNumpy(Open3D):
     """The same, rays made and hits gathered in NumPy as one would write it down."""
 
     name = "Open3D + NumPy"
@@ -58,7 +58,7 @@ class Open3DWhole(Open3D):
 
         scene = _open3d_scene(job, self.threads)
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             directions = job.directions @ job.rotation.T
             rays = np.hstack([np.tile(origin, (len(directions), 1)), directions])
             tensor = open3d.core.Tensor(rays.astype(np.float32))
@@ -69,7 +69,7 @@ class Open3DWhole(Open3D):
             points = origin + t[hit, None] * directions[hit]
             return len(points) if len(triangle[hit]) == len(points) else -1
 
-        return lambda: sum(one(origin) for origin in job.origins)
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
 
 class Trimesh(Engine):
@@ -88,12 +88,12 @@ class Trimesh(Engine):
 
         scene = RayMeshIntersector(trimesh.Trimesh(job.vertices, job.faces, process=False))
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             directions = job.directions @ job.rotation.T
             return self.hits(scene, np.tile(origin, (len(directions), 1)), directions)
 
-        one(job.origins[0])  # builds the tree
-        return lambda: sum(one(origin) for origin in job.origins)
+        count_hits(job.origins[0])  # builds the tree
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
     def hits(self, scene: Any, origins: Float, directions: Float) -> int:
         """Ask for the triangles that are hit."""
@@ -136,18 +136,18 @@ class Warp(Engine):
             indices=warp.array(job.faces.reshape(-1), dtype=int, device=self.device),
             bvh_constructor=self.builder,
         )
-        turned = (job.directions @ job.rotation.T).astype(np.float32)
-        directions = warp.array(turned, dtype=warp.vec3, device=self.device)
-        n = len(turned)
+        turned_directions = (job.directions @ job.rotation.T).astype(np.float32)
+        directions = warp.array(turned_directions, dtype=warp.vec3, device=self.device)
+        n = len(turned_directions)
         t = warp.empty(n, dtype=float, device=self.device)
         face = warp.empty(n, dtype=int, device=self.device)
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             inputs = [mesh.id, warp.vec3(*origin.tolist()), directions, t, face]
             warp.launch(first_hits, dim=n, inputs=inputs, device=self.device)
             return int((face.numpy() >= 0).sum()) if len(t.numpy()) == n else -1
 
-        return lambda: sum(one(origin) for origin in job.origins)
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
 
 class WarpCuda(Warp):
@@ -191,5 +191,5 @@ def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
 
 ENGINES: tuple[type[Engine], ...] = (
     Cuda, Embree, Numpy,
-    Open3D, Open3DWhole, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
+    Open3D, Open3DWithNumpy, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
 )  # fmt: skip

@@ -57,7 +57,7 @@ class Job:
         return replace(self, directions=directions, order="shuffled")
 
 
-def _turned(degrees: float) -> Float:
+def _tilted_rotation(degrees: float) -> Float:
     """Rotation of a sensor that is not set up level: about z, then a little about x."""
     a = np.radians(degrees)
     b = np.radians(2.0)
@@ -74,7 +74,7 @@ def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
         np.array(scene.faces),
         np.atleast_2d(np.asarray(origins, dtype=np.float64)),
         sensor.directions(np.arange(sensor.period)).reshape(-1, 3),
-        _turned(17.0),
+        _tilted_rotation(17.0),
     )
 
 
@@ -87,8 +87,10 @@ def survey_job(rays: int) -> Job:
     """Make the default survey: its scene, its sensor, its three poses."""
     survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     origins = np.array([pose.position for pose in survey.poses])
-    turn = max(36, min(survey.sensor.period or 0, rays // 120))
-    sensor = replace(survey.sensor, head=replace(survey.sensor.head, firings_per_turn=turn))
+    firings_per_revolution = max(36, min(survey.sensor.period or 0, rays // 120))
+    sensor = replace(
+        survey.sensor, head=replace(survey.sensor.head, firings_per_turn=firings_per_revolution)
+    )
     return _job("default survey", Scene.seed(), origins, sensor)
 
 
@@ -103,14 +105,14 @@ def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
     """Make a city, the sensor at places in streets, or in buildings, where all rays hit."""
     scene = city(triangles)
     sensor = _lidar(rays)
-    low, high = scene.bounds
+    lower_m, upper_m = scene.bounds
     random = np.random.default_rng(0)
-    places = np.full((24, 3), low[2] + 2)
-    places[:, :2] = low[:2] + (high - low)[:2] * random.uniform(0.3, 0.7, (24, 2))
+    positions = np.full((24, 3), lower_m[2] + 2)
+    positions[:, :2] = lower_m[:2] + (upper_m - lower_m)[:2] * random.uniform(0.3, 0.7, (24, 2))
     caster = RayCaster(scene.vertices, scene.faces)
-    few = sensor.directions(np.arange(36)).reshape(-1, 3)
-    share = np.array([caster.cast(place, few).hit.mean() for place in places])
-    chosen = places[(share > 0.97) == inside][:4]
+    directions = sensor.directions(np.arange(36)).reshape(-1, 3)
+    share = np.array([caster.cast(position, directions).hit.mean() for position in positions])
+    chosen = positions[(share > 0.97) == inside][:4]
     name = f"{'inside' if inside else 'street'} {triangles:.0e}".replace("e+0", "e")
     return _job(name, scene, chosen, sensor)
 
@@ -128,9 +130,9 @@ def terrain_job(triangles: int, rays: int) -> Job:
 def mesh_job(path: Path, rays: int) -> Job:
     """Read a mesh file, the sensor 1.5 m above the lowest point in its middle."""
     scene = Scene.load(path)
-    low, high = scene.bounds
-    middle = (low + high) / 2
-    return _job(path.stem, scene, [*middle[:2], low[2] + 1.5], _lidar(rays))
+    lower_m, upper_m = scene.bounds
+    middle = (lower_m + upper_m) / 2
+    return _job(path.stem, scene, [*middle[:2], lower_m[2] + 1.5], _lidar(rays))
 
 
 def jobs(
@@ -153,14 +155,16 @@ def jobs(
     if large:
         cities.append(10_000_000)
     hills = 2_000 if quick else 2_000_000
-    out: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
+    makers: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
     for triangles in cities:
         name = f"city-{triangles:.0e}".replace("e+0", "e")
-        out[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
-    for place in ("street", "inside"):
-        most = max(cities[0], 20_000)  # smaller ones have no rooms
-        out[place] = partial(positions_job, most, rays, inside=place == "inside")
-    out[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
+        makers[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
+    for where_positions in ("street", "inside"):
+        city_triangles = max(cities[0], 20_000)  # smaller ones have no rooms
+        makers[where_positions] = partial(
+            positions_job, city_triangles, rays, inside=where_positions == "inside"
+        )
+    makers[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
     for path in meshes:
-        out[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
-    return out
+        makers[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
+    return makers

@@ -63,7 +63,7 @@ def poses_of(count: int, number: int) -> Float:
     return poses
 
 
-class Ours:
+class LidarpoolScans:
     """The cast alone, and the scanner, with the same rays.
 
     Parameters
@@ -86,7 +86,7 @@ class Ours:
 
     def cast(self, poses: Float) -> int:
         """Cast the rays from poses (k, 4, 4), and count the hits."""
-        found = self.caster.scan(
+        hits = self.caster.scan(
             self.pattern,
             poses[:, :3, 3],
             poses[:, :3, :3],
@@ -95,7 +95,7 @@ class Ours:
             t_min=self.sensor.min_range_m,
             t_max=self.sensor.max_range_m,
         )
-        return len(found)
+        return len(hits)
 
     def ranges(self, poses: Float) -> Any:
         """Make images."""
@@ -111,40 +111,40 @@ class Ours:
 
     def moving(self, poses: Float) -> int:
         """Make the cloud of a sensor at 20 m/s."""
-        ends = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
-        return len(self.scanner.sweep(Track([0, 0.2], ends)))
+        positions = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
+        return len(self.scanner.sweep(Track([0, 0.2], positions)))
 
 
 class Open3D:
     """Open3D's scene, and the rays in NumPy."""
 
-    def __init__(self, scene: Scene, ours: Ours) -> None:
+    def __init__(self, scene: Scene, scans: LidarpoolScans) -> None:
         import open3d
 
         self.core = open3d.core
-        self.ours = ours
+        self.scans = scans
         self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self.scene.add_triangles(
             self.core.Tensor(scene.vertices.astype(np.float32)),
             self.core.Tensor(scene.faces.astype(np.uint32)),
         )
-        self.rays = np.array(ours.pattern.directions, np.float32)
-        origins = ours.pattern.origins
+        self.rays = np.array(scans.pattern.directions, np.float32)
+        origins = scans.pattern.origins
         self.origins = None if origins is None else np.array(origins, np.float32)
 
     def ranges(self, poses: Float) -> Any:
         """Make images."""
         count = len(self.rays)
         matrices = poses.astype(np.float32)
-        turns = matrices[:, :3, :3].transpose(0, 2, 1)
+        rotations = matrices[:, :3, :3].transpose(0, 2, 1)
         rays = np.empty((len(poses), count, 6), np.float32)
         rays[..., :3] = matrices[:, None, :3, 3]
         if self.origins is not None:
-            rays[..., :3] += self.origins @ turns
-        rays[..., 3:] = self.rays @ turns
-        found = self.scene.cast_rays(self.core.Tensor.from_numpy(rays), nthreads=1)
-        range_m = found["t_hit"].numpy()
-        sensor = self.ours.sensor
+            rays[..., :3] += self.origins @ rotations
+        rays[..., 3:] = self.rays @ rotations
+        answer = self.scene.cast_rays(self.core.Tensor.from_numpy(rays), nthreads=1)
+        range_m = answer["t_hit"].numpy()
+        sensor = self.scans.sensor
         range_m[(range_m < sensor.min_range_m) | (range_m > sensor.max_range_m)] = np.inf
         return range_m
 
@@ -153,36 +153,36 @@ def measure(
     case: str, backend: str, scene: Scene, robots: int, rounds: int, clock: str, python: str
 ) -> dict[str, Any]:
     """Time all ways of one case."""
-    now = CLOCKS[clock]
+    clock_s = CLOCKS[clock]
     count = robots if case == "robots" else 1
-    ours = Ours(scene, sensor_of(case), backend)
-    ways: dict[str, Callable[[Float], Any]] = {
-        "cast": ours.cast,
-        "ranges": ours.ranges,
-        "noise": ours.noise,
+    scans = LidarpoolScans(scene, sensor_of(case), backend)
+    methods: dict[str, Callable[[Float], Any]] = {
+        "cast": scans.cast,
+        "ranges": scans.ranges,
+        "noise": scans.noise,
     }
     if case != "robots":
-        ways |= {"sweep": ours.sweep, "moving": ours.moving}
+        methods |= {"sweep": scans.sweep, "moving": scans.moving}
     if importlib.util.find_spec("open3d"):
-        ways["open3d"] = Open3D(scene, ours).ranges
-    rays = len(ours.pattern) * count
-    seconds: dict[str, list[float]] = {way: [] for way in ways}
+        methods["open3d"] = Open3D(scene, scans).ranges
+    rays = len(scans.pattern) * count
+    seconds: dict[str, list[float]] = {method: [] for method in methods}
     hits: dict[str, float] = {}
     for number in range(rounds + 1):
         poses = poses_of(count, number)
         # Each finds caches and memory as the last one left them: not always the same one.
-        for way in np.random.default_rng(number).permutation(list(ways)).tolist():
-            start = now()
-            found = ways[way](poses)
-            spent = now() - start
+        for method in np.random.default_rng(number).permutation(list(methods)).tolist():
+            start = clock_s()
+            answer = methods[method](poses)
+            spent = clock_s() - start
             if number:  # the first round warms up
-                seconds[way].append(spent)
-            hit = found if isinstance(found, int) else np.isfinite(found).sum()
-            hits[way] = float(hit / rays)
+                seconds[method].append(spent)
+            hit = answer if isinstance(answer, int) else np.isfinite(answer).sum()
+            hits[method] = float(hit / rays)
     if python:
         for peer in PEERS:
-            found = _peer(peer, python, ours, scene, poses, rounds, clock)
-            seconds[peer], hits[peer] = found
+            answer = _time_peer(peer, python, scans, scene, poses, rounds, clock)
+            seconds[peer], hits[peer] = answer
     return {
         "case": case,
         "backend": backend,
@@ -194,11 +194,17 @@ def measure(
     }
 
 
-def _peer(
-    name: str, python: str, ours: Ours, scene: Scene, poses: Float, rounds: int, clock: str
+def _time_peer(
+    name: str,
+    python: str,
+    scans: LidarpoolScans,
+    scene: Scene,
+    poses: Float,
+    rounds: int,
+    clock: str,
 ) -> tuple[list[float], float]:
     """Time a peer with the poses of the last round, and find its share of hits."""
-    rays = np.concatenate([ours.directions @ pose[:3, :3].T for pose in poses])
+    rays = np.concatenate([scans.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
         np.savez(
@@ -207,17 +213,17 @@ def _peer(
             faces=scene.faces,
             origins=poses[:, :3, 3],
             directions=rays,
-            far=min(ours.sensor.max_range_m, 1e10),
+            far=min(scans.sensor.max_range_m, 1e10),
         )
         peer = Peer(name, python, job, clock)
-        turns = [peer.cast() for _ in range(rounds + 1)][1:]
+        casts = [peer.cast() for _ in range(rounds + 1)][1:]
         peer.close()
-    return [spent for spent, _ in turns], turns[-1][1] / len(rays)
+    return [spent for spent, _ in casts], casts[-1][1] / len(rays)
 
 
-def ratio(row: dict[str, Any], way: str, other: str = "cast") -> float:
+def ratio(row: dict[str, Any], method: str, base: str = "cast") -> float:
     """Median over the rounds of one way's time to another's."""
-    pairs = zip(row["seconds"][way], row["seconds"][other], strict=True)
+    pairs = zip(row["seconds"][method], row["seconds"][base], strict=True)
     return float(np.median([max(a, 1e-9) / max(b, 1e-9) for a, b in pairs]))
 
 
@@ -227,13 +233,15 @@ def show(row: dict[str, Any]) -> None:
         f"\n{row['case']} by {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
         f"{row['triangles']:,} triangles"
     )
-    for way, seconds in row["seconds"].items():
+    for method, seconds in row["seconds"].items():
         print(
-            f"  {way:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, way):6.2f} x cast; "
-            f"hits {100 * row['hits'][way]:.1f} % of rays"
+            f"  {method:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, method):6.2f} x cast; "
+            f"hits {100 * row['hits'][method]:.1f} % of rays"
         )
-    found = ratio(row, "ranges")
-    print(f"  the bar of {BAR} x the cast is {'kept' if found <= BAR else 'missed'}: {found:.2f}")
+    ranges_ratio = ratio(row, "ranges")
+    print(
+        f"  the bar of {BAR} x the cast is {'kept' if ranges_ratio <= BAR else 'missed'}: {ranges_ratio:.2f}"
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -42,7 +42,7 @@ _STACK = 256
 _BLOCK = 128
 
 
-def compiled(folder: Path) -> ctypes.CDLL:
+def compile_kernels(folder: Path) -> ctypes.CDLL:
     """Compile intersect.cu for the CPU, with counters."""
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
@@ -63,10 +63,10 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
     directions = np.ascontiguousarray(job.directions @ job.rotation.T)
     n = len(directions)
     distance = np.empty(n)
-    place = np.empty(n, np.int32)
-    places = lay_out_instances(plain(mesh), layout.roots)
-    where = (places.frame, places.top, places.instances)
-    before = _seen(library)
+    triangle = np.empty(n, np.int32)
+    instance_layout = lay_out_instances(plain(mesh), layout.roots)
+    instance_tables = (instance_layout.frame, instance_layout.top, instance_layout.instances)
+    counters_before = _read_counters(library)
     hits = 0
     for origin in job.origins:
         tables = (
@@ -78,13 +78,24 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
         )
         rays = (np.array(origin), ctypes.c_int(0), directions)  # one origin for all
         limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
-        _run(library, "cast_table", n, *tables, *where, *rays, *limits, distance, place, place)
-        hits += int((place >= 0).sum())
-    seen = (_seen(library) - before) / job.rays
-    return {**dict(zip(KINDS, seen.tolist(), strict=True)), "hit_share": hits / job.rays}
+        _run(
+            library,
+            "cast_table",
+            n,
+            *tables,
+            *instance_tables,
+            *rays,
+            *limits,
+            distance,
+            triangle,
+            triangle,
+        )
+        hits += int((triangle >= 0).sum())
+    per_ray = (_read_counters(library) - counters_before) / job.rays
+    return {**dict(zip(KINDS, per_ray.tolist(), strict=True)), "hit_share": hits / job.rays}
 
 
-def _seen(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
+def _read_counters(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
     return np.array(library.what_was_seen()[: len(KINDS)])
 
 
@@ -100,9 +111,11 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     """Both trees on one job."""
     mesh = local_mesh(job.vertices, job.faces)
     row: dict[str, Any] = {"scene": job.name, "triangles": len(mesh.corners), "rays": job.rays}
-    for name, left in TREES.items():
+    for name, cluster_limits in TREES.items():
         start = time.process_time()
-        layout = lay_out((mesh,)) if left is None else _laid_out(mesh, left)
+        layout = (
+            lay_out((mesh,)) if cluster_limits is None else _lay_out_limited(mesh, cluster_limits)
+        )
         row[name] = {
             "build_s": time.process_time() - start,
             "tree_nodes": len(layout.nodes),
@@ -111,9 +124,12 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     return row
 
 
-def _laid_out(mesh: LocalMesh, left: tuple[int, int]) -> Layout:
+def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout:
     """Lay out a mesh with so many clusters left to the sweep."""
-    with patch.object(ploc, "_MAX_CLUSTERS", left[0]), patch.object(ploc, "_MIN_CLUSTERS", left[1]):
+    with (
+        patch.object(ploc, "_MAX_CLUSTERS", cluster_limits[0]),
+        patch.object(ploc, "_MIN_CLUSTERS", cluster_limits[1]),
+    ):
         return lay_out((mesh,))
 
 
@@ -146,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"of each: {' / '.join(TREES)}")
     print("| scene | triangles | nodes | triangle tests | decisions | nodes, ratio | seconds |")
     with tempfile.TemporaryDirectory() as folder:
-        library = compiled(Path(folder))
+        library = compile_kernels(Path(folder))
         for name, make in makers.items():
             if not chosen.scene or name in chosen.scene:
                 rows.append(measure(library, make()))

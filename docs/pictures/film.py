@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.realism import TURN_S, cases
+from benchmarks.realism import REVOLUTION_S, cases
 from PIL import Image
 
 from lidarscenes.procedural.city import city
@@ -80,12 +80,12 @@ def main(arguments: list[str] | None = None) -> int:
         frames.append(frame(camera, points.astype(np.float64)))
     cast_s = time.perf_counter() - start
     caster.join()
-    kept = {"save_all": True, "duration": round(1e3 * TURN_S), "loop": 0}
+    kept = {"save_all": True, "duration": round(1e3 * REVOLUTION_S), "loop": 0}
     frames[0].save(memory := io.BytesIO(), "webp", append_images=frames[1:], method=0, **kept)
     options.film.write_bytes(memory.getvalue())
     took = time.perf_counter() - start
     print(
-        f"{options.sweeps * TURN_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,", end=" "
+        f"{options.sweeps * REVOLUTION_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,", end=" "
     )
     print(f"written after {took:.1f} s")
     return 0
