@@ -42,7 +42,7 @@ SCHEDULER = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.
 
 
 class ProcessJob(dask_jobqueue.local.LocalJob):
-    """A job that is a process of this machine, whether it has begun, runs or has ended."""
+    """Dask-jobqueue job that is a process of this machine, in any state of its life."""
 
     async def _submit_job(self, script: str) -> str:
         command = shlex.split(Path(script).read_text())
@@ -51,7 +51,7 @@ class ProcessJob(dask_jobqueue.local.LocalJob):
         return str(self.process.pid)
 
     async def close(self) -> None:
-        """End the process, which may be ending by itself."""
+        """End the process, which may be ending by itself already."""
         await asyncio.sleep(0.5)
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGTERM)
@@ -60,13 +60,13 @@ class ProcessJob(dask_jobqueue.local.LocalJob):
 
 
 class ProcessCluster(dask_jobqueue.local.LocalCluster):
-    """A cluster of such jobs."""
+    """Cluster of `ProcessJob` jobs."""
 
     job_cls = ProcessJob
 
 
 class Watched(SchedulerPlugin):
-    """Counts workers, and tasks that a worker had when it went."""
+    """Scheduler plugin that counts workers, and tasks lost or taken back when workers leave."""
 
     name = "watched"
 
@@ -75,11 +75,11 @@ class Watched(SchedulerPlugin):
         self.max_workers: Counter[str] = Counter()  # workers at a time, by partition
 
     def start(self, scheduler: Any) -> None:
-        """Get the scheduler."""
+        """Store the scheduler."""
         self.scheduler = scheduler
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Count a worker."""
+        """Count a worker that joins, and the workers of each partition."""
         self.counts["joined"] += 1
         workers_of_partition = Counter(
             str(w.name).partition("-")[0] for w in scheduler.workers.values()
@@ -87,13 +87,13 @@ class Watched(SchedulerPlugin):
         self.max_workers |= workers_of_partition
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Count a worker."""
+        """Count a worker that leaves."""
         self.counts["left"] += 1
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str, **kwargs: Any
     ) -> None:
-        """Count a task that has to run again; nothing here is cancelled."""
+        """Count a task that has to run again; this benchmark cancels no tasks."""
         if start == "processing" and finish not in ("memory", "erred"):
             self.counts["taken back"] += 1
         if start == "memory" and finish == "released" and "remove-worker" in stimulus_id:
@@ -101,18 +101,18 @@ class Watched(SchedulerPlugin):
 
 
 def read_counts(dask_scheduler: Any = None) -> tuple[Counter[str], Counter[str]]:
-    """Return what was counted; runs on the scheduler."""
+    """Return the counts of events and the largest partition sizes; runs on the scheduler."""
     watched = dask_scheduler.plugins[Watched.name]
     return watched.counts, watched.max_workers
 
 
 def run_task(partition: str, number: int) -> tuple[int, TaskRecord]:
-    """One small task: its number, and where it ran."""
+    """Run a small task; return its number and the record of its execution."""
     return recorded("run", partition, int, number)
 
 
 def waves(partition: Partition, sizes: Sequence[int], seed: int) -> list[tuple[int, TaskRecord]]:
-    """Run tasks in waves; returns their numbers and records."""
+    """Run tasks in waves; return their numbers and records."""
     rng = random.Random(f"{seed} {partition.name}")
     ran: list[tuple[int, TaskRecord]] = []
     for size in sizes:
@@ -123,7 +123,7 @@ def waves(partition: Partition, sizes: Sequence[int], seed: int) -> list[tuple[i
 
 
 def measure(tasks: int, rounds: int, seed: int) -> dict[str, Any]:
-    """Run so many tasks in so many waves a partition, and check where each ran."""
+    """Run `tasks` tasks in `rounds` waves per partition; return figures about their placement."""
     rng = random.Random(seed)
     task_counts = {
         name: tasks // len(NAMES) + (n < tasks % len(NAMES)) for n, name in enumerate(NAMES)
@@ -167,7 +167,7 @@ def measure(tasks: int, rounds: int, seed: int) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run the benchmark; returns its figures."""
+    """Run the benchmark; return its figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", type=int, default=100_000)
     parser.add_argument("--waves", type=int, default=10, help="of each partition")

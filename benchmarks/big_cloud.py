@@ -29,14 +29,14 @@ PER_PART = 10  # scans
 
 
 def limit_memory(extra: int) -> None:
-    """Let this process allocate so many bytes more than it has."""
+    """Limit this process to `extra` bytes above its current data segment."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     allocated = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
     resource.setrlimit(resource.RLIMIT_DATA, (allocated + extra, allocated + extra))
 
 
 def make_parts(storage: Storage, points: int) -> StoredCloud:
-    """Write parts of that many points."""
+    """Write random parts with about `points` points; return them as a cloud."""
     rows = PER_SCAN * PER_PART
     chance = np.random.default_rng(1)
     columns = {

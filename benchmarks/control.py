@@ -29,23 +29,23 @@ UPKEEP = {"heartbeat", "setup", "transfers"}
 
 
 class TrafficCounts:
-    """Bytes of messages by kind, by the address at this end of their connection."""
+    """Bytes of messages by kind and by local address of the connection."""
 
     def __init__(self) -> None:
         self._bytes: dict[str, Counter[str]] = {}  # {address here: {kind: bytes}}
 
     def add(self, message: Any, frames: list[Any]) -> None:
-        """Count a message."""
+        """Add the bytes of a message."""
         counts_of_address = self._bytes.setdefault(_local_address.get(), Counter())
         counts_of_address[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
 
     @property
     def scheduler(self) -> Counter[str]:
-        """What the scheduler sent and received: all of its connections end at one address."""
+        """Bytes at the scheduler by kind; all its connections share a local address."""
         return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
 
     def work(self, *, driver: bool = False) -> int:
-        """Bytes that came with work: at the scheduler, or at all other ends in this process."""
+        """Return the bytes of task messages, at the scheduler or at the driver."""
         counts_by_address = self._bytes.values()
         counted = [
             counts for counts in counts_by_address if (counts is not self.scheduler) == driver
@@ -70,7 +70,7 @@ _local_address: ContextVar[str] = ContextVar(
 
 @contextmanager
 def count_traffic() -> Iterator[TrafficCounts]:
-    """Count what this process sends and receives while the body runs."""
+    """Count the bytes that this process sends and receives while the body runs."""
     counted = TrafficCounts()
     to_frames = tcp.to_frames
     from_frames = tcp.from_frames
@@ -105,14 +105,14 @@ def count_traffic() -> Iterator[TrafficCounts]:
 
 
 def small_survey(scans: int, keep_every: int) -> Survey:
-    """Describe scans of 128 rays."""
+    """Return a survey of `scans` scans of 128 rays."""
     sensor = Sensor.grid(rays_per_revolution=360, layers=32, step_deg=4)
     poses = [(0.01 * index, 0.0, 1.0) for index in range(-(-scans // 90))]
     return Survey(sensor, poses, steps=90, keep_every=keep_every)
 
 
 def count_bytes(scans: int) -> None:
-    """Print bytes a scan: what more scans and more points add to what passes the scheduler."""
+    """Print the scheduler's bytes per additional scan, and with five times as many points."""
     sides = {
         "every 5th point": (scans, 5),
         "all points": (scans, 1),
@@ -143,12 +143,12 @@ def count_bytes(scans: int) -> None:
 
 
 def single_scans() -> Any:
-    """Make the batches of runs so small that each has one scan; tasks still have several."""
+    """Return a patch that limits each batch to one scan; tasks still have several batches."""
     return patch.object(lidarpool.run.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:
-    """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
+    """Print the bytes per additional batch of one scan, at the scheduler and at the driver."""
     bytes_by_batches = {}
     for count in (batches, 3 * batches):
         with count_traffic() as counted, single_scans():
@@ -164,7 +164,7 @@ def count_batches(batches: int) -> None:
 
 
 def main() -> None:
-    """Count both."""
+    """Count bytes of scans and of batches."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
     options = parser.parse_args()

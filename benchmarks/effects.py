@@ -25,7 +25,7 @@ ROUNDS = 5
 
 
 def stage_seconds(rig: Rig) -> float:
-    """Processor time of casting all scans and making their columns."""
+    """Return the processor time of casting all scans and making their columns, seconds."""
     begin = time.process_time()
     columns_of(list(rig.cast(0, rig.survey.scan_count)))
     return time.process_time() - begin
@@ -34,15 +34,15 @@ def stage_seconds(rig: Rig) -> float:
 def costs(
     effects: Mapping[str, Any], rounds: int = ROUNDS, triangles: int = 20_000
 ) -> dict[str, float]:
-    """Return the time of stage 2 with each effect, relative to the time without: medians."""
+    """Return the median time of stage 2 with each effect, relative to the time without."""
     scene = city(triangles)
     plain_survey = survey_without()
     plain = Rig(scene, plain_survey)
     rigs = {}  # {effect: (with it, without it)}
     for name, effect in effects.items():
-        moving_scene = effect.of(scene) if hasattr(effect, "of") else None
+        moving_scene = effect.with_actors(scene) if hasattr(effect, "with_actors") else None
         bare = plain if moving_scene is None else Rig(moving_scene, plain_survey)
-        rigs[name] = Rig(moving_scene or scene, effect.on(plain_survey)), bare
+        rigs[name] = Rig(moving_scene or scene, effect.with_effect(plain_survey)), bare
     ratios: dict[str, list[float]] = {name: [] for name in rigs}
     for number in range(rounds + 1):
         for name, (rig, bare) in rigs.items():

@@ -30,7 +30,7 @@ PLACES = ("room", "street", "hall", "forest")
 
 
 def street() -> Scene:
-    """Make the ground, a wall on either side and one at the end; above them is sky."""
+    """Make the ground, two side walls and an end wall below an open sky."""
     corners = {
         "ground": [(-80, -60, -1.7), (80, -60, -1.7), (80, 60, -1.7), (-80, 60, -1.7)],
         "left": [(-80, 4, -1.7), (80, 4, -1.7), (80, 4, 6), (-80, 4, 6)],
@@ -54,7 +54,7 @@ def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
 
 
 def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
-    """Make one of `PLACES`, and the position of a sensor in it, metres."""
+    """Make a scene of `PLACES`; return it with the position of a sensor, metres."""
     rng = np.random.default_rng(seed)
     if name == "street":
         return city(30_000, seed=seed), (0.0, 0.0, 1.8)
@@ -106,7 +106,7 @@ def recorded(
     columns: int = COLUMNS,
     cache: Path | None = None,
 ) -> Recording:
-    """Sweeps of a sensor that stands in the street, with an error of each channel in metres."""
+    """Record sweeps of a standing sensor, with an error of each channel in metres."""
     if cache is None or not cache.exists():
         sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
         scanner = Scanner(
@@ -142,7 +142,7 @@ def recorded(
 def trial(
     number: int, cache: Path | None = None, place_name: str = ""
 ) -> tuple[dict[str, float], Any]:
-    """Figures that a recording was made with, and those that were fitted: {name: …}.
+    """Fit a recording; return the true figures and the fitted figures: {name: …}.
 
     Every second sensor has noise by range and errors of its channels, the others noise by energy,
     a threshold and false alarms. With `place_name`, one of `PLACES`, the second is the error of the fit

@@ -31,7 +31,7 @@ COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
 
 def every_second_sweep(recording: Recording, first: int) -> Recording:
-    """Every second sweep of a recording."""
+    """Return a recording of every second sweep, from sweep `first` on."""
     numbers = range(first, recording.count, 2)
     return replace(
         recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
@@ -39,7 +39,7 @@ def every_second_sweep(recording: Recording, first: int) -> Recording:
 
 
 def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
-    """Ranges of rays in sweeps, (s, k), NaN where lost."""
+    """Simulate the ranges of rays in sweeps, (s, k) metres; NaN where a pulse is lost."""
     keys = np.arange(len(rays.row))
     result = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
@@ -52,7 +52,7 @@ def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
 
 
 def deviations(ranges: Any) -> Any:
-    """Differences of sweeps in turn, over the root of two, millimetres."""
+    """Return differences of successive sweeps divided by √2, millimetres."""
     steps = np.diff(ranges, axis=0) / np.sqrt(2)
     return 1000 * steps[np.isfinite(steps)]
 
@@ -60,7 +60,7 @@ def deviations(ranges: Any) -> Any:
 def compare_halves(
     recording: Recording, model: str | None, white: float | None
 ) -> tuple[dict[str, Any], ...]:
-    """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity.
+    """Return deviations (n,), shares of lost pulses and scatter of intensity, by source.
 
     LidarError if a half cannot be fitted.
     """

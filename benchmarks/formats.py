@@ -42,7 +42,7 @@ REVOLUTIONS = 100
 
 
 def write_inputs(folder, points):
-    """Write a cloud of so many points in 100 sweeps of a sensor that moves, and the sweeps."""
+    """Write a cloud of `points` points, and the 100 sweeps of a moving sensor."""
     track = Track([0, 100], [[0, 0, 1], [300, 50, 1]])
     survey = Survey(Sensor.grid(360, 4), trajectory=track, steps=36 * REVOLUTIONS, columns=COLUMNS)
     Sweeps.from_survey(survey, Scene.seed()).save(folder / "sweeps.npz")
@@ -58,7 +58,7 @@ def write_inputs(folder, points):
 
 
 def export(name, folder, path):
-    """Export as `lidarpool export` does."""
+    """Export a cloud as `lidarpool export` does."""
     cloud = CloudFile(folder / "cloud.ply")
     sweeps = Sweeps.load(folder / "sweeps.npz")
     Format(name).write(path, cloud, sweeps)
@@ -129,13 +129,13 @@ SCRIPTS = {
 
 
 def write_by_library(name, folder, path):
-    """Write the same points by the library alone."""
+    """Write the same points with the format's library alone."""
     start, count, row = layout(folder / "cloud.ply")
     SCRIPTS[name](np.fromfile(folder / "cloud.ply", row, count, offset=start), path)
 
 
 def measure_call(write, *arguments):
-    """Processor seconds of a call in this process, and the most memory in MB."""
+    """Return the processor time of a call, seconds, and the peak memory of this process, MB."""
     samples_kb = [0]
     finished = threading.Event()
 

@@ -88,7 +88,7 @@ ROWS = (
 
 
 def figure_at(results: dict[str, Any], path: str) -> float | None:
-    """Look up a figure of the results; None if it was not measured."""
+    """Return a figure of the results by its path, or None if it was not measured."""
     if path == "different":
         checked = [results.get(name, {}) for name in ("bits", "columns")]
         rows = [row for section in checked for row in section.values() if isinstance(row, dict)]
@@ -105,7 +105,7 @@ def figure_at(results: dict[str, Any], path: str) -> float | None:
 
 
 def table(results: dict[str, Any]) -> list[str]:
-    """Make the table of docs/performance.md."""
+    """Return the lines of the table of docs/performance.md."""
     lines = ["| | |", "|---|---|"]
     for name, digits, paths in ROWS:
         values = [figure_at(results, path) for path in paths]
@@ -116,7 +116,7 @@ def table(results: dict[str, Any]) -> list[str]:
 
 
 def headline(results: dict[str, Any]) -> str:
-    """Name the device, its clock under load, the versions and the date."""
+    """Return a line with the device, its clock under load, versions and date."""
     device = results.get("device", {}).get("device", {})
     clock = results.get("kernels", {}).get("clocks", {}).get("after", {})
     words = [device.get("name"), *(f"{name} {value}" for name, value in clock.items())]
@@ -125,7 +125,7 @@ def headline(results: dict[str, Any]) -> str:
 
 
 def problems(results: dict[str, Any]) -> list[str]:
-    """List what failed, and what is wrong with the device's answers."""
+    """List failed sections and wrong results of the device."""
     failures = [f"{name}: {row['error']}" for name, row in results.items() if "error" in row]
     if figure_at(results, "different"):
         failures.append("values differ from NumPy's")
@@ -137,7 +137,7 @@ def problems(results: dict[str, Any]) -> list[str]:
 
 
 def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
-    """Measure a section in this process: its rows so far, again and again."""
+    """Measure a section in this process; yield its rows after each new row."""
     module, seconds = SECTIONS[name]
     rows: dict[str, Any] = {}
     clocks_before = clocks()
@@ -162,7 +162,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
 
 
 def shown(row: Any) -> str:
-    """Write a row in a line, without times where rates are."""
+    """Format a row in a line, without times where rates are present."""
     if not isinstance(row, dict):
         return f"{row:.4g}" if isinstance(row, float) else str(row)
     words = [
@@ -174,7 +174,7 @@ def shown(row: Any) -> str:
 
 
 def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
-    """Measure a section in a process of its own, which is ended when its time is up."""
+    """Measure a section in a new process, which is killed after `seconds`; return its rows."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rows.json")
         arguments = ["--in-process", "--only", name, "--json", str(path), *options]
@@ -196,7 +196,7 @@ def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 1 when something failed or is wrong, 2 without a device."""
+    """Run from the command line; return 1 for failures or wrong results, 2 without a device."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy sizes: whether it works")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))

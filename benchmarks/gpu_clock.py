@@ -23,7 +23,7 @@ _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.lin
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured; the defaults are for a device, `QUICK` is for a look."""
+    """Sizes of all sections; the defaults are for a device, `QUICK` is for tests."""
 
     cities: tuple[int, ...] = (100_000, 1_000_000)  # triangles
     large: int = 10_000_000
@@ -48,7 +48,7 @@ QUICK = Sizes(
 
 @dataclass(frozen=True)
 class Session:
-    """What sections need."""
+    """CuPy, sizes and output folder of all sections."""
 
     cupy: Any
     sizes: Sizes
@@ -56,7 +56,7 @@ class Session:
 
 
 def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, float]:
-    """Median, least and greatest time of a launch on the device, by events."""
+    """Return median, least and greatest time of a launch on the device, by events."""
     events = session.cupy.cuda.Event
     launch()
 
@@ -73,7 +73,7 @@ def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, fl
 
 
 def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str, float]:
-    """Median, least and greatest time of a call by the clock, until the device is done."""
+    """Return median, least and greatest wall time of a call, including the device's work."""
     device = session.cupy.cuda.Device()
     call()
 
@@ -96,7 +96,7 @@ def _repeated(session: Session, once: Callable[[], float]) -> dict[str, float]:
 
 
 class Split:
-    """Adds up times of parts of the work on the device, by events."""
+    """Sums of device times by name of the work, measured by events."""
 
     def __init__(self, cupy: Any) -> None:
         self._cupy = cupy
@@ -104,14 +104,14 @@ class Split:
 
     @contextmanager
     def timed(self, name: str, stream: Any = None) -> Iterator[None]:
-        """Add what is begun inside in a stream, the current one by default."""
+        """Add the device time of the body's work in a stream, by default the current stream."""
         stream = stream or self._cupy.cuda.get_current_stream()
         start = stream.record()
         yield
         self._pairs.append((name, start, stream.record()))
 
     def milliseconds(self) -> dict[str, float]:
-        """Return sums by name, when the device is done."""
+        """Synchronise the device, and return the sums by name, milliseconds."""
         self._cupy.cuda.Device().synchronize()
         sums: Counter[str] = Counter()
         for name, start, stop in self._pairs:
@@ -120,12 +120,12 @@ class Split:
 
 
 def pinned(cupy: Any, count: int) -> Any:
-    """Make bytes in page-locked memory."""
+    """Allocate `count` bytes of page-locked memory."""
     return np.frombuffer(cupy.cuda.alloc_pinned_memory(count), np.uint8, count)
 
 
 def to_pinned(session: Session) -> float:
-    """GB/s of a plain copy from the device to page-locked memory: all that the bus gives."""
+    """Return the bus rate, GB/s: a plain copy from the device to page-locked memory."""
     cupy = session.cupy
     count = session.sizes.copied
     array = cupy.zeros(count, np.uint8)
@@ -136,7 +136,7 @@ def to_pinned(session: Session) -> float:
 
 
 def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Tell what the device is, and how fast it copies."""
+    """Yield the properties of the device, and its copy rates."""
     cupy = session.cupy
     count = session.sizes.copied
     runtime = cupy.cuda.runtime
@@ -182,7 +182,7 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def clocks() -> dict[str, str]:
-    """Clocks, temperature and power now, in the words of nvidia-smi; nothing without it."""
+    """Return clocks, temperature and power as nvidia-smi reports them; {} without nvidia-smi."""
     program = shutil.which("nvidia-smi")
     if program is None:
         return {}

@@ -39,7 +39,7 @@ _ROOM = 4e9  # bytes
 
 
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
-    """Make a drive of an OS1-128 at 10 m/s along the street."""
+    """Return a drive of an OS1-128 at 10 m/s along the street."""
     positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
     sensor = load_sensor("ouster/os1-128", step_deg=sizes.step_deg)
     drive = Track([0, seconds], positions)
@@ -47,7 +47,7 @@ def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
 
 
 def traffic(scene: Scene) -> Scene:
-    """Put ten cars on the street."""
+    """Return the scene with ten cars on the street."""
     trajectories = [Track([0, 10], [[k * 8 - 40, 3.6, 0], [k * 8 + 40, 3.6, 0]]) for k in range(10)]
     cars = (
         Actor(box(f"car {k}", (4.5, 1.8, 1.5)), trajectory)
@@ -57,7 +57,7 @@ def traffic(scene: Scene) -> Scene:
 
 
 def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
-    """Give functions that cast a batch, and make its columns as a GPU worker does; for ever."""
+    """Yield functions that cast a batch and make its columns, endlessly."""
     spec = rig.survey.scan(0)
     size = max(1, rays // ((spec.firings[1] - spec.firings[0]) * spec.channels))
     count = rig.survey.scan_count
@@ -66,7 +66,7 @@ def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
 
 
 def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
-    """Make batches for so many seconds."""
+    """Make batches for `seconds`; return points per second and times per batch."""
     casts = batches(rig, rays)
     part = next(casts)()
     times = []
@@ -88,7 +88,7 @@ def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 
 @contextmanager
 def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
-    """Take the times of kernels and of copies of columns."""
+    """Measure the device times of kernels and of copies of columns while the body runs."""
     split = Split(cupy)
     engine = rig._caster.caster._engine
     run = engine._run  # type: ignore[attr-defined]
@@ -120,7 +120,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
 
 def columns(session: Session) -> Rows:
-    """Points a second into host memory: a plain survey, larger batches, and ten actors."""
+    """Yield points per second into host memory: a plain survey, large batches, ten actors."""
     sizes = session.sizes
     bus = to_pinned(session)
     scene = city(sizes.cities[-1])
@@ -160,7 +160,7 @@ def columns(session: Session) -> Rows:
 
 
 def durable(session: Session) -> Rows:
-    """Points a second in parts on a disk and in memory, by as many threads as make it faster."""
+    """Yield points per second in parts on disk and in memory, at the best number of threads."""
     rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()
     for name, parent in {"memory": memory, "disk": session.folder}.items():
@@ -179,7 +179,7 @@ def durable(session: Session) -> Rows:
 
 
 def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict[str, float]:
-    """Cast in this thread, and make and write parts in others, as collectors do."""
+    """Cast in this thread; make and write parts in worker threads, as collectors do."""
     room = threading.Semaphore(2 * threads)
     sizes = []
 
@@ -209,7 +209,7 @@ def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict
 
 
 def sharing(session: Session) -> Rows:
-    """Points a second into host memory: two threads, one process, two that share the device."""
+    """Yield points per second into host memory by two threads, one process, two processes."""
     rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     with ThreadPoolExecutor(2) as pool:
         futures = [
@@ -248,7 +248,7 @@ def _share(sizes: Sizes, barrier: Any, rates_queue: Any) -> None:
 
 
 def run(session: Session) -> Rows:
-    """Run a survey with its cluster, from rays to parts on the disk."""
+    """Run surveys on a local cluster, from rays to parts on the disk; yield their rates."""
     from lidarpool import simulate
 
     drive = survey(

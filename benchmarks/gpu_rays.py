@@ -58,12 +58,12 @@ KERNEL brute_force(
 
 
 def name_of(triangles: int) -> str:
-    """Name of a city."""
+    """Return the name of a city in the results."""
     return f"city {triangles:.0e}".replace("e+0", "e")
 
 
 def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
-    """Time a scan: the cast alone, closing up, and all until hits are on the host."""
+    """Time a scan: the cast alone, packing of hits, and copies of hits to the host."""
     engine: Any = caster._engine
     parts = list(engine._chunks(scan))
     hit_parts = [engine._cast("cast_pattern", n, rays) for _, n, rays in parts]
@@ -89,14 +89,14 @@ def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
 
 
 def revolutions(session: Session, directions: Float) -> Scan:
-    """Make a scan of the same rays from one pose after the other, 10 cm apart."""
+    """Make a scan of the same rays from successive poses, 10 cm apart."""
     poses = MIDDLE + 0.1 * np.arange(session.sizes.poses)[:, None] * [1, 0, 0]
     window = (0, len(directions) * len(poses))
     return check_scan(Pattern(directions), poses, window=window, rays_per_pose=len(directions))
 
 
 def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
-    """Make a caster: NumPy checks the mesh and makes the tree."""
+    """Build a CUDA caster; return the caster and figures of its build."""
     start = time.perf_counter()
     caster = RayCaster(*mesh, backend="cuda")
     took = time.perf_counter() - start  # type: ignore[attr-defined]
@@ -106,7 +106,7 @@ def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
 
 
 def kernels(session: Session) -> Rows:
-    """Rates of rays in cities, in order and shuffled, and of brute force."""
+    """Yield rates of rays in cities, coherent and shuffled, and of brute force."""
     directions = revolution(session.sizes.rays)
     shuffled = np.random.default_rng(0).permutation(directions)
     for count in session.sizes.cities:
@@ -127,7 +127,7 @@ def kernels(session: Session) -> Rows:
 
 
 def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[str, float]:
-    """Rate of every ray against every triangle, on so many rays that it takes a moment."""
+    """Time a subset of the rays against all triangles, without a tree."""
     cupy = session.cupy
     engine = caster._engine
     triangles = engine._meshes[1]  # type: ignore[attr-defined]
@@ -149,11 +149,12 @@ def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[
 
 
 def moving(session: Session) -> Rows:
-    """Compare a pose for each firing, and motion within each, with a pose for each revolution."""
+    """Yield rates with a pose per firing and with motion, beside a pose per revolution."""
     caster = RayCaster(*city(session.sizes.cities[-1]), backend="cuda")
     beams = 128
     directions = beam_directions(beams, session.sizes.rays * session.sizes.poses)
-    pattern, (positions, rotations) = Pattern(directions), track(len(directions) // beams)
+    pattern = Pattern(directions)
+    positions, rotations = track(len(directions) // beams)
     positions[:, 2] = MIDDLE[2]
     speeds = np.gradient(positions, 1e-4, axis=0)
     motion = PoseMotion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
@@ -179,7 +180,7 @@ def moving(session: Session) -> Rows:
 
 
 def forest(trees: int, leaves: int, masked: bool) -> list[Instance]:
-    """Make trees of a mesh, on a ground; half of each masked leaf is transparent."""
+    """Make instances of a tree on a ground; half of each masked leaf is transparent."""
     vertices, faces = tree(leaves)
     opacity = None
     if masked:
@@ -193,7 +194,7 @@ def forest(trees: int, leaves: int, masked: bool) -> list[Instance]:
 
 
 def instances(session: Session) -> Rows:
-    """Cast in a forest of instances, opaque and masked; and in one tree of it, as a plain mesh."""
+    """Yield rates in a forest of instances, and at a single tree, opaque and masked."""
     scan = revolutions(session, revolution(session.sizes.rays))
     for masked in (False, True):
         start = time.perf_counter()
@@ -207,7 +208,7 @@ def instances(session: Session) -> Rows:
 
 
 def bits(session: Session) -> Rows:
-    """Count rays of samples that differ from NumPy's in any bit; 0 expected."""
+    """Count sample rays that differ from NumPy's results in any bit; 0 expected."""
     crown = np.array([0.3, 0.2, 6.0])  # of a tree
     step = max(1, session.sizes.rays // session.sizes.sample)
     sample = revolution(session.sizes.rays)[::step]
@@ -262,7 +263,7 @@ def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -
 
 
 def leaks(session: Session) -> Rows:
-    """Count rays from inside a closed object, at its edges and corners, that hit nothing."""
+    """Count rays from inside a closed mesh that escape at its edges and corners."""
     vertices, faces = six_objects()
     faces = faces[: len(faces) // 6]
     vertices = vertices[: faces.max() + 1] + 5e5
@@ -283,7 +284,7 @@ def leaks(session: Session) -> Rows:
 
 
 def large(session: Session) -> Rows:
-    """Cast more rays than an int counts, then in a large city."""
+    """Cast more rays than a 32-bit integer counts, then cast in a large city."""
     directions = revolution(session.sizes.rays)
     caster = RayCaster(*city(session.sizes.cities[0]), backend="cuda")
     revolution_count = -(-session.sizes.rays_beyond_int // len(directions))

@@ -10,7 +10,7 @@ Float = NDArray[np.float64]
 
 
 def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]:
-    """Two triangles for each cell of a grid of vertices."""
+    """Return two triangles for each cell of a grid of vertices."""
     i = np.arange(rows - 1)[:, None] * columns
     j = np.arange(columns if wrap else columns - 1)[None, :]
     k = (j + 1) % columns
@@ -19,7 +19,7 @@ def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Concatenate several meshes."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
     return (
         np.concatenate([vertices for vertices, _ in meshes]),
@@ -28,7 +28,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def six_objects() -> Mesh:
-    """Six surfaces of revolution, 80 by 80, as in the default survey."""
+    """Make six surfaces of revolution, 80 by 80, as in the default survey."""
     polar = np.linspace(0, np.pi, 80)[:, None]
     azimuth = np.arange(80) * 2 * np.pi / 80
     radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
@@ -42,7 +42,7 @@ def six_objects() -> Mesh:
 
 
 def city(triangles: int, seed: int = 0) -> Mesh:
-    """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
+    """Make streets of panelled box buildings on flat ground, about `triangles` triangles."""
     rng = np.random.default_rng(seed)
     panels = 4
     pitch = 20.0
@@ -73,7 +73,7 @@ def city(triangles: int, seed: int = 0) -> Mesh:
 
 
 def revolution(rays: int, layers: int = 128) -> Float:
-    """Return unit directions of one turn of a lidar with a field of view of 60 degrees."""
+    """Return unit directions of a lidar's revolution; the field of view is 60 degrees."""
     azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)
     elevation = np.radians(np.linspace(-30, 30, layers))
     level = np.cos(elevation)
@@ -82,7 +82,7 @@ def revolution(rays: int, layers: int = 128) -> Float:
 
 
 def beam_directions(beams: int, rays: int) -> Float:
-    """Make unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
+    """Return unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
     azimuth = np.linspace(0, 2 * np.pi, max(1, rays // beams), endpoint=False)[:, None]
     elevation = np.radians(np.linspace(-15, 45, beams))
     flat = np.cos(elevation)
@@ -92,7 +92,7 @@ def beam_directions(beams: int, rays: int) -> Float:
 
 
 def track(firings: int) -> tuple[Float, Float]:
-    """Positions (k, 3) and rotations (k, 3, 3) of a head that moves by 1 m and turns by 5 degrees.
+    """Return positions (k, 3) and rotations (k, 3, 3) of a head that moves 1 m and turns 5 degrees.
 
     It is tilted by 2 degrees, so that no rotation is about an axis.
     """

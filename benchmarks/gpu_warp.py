@@ -23,7 +23,7 @@ _LEAF_SIZES = (1, 2, 4)
 
 
 def peers(session: Session, device: str = "cuda:0") -> Rows:
-    """Rates of Warp's ray query in the cities, with every way of building its tree."""
+    """Yield rates of Warp's ray query in the cities, by tree builder and leaf size."""
     warp.config.quiet = True
     warp.init()
     once = revolution(session.sizes.rays)
@@ -50,7 +50,7 @@ def peers(session: Session, device: str = "cuda:0") -> Rows:
 
 
 def mujoco(session: Session, device: str = "cuda:0") -> Rows:
-    """Rates of MuJoCo-LiDAR's Warp backend and ours, from poses to distances on the host."""
+    """Yield rates of MuJoCo-LiDAR's Warp backend and of raybeam, from poses to host distances."""
     vertices, faces = city(session.sizes.cities[0])
     once = revolution(session.sizes.rays)
     scan = revolutions(session, once)
@@ -88,7 +88,7 @@ def _cast(mesh: Any, directions: Float, device: str, seconds: float) -> dict[str
 
 
 def _timed(launch: Any, device: str) -> float:
-    """Milliseconds by events on a CUDA device, by the clock elsewhere."""
+    """Time a launch, milliseconds: by events on a CUDA device, by the wall clock elsewhere."""
     if not warp.get_device(device).is_cuda:
         began = time.perf_counter()
         launch()

@@ -39,7 +39,7 @@ def tree(leaves: int) -> tuple[Float, NDArray[np.int64]]:
 
 
 def tree_transforms(trees: int) -> Float:
-    """Make transforms (trees, 3, 4): a square grid, each tree turned and of its own size."""
+    """Make transforms (trees, 3, 4): a square grid, with random yaw and scale of each tree."""
     rng = np.random.default_rng(2)
     side = int(np.ceil(np.sqrt(trees)))
     angle = rng.uniform(0, 2 * np.pi, trees)
@@ -57,7 +57,7 @@ def tree_transforms(trees: int) -> Float:
 
 
 def peak() -> float:
-    """Most memory that this process has had, MB; 0 where /proc does not tell."""
+    """Return the peak memory of this process, MB, or 0 without /proc."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     return sum(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
@@ -109,7 +109,7 @@ def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> d
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 2 where the backend is not there."""
+    """Run from the command line; return 2 if the backend is not available."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy sizes")
     parser.add_argument("--backend", default="embree")

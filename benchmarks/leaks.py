@@ -28,7 +28,7 @@ _PART = 250_000
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """A closed mesh, a point inside it, and how far that may be moved."""
+    """Closed mesh, a point inside the mesh, and a distance by which the point may be moved."""
 
     name: str
     vertices: NDArray[np.float64]
@@ -38,7 +38,7 @@ class Closed:
 
 
 def closed_meshes(triangles: int) -> Iterator[Closed]:
-    """Cube, sphere, the six objects of the default survey, a terrain box of so many triangles."""
+    """Yield a cube, a sphere, the default survey's six objects, and a box of terrain."""
     x = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     sides = np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
@@ -57,7 +57,7 @@ def closed_meshes(triangles: int) -> Iterator[Closed]:
 
 
 def terrain_box(triangles: int) -> Closed:
-    """Fractal ground under a lid of the same grid, with walls around."""
+    """Make fractal ground below a lid of the same grid, joined by walls."""
     ground = terrain(triangles // 2)
     points = np.array(ground.vertices)
     faces = np.array(ground.faces)
@@ -75,7 +75,7 @@ def terrain_box(triangles: int) -> Closed:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 1 when a ray escapes from an exact backend."""
+    """Run from the command line; return 1 if a ray escapes from an exact backend."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rays", type=int, default=10_000_000, help="for each backend, in all")
     parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")

@@ -33,7 +33,7 @@ SECONDS = (0.05, 0.2, 1.0)  # of casting a batch
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds of processor time of each process: {name: (for a task, for each receipt in it)}.
+    """Processor time of each process, seconds: {name: (per task, per receipt of the task)}.
 
     Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
     """
@@ -42,7 +42,7 @@ class Costs:
     member: float
 
     def step(self, number: int, gpus: int, batches: int) -> float:
-        """Seconds of a step of a task with so many batches."""
+        """Return the time of a step of a task with `batches` batches, seconds."""
         name = STEPS[number]
         task, receipt = self.per_step[name]
         task += gpus * self.member if name == "scheduler" else 0
@@ -51,14 +51,14 @@ class Costs:
 
 
 def collectors_of(gpus: int) -> int:
-    """Give the number of collectors of so many GPU workers, as `benchmarks.scale` starts them."""
+    """Return the number of collectors that `benchmarks.scale` starts for `gpus` GPU workers."""
     return max(2, gpus // GPUS_EACH)
 
 
 def batches_a_second(
     gpus: int, seconds: float, costs: Costs, cores: int | None = None, shards: int = 1
 ) -> float:
-    """Batches of so many seconds that clusters with a scheduler each cast in a second, together.
+    """Return the rate of batches of `seconds` that `shards` clusters cast together, per second.
 
     Their processes share `cores`; None: each has its own.
     """
@@ -103,12 +103,12 @@ def batches_a_second(
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
-    """Share of the time that the GPU workers cast."""
+    """Return the share of the time that the GPU workers cast."""
     return min(1.0, batches_a_second(gpus, seconds, costs) * seconds / gpus)
 
 
 def limit(gpus: int, seconds: float, costs: Costs) -> str:
-    """Name what is busiest: the process that the others wait for."""
+    """Return the name of the busiest process, for which the rest of the cluster waits."""
     batches = batches_per_task([(seconds, 1)], gpus)
     load: Counter[str] = Counter()
     for number, name in enumerate(STEPS):
@@ -119,7 +119,7 @@ def limit(gpus: int, seconds: float, costs: Costs) -> str:
 
 
 def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -> int:
-    """How many clusters, each with a scheduler and driver, keep all GPUs so busy."""
+    """Return the number of clusters that keep all GPUs busy for at least a share of the time."""
     shards = 1
     while busy(-(-gpus // shards), seconds, costs) < min_busy:
         shards += max(1, shards // 8)
@@ -127,7 +127,7 @@ def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -
 
 
 def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
-    """Draw how busy the GPUs of one scheduler are, and what was read."""
+    """Draw how busy the GPUs of a scheduler are by the model, with measured runs as dots."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -149,7 +149,7 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line."""
+    """Run from the command line; return rates, limits and shards by case."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     for name in dict.fromkeys(STEPS):
         words = "ms of it for a task, and for each receipt in it"

@@ -41,7 +41,7 @@ _VERSIONS = (
 
 
 def time_call(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, int]:
-    """Seconds of one call, as a mean over some, and what it returned."""
+    """Return the mean time of a call, seconds, and the number of hits."""
     start = clock()
     for _ in range(repeats):
         hits = cast()
@@ -51,7 +51,7 @@ def time_call(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[flo
 def measure(
     job: Job, engines: list[Engine], rounds: int, calls_s: float, clock: Callable[[], float]
 ) -> dict[str, Any]:
-    """Rates of all engines on one job."""
+    """Measure the rates of all engines on a job."""
     ready: list[tuple[Engine, Cast, int]] = []
     builds = {}
     for engine in engines:
@@ -89,19 +89,19 @@ def measure(
 
 
 def best_peer(row: dict[str, Any]) -> str | None:
-    """Name of the peer with the highest median rate, on the device or not."""
+    """Return the name of the peer with the highest median rate, or None without peers."""
     peers = {k: np.median(v["mrays_s"]) for k, v in row["engines"].items() if v["peer"]}
     return max(peers, key=lambda name: peers[name]) if peers else None
 
 
 def ratio(row: dict[str, Any], engine: str, base: str) -> float:
-    """Median over the rounds of how many times faster one engine was than another."""
+    """Return the median over the rounds of the rate of an engine over the rate of `base`."""
     rates = [np.array(row["engines"][name]["mrays_s"]) for name in (engine, base)]
     return float(np.median(rates[0] / rates[1]))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print one job's rates."""
+    """Print the rates of a job."""
     print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
     peer = best_peer(row)
     for name, entry in row["engines"].items():
@@ -118,7 +118,7 @@ def show(row: dict[str, Any]) -> None:
 
 
 def findings(row: dict[str, Any]) -> list[str]:
-    """Say what the targets are about."""
+    """Return sentences about the ratios that have targets."""
     engines = row["engines"]
     sentences = []
     if "Open3D, bare" in engines and "embree" in engines:
@@ -129,7 +129,7 @@ def findings(row: dict[str, Any]) -> list[str]:
 
 
 def environment(threads: int, clock: str) -> dict[str, Any]:
-    """Where and with what it was measured."""
+    """Return the machine, versions and settings of a measurement."""
     versions = {}
     for name in _VERSIONS:
         try:

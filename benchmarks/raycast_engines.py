@@ -23,7 +23,7 @@ Cast = Callable[[], int]
 
 
 class Engine(ABC):
-    """One way to cast rays."""
+    """Engine that casts rays."""
 
     name: ClassVar[str]
     is_raybeam: ClassVar[bool] = False
@@ -35,29 +35,29 @@ class Engine(ABC):
 
     @abstractmethod
     def missing(self) -> str:
-        """Why it cannot take part; "" when it can."""
+        """Return the reason why the engine is not available, or an empty string."""
 
     @abstractmethod
     def prepare(self, job: Job) -> Cast:
-        """Build what it needs once for a mesh."""
+        """Build the engine's tree; return a function that casts the job's rays and counts hits."""
 
     def rays(self, job: Job) -> int:
-        """How many of the job's rays it casts in one call."""
+        """Return the number of rays that a call casts."""
         return job.rays
 
 
 class _RaybeamEngine(Engine):
-    """Poses in, hits out: makes the rays, casts them and gathers the hits."""
+    """Backend of raybeam, from poses to hits: makes the rays, casts them and gathers hits."""
 
     is_raybeam = True
     peer = False
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return why the backend is not available, or an empty string."""
         return available_backends()[self.name]
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build a `RayCaster`; return a function that scans from all origins."""
         caster = RayCaster(job.vertices, job.faces, self.name, threads=self.threads)
         pattern = Pattern(job.directions)
         return lambda: sum(
@@ -66,39 +66,39 @@ class _RaybeamEngine(Engine):
 
 
 class Numpy(_RaybeamEngine):
-    """The numpy backend."""
+    """Backend `numpy`."""
 
     name = "numpy"
 
 
 class Embree(_RaybeamEngine):
-    """The embree backend."""
+    """Backend `embree`."""
 
     name = "embree"
 
 
 class Cuda(_RaybeamEngine):
-    """The cuda backend, hits copied to the host."""
+    """Backend `cuda`, with hits copied to the host."""
 
     name = "cuda"
 
 
 class BruteForce(Engine):
-    """Every ray against every triangle in NumPy, on as many rays as a moment allows."""
+    """Brute force in NumPy: a subset of the rays against all triangles."""
 
     name = "brute force, NumPy"
     peer = False
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return an empty string: NumPy is installed."""
         return ""
 
     def rays(self, job: Job) -> int:
-        """See `Engine.rays`."""
+        """Return the size of the subset that a moment allows."""
         return min(len(job.directions), max(4, 4_000_000 // len(job.faces)))
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Compute edges and products of the origin; return a function that casts the subset."""
         first, second, third = (job.vertices[job.faces[:, k]] for k in range(3))
         first_edge = second - first
         second_edge = third - first

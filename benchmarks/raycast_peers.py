@@ -17,17 +17,17 @@ _MISS = 0xFFFFFFFF
 
 
 class Open3D(Engine):
-    """A bare loop over `RaycastingScene.cast_rays` with rays that were made before."""
+    """Bare loop over `RaycastingScene.cast_rays` with prepared rays."""
 
     name = "Open3D, bare"
     chunk = 1 << 17
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Open3D, or an empty string."""
         return "" if importlib.util.find_spec("open3d") else "pip install open3d-cpu"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Open3D's scene and the chunks of rays; return a function that casts the chunks."""
         import open3d
 
         scene = _open3d_scene(job, self.threads)
@@ -48,12 +48,12 @@ class Open3D(Engine):
 
 
 class Open3DWithNumpy(Open3D):
-    """The same, rays made and hits gathered in NumPy as one would write it down."""
+    """Open3D with rays made and hits gathered in NumPy, as a script would do."""
 
     name = "Open3D + NumPy"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Open3D's scene; return a function that makes rays, casts and gathers hits."""
         import open3d
 
         scene = _open3d_scene(job, self.threads)
@@ -73,16 +73,16 @@ class Open3DWithNumpy(Open3D):
 
 
 class Trimesh(Engine):
-    """The fastest query of trimesh with embreex: poses in, triangles out, no distances."""
+    """Fastest query of trimesh with embreex: from poses to triangles, without distances."""
 
     name = "trimesh + embreex"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install embreex, or an empty string."""
         return "" if importlib.util.find_spec("embreex") else "pip install embreex"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build the intersector; return a function that queries from all origins."""
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -96,23 +96,23 @@ class Trimesh(Engine):
         return lambda: sum(count_hits(origin) for origin in job.origins)
 
     def hits(self, scene: Any, origins: Float, directions: Float) -> int:
-        """Ask for the triangles that are hit."""
+        """Return the number of rays that hit a triangle."""
         return int((scene.intersects_first(origins, directions) >= 0).sum())
 
 
 class TrimeshPoints(Trimesh):
-    """The query that answers what our backends do: where which ray hits which triangle."""
+    """Query of trimesh with the results of our backends: points, rays and triangles."""
 
     name = "trimesh, points"
 
     def hits(self, scene: Any, origins: Float, directions: Float) -> int:
-        """Ask for points, rays and triangles."""
+        """Return the number of hit points."""
         points, _, _ = scene.intersects_location(origins, directions, multiple_hits=False)
         return len(points)
 
 
 class Warp(Engine):
-    """Warp's mesh_query_ray, rays that were made before, answers on the host."""
+    """Warp's mesh_query_ray with prepared rays and results on the host."""
 
     name = "Warp CPU"
     device: ClassVar[str] = "cpu"
@@ -120,13 +120,13 @@ class Warp(Engine):
     builder: ClassVar[str] = "sah"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Warp, or an empty string."""
         if not importlib.util.find_spec("warp"):
             return "pip install warp-lang"
         return ""
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Warp's mesh and arrays; return a function that launches a kernel per origin."""
         import warp
 
         from .raycast_warp import first_hits
@@ -151,13 +151,13 @@ class Warp(Engine):
 
 
 class WarpCuda(Warp):
-    """The same on the device."""
+    """Warp's mesh_query_ray on a CUDA device."""
 
     name = "Warp CUDA"
     device = "cuda:0"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Warp, or that a CUDA device is missing, or an empty string."""
         import_error = super().missing()
         if import_error:
             return import_error
@@ -178,7 +178,7 @@ def _open3d_scene(job: Job, threads: int) -> Any:
 
 
 def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
-    """Rays (n, 6) of all origins, made before they are cast."""
+    """Return the rays (n, 6) of all origins, in chunks."""
     directions = job.directions @ job.rotation.T
     chunks = []
     for origin in origins:

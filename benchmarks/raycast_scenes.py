@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A mesh and the rays to cast at it.
+    """Mesh and rays to cast at the mesh.
 
     Attributes
     ----------
@@ -52,13 +52,13 @@ class Job:
         return len(self.origins) * len(self.directions)
 
     def shuffled(self) -> Job:
-        """Return the same rays in no order."""
+        """Return the job with the same rays in random order."""
         directions = np.random.default_rng(0).permutation(self.directions)
         return replace(self, directions=directions, order="shuffled")
 
 
 def _tilted_rotation(degrees: float) -> Float:
-    """Rotation of a sensor that is not set up level: about z, then a little about x."""
+    """Return the rotation of a tilted sensor: about z, then by two degrees about x."""
     a = np.radians(degrees)
     b = np.radians(2.0)
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
@@ -67,7 +67,7 @@ def _tilted_rotation(degrees: float) -> Float:
 
 
 def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
-    """Make a job of one turn of a sensor."""
+    """Make a job of a sensor's revolution."""
     return Job(
         name,
         np.array(scene.vertices),
@@ -79,12 +79,12 @@ def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
 
 
 def _lidar(rays: int) -> Sensor:
-    """Make a sensor of 128 rings and 45 degrees, with so many rays in a turn."""
+    """Make a sensor of 128 rings and 45 degrees, with about `rays` rays per revolution."""
     return Sensor.grid(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
 
 
 def survey_job(rays: int) -> Job:
-    """Make the default survey: its scene, its sensor, its three poses."""
+    """Make a job of the default survey: its scene, its sensor, its three poses."""
     survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     origins = np.array([pose.position for pose in survey.poses])
     firings_per_revolution = max(36, min(survey.sensor.period or 0, rays // 120))
@@ -95,14 +95,14 @@ def survey_job(rays: int) -> Job:
 
 
 def city_job(triangles: int, rays: int) -> Job:
-    """Make a city, the sensor on the crossing in its middle."""
+    """Make a city, with the sensor on the central crossing."""
     return _job(
         f"city {triangles:.0e}".replace("e+0", "e"), city(triangles), [0, 0, 2], _lidar(rays)
     )
 
 
 def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
-    """Make a city, the sensor at places in streets, or in buildings, where all rays hit."""
+    """Make a city, with the sensor in streets, or in buildings where all rays hit."""
     scene = city(triangles)
     sensor = _lidar(rays)
     lower_m, upper_m = scene.bounds
@@ -118,7 +118,7 @@ def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
 
 
 def terrain_job(triangles: int, rays: int) -> Job:
-    """Make a terrain, the sensor 30 m above its middle."""
+    """Make a terrain, with the sensor 30 m above its middle."""
     scene = terrain(triangles)
     down = RayCaster(scene.vertices, scene.faces, "numpy").cast([0.1, 0.2, 1e4], [[0, 0, -1]])
     height = 1e4 - float(down.distance[0]) + 30
@@ -128,7 +128,7 @@ def terrain_job(triangles: int, rays: int) -> Job:
 
 
 def mesh_job(path: Path, rays: int) -> Job:
-    """Read a mesh file, the sensor 1.5 m above the lowest point in its middle."""
+    """Read a mesh file; the sensor is in its middle, 1.5 m above the lowest point."""
     scene = Scene.load(path)
     lower_m, upper_m = scene.bounds
     middle = (lower_m + upper_m) / 2
@@ -138,7 +138,7 @@ def mesh_job(path: Path, rays: int) -> Job:
 def jobs(
     rays: int, meshes: list[Path], quick: bool, large: bool = False
 ) -> dict[str, Callable[[], Job]]:
-    """Makers of jobs by the name that --scene takes.
+    """Return functions that make jobs, by the name that --scene takes.
 
     Parameters
     ----------

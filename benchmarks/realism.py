@@ -60,14 +60,15 @@ PEOPLE_M = (4.0, 30.0)
 
 
 def fine_box(triangles: int) -> SceneMesh:
-    """Make the box of a car of so many triangles, at least."""
+    """Make the box of a car with at least `triangles` triangles."""
     mesh = box("Car", (4.5, 1.8, 1.5))
     vertices = mesh.vertices
     faces = mesh.faces
     while len(faces) < triangles:  # each in four
         corners = vertices[faces]
         middles = (corners + np.roll(corners, -1, axis=1)) / 2
-        (a, b, c), (p, q, r) = corners.transpose(1, 0, 2), middles.transpose(1, 0, 2)
+        a, b, c = corners.transpose(1, 0, 2)
+        p, q, r = middles.transpose(1, 0, 2)
         corners = np.stack([a, p, r, p, b, q, r, q, c, p, q, r], axis=1).reshape(-1, 3)
         vertices = corners
         faces = np.arange(len(corners)).reshape(-1, 3)
@@ -75,7 +76,7 @@ def fine_box(triangles: int) -> SceneMesh:
 
 
 def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
-    """Make cars around the sensor, at 10 m/s, some of which turn."""
+    """Make cars around the sensor, at 10 m/s, with random changes of heading."""
     random = np.random.default_rng(seed)
     angle, heading = random.uniform(0, 2 * np.pi, (2, count))
     radius = random.uniform(*FIELD_M, count)
@@ -93,7 +94,7 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
 
 
 def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
-    """Make copies of one person around the sensor, at 1.4 m/s, each in another phase."""
+    """Make copies of a person around the sensor, at 1.4 m/s, in different phases."""
     mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4) if walking else None)
@@ -110,7 +111,7 @@ def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
 
 
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
-    """Make a function of the round for each row, which gives its sweep."""
+    """Make a function of the round for each row; each function returns a sweep."""
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
@@ -170,7 +171,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
 
 
 def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
-    """Make a function that casts a turn of a survey, of five, and makes its columns."""
+    """Return a function that casts a revolution of a survey, of five, and makes its columns."""
     rig = Rig(scene, survey, backend, threads=1)
     scans = survey.scan_count // 5
 
@@ -182,7 +183,7 @@ def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
 
 
 def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
-    """Time all rows, in another order each round; the first round warms up."""
+    """Time all rows, in a random order each round; the first round warms up."""
     seconds: dict[str, list[float]] = {row: [] for row in rows}
     points = {}
     for number in range(rounds + 1):

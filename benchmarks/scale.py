@@ -66,7 +66,7 @@ async def _workers(
     seconds: float = 0.0,
     first: int = 0,
 ) -> None:
-    """Run workers, perhaps each with slots of a partition; batches take `seconds` to cast.
+    """Run workers, optionally with slots of a partition; batches take `seconds` to cast.
 
     Their names count from `first` on.
     """
@@ -102,7 +102,7 @@ def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) ->
 
 @contextmanager
 def process(main: Callable[..., Any], *arguments: Any) -> Iterator[tuple[psutil.Process, str]]:
-    """Run `main` in a process of its own; gives it, and the address that it sends when ready."""
+    """Run `main` in a new process; yield the process and the address it sends when ready."""
     context = multiprocessing.get_context("spawn")
     parent_end, child_end = context.Pipe()
     child = context.Process(target=_serve, args=(main, child_end, *arguments), daemon=True)
@@ -122,7 +122,7 @@ def name_of_worker(_: object = None) -> str:
 
 
 def divide(client: Client) -> tuple[list[Partition], float]:
-    """Divide all workers into four partitions; gives those and the seconds it took."""
+    """Divide all workers into four partitions; return the partitions and the elapsed seconds."""
     start = time.perf_counter()
     remaining = Pool.from_client(client)
     workers_per_partition = len(remaining) // len(NAMES)
@@ -168,7 +168,7 @@ def processor_s(process: psutil.Process) -> float:
 
 
 def measure(workers: int, tasks: int) -> dict[str, Any]:
-    """Figures of a cluster of so many workers."""
+    """Return the figures of a cluster of `workers` workers."""
     with (
         process(_scheduler) as (scheduler, address),
         process(_workers, address, workers),
@@ -214,13 +214,13 @@ ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
 def small_survey(scans: int) -> Survey:
-    """Describe scans of four rays."""
+    """Return a survey of scans of four rays."""
     sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
     return Survey(sensor, [(0.0, 0.0, 1.0)] * scans, steps=1)
 
 
 class CostSamples:
-    """Processor time of each kind of process for a receipt, or job, from a fifth of them on."""
+    """Processor time per receipt or job of each kind of process, after a fifth of the work."""
 
     def __init__(self, total: int, processes: dict[str, list[psutil.Process]]) -> None:
         self._all = total
@@ -236,7 +236,7 @@ class CostSamples:
         }
 
     def __call__(self, progress: Progress) -> None:
-        """Look how much is done, and what it took."""
+        """Sample the progress and the processor times."""
         finished = progress.jobs_done if progress.jobs else progress.collected
         if not self._samples or finished > self._samples[-1][0]:
             if finished <= self._all // 5:
@@ -244,7 +244,7 @@ class CostSamples:
             self._samples.append((finished, time.perf_counter(), self._cpu_s()))
 
     def figures(self) -> dict[str, float]:
-        """Return what was done a second, and milliseconds for each without heartbeats."""
+        """Return items per second, and milliseconds per item without heartbeats."""
         (first_count, start, cpu_before), *_, (last_count, stop, cpu_after) = self._samples
         took = {
             name: cpu_after[name] - cpu_before[name] - self._idle[name] * (stop - start)
@@ -265,7 +265,7 @@ class CostSamples:
 def casting_cluster(
     gpus: int, seconds: float
 ) -> Iterator[tuple[Client, dict[str, list[psutil.Process]]]]:
-    """Start workers that cast slowly, and a worker of LIDAR; gives the processes of each kind."""
+    """Start slow casting workers and a worker of LIDAR; yield a client and processes by kind."""
     with ExitStack() as stack:
 
         def start(main: Callable[..., Any], *arguments: Any) -> tuple[psutil.Process, str]:
@@ -282,7 +282,7 @@ def casting_cluster(
 
 
 def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
-    """Run a survey with batches of one scan; its figures, and the share of a minute of casting."""
+    """Run a survey with batches of one scan; return its figures and the share of casting."""
     with casting_cluster(gpus, seconds) as (client, processes), single_scans():
         simulate(ROOM, small_survey(gpus), client=client, backend="numpy")
         counts = CostSamples(scans, processes)
@@ -302,7 +302,7 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
 
 
 def measure_shards(shards: int, *arguments: Any) -> dict[str, float]:
-    """Run `measure_receipts` in several clusters at a time; the sum of rates, means of the rest."""
+    """Run `measure_receipts` in several clusters at a time; return summed rates, other means."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(shards, mp_context=spawn) as pool:
         rows = list(pool.map(measure_receipts, *([value] * shards for value in arguments)))
@@ -311,7 +311,7 @@ def measure_shards(shards: int, *arguments: Any) -> dict[str, float]:
 
 
 def measure_jobs(jobs: int) -> dict[str, float]:
-    """Run a campaign of tiny jobs; its figures."""
+    """Run a campaign of tiny jobs; return its figures."""
     with casting_cluster(4, 0.0) as (client, processes), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "campaign.yaml"
         data = Path(folder) / "data"
@@ -325,7 +325,7 @@ def measure_jobs(jobs: int) -> dict[str, float]:
 
 
 def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | None:
-    """Of driver and scheduler together; None where the smallest took no time to speak of."""
+    """Return the growth of driver and scheduler time together, or None from zero."""
     smallest_ms, largest_ms = (
         figures["driver_ms"] + figures["scheduler_ms"] for figures in (smallest, largest)
     )

@@ -43,14 +43,14 @@ HEIGHT_M = 1.8
 
 
 def sensor_of(case: str) -> Sensor:
-    """Make the sensor of a case; a robot has 64 rays around it."""
+    """Make the sensor of a case; a robot's sensor has 64 rays around it."""
     if case == "robots":
         return Sensor.grid(64, 1, step_deg=360, max_range_m=30)
     return load_sensor(case)
 
 
 def poses_of(count: int, number: int) -> Float:
-    """Poses of a round, (count, 4, 4): on the street, each turned by another angle."""
+    """Return the poses of a round, (count, 4, 4): on the street, with random yaw."""
     random = np.random.default_rng(number)
     angle = random.uniform(-np.pi, np.pi, count)
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -64,7 +64,7 @@ def poses_of(count: int, number: int) -> Float:
 
 
 class LidarpoolScans:
-    """The cast alone, and the scanner, with the same rays.
+    """Cast alone, and scanners, with the same rays.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class LidarpoolScans:
         self.noisy = Scanner(scene, sensor, noise=noise, backend=backend, threads=1)
 
     def cast(self, poses: Float) -> int:
-        """Cast the rays from poses (k, 4, 4), and count the hits."""
+        """Cast the rays from poses (k, 4, 4); return the number of hits."""
         hits = self.caster.scan(
             self.pattern,
             poses[:, :3, 3],
@@ -98,25 +98,25 @@ class LidarpoolScans:
         return len(hits)
 
     def ranges(self, poses: Float) -> Any:
-        """Make images."""
+        """Make range images."""
         return self.scanner.ranges(poses)
 
     def noise(self, poses: Float) -> Any:
-        """Make images with noise."""
+        """Make range images with noise."""
         return self.noisy.ranges(poses)
 
     def sweep(self, poses: Float) -> int:
-        """Make the cloud of one pose."""
+        """Make the cloud of a pose; return its number of points."""
         return len(self.scanner.sweep(poses[0, :3, 3]))
 
     def moving(self, poses: Float) -> int:
-        """Make the cloud of a sensor at 20 m/s."""
+        """Make the cloud of a sensor at 20 m/s; return its number of points."""
         positions = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
         return len(self.scanner.sweep(Track([0, 0.2], positions)))
 
 
 class Open3D:
-    """Open3D's scene, and the rays in NumPy."""
+    """Open3D's scene, with rays made in NumPy."""
 
     def __init__(self, scene: Scene, scans: LidarpoolScans) -> None:
         import open3d
@@ -133,7 +133,7 @@ class Open3D:
         self.origins = None if origins is None else np.array(origins, np.float32)
 
     def ranges(self, poses: Float) -> Any:
-        """Make images."""
+        """Make range images."""
         count = len(self.rays)
         matrices = poses.astype(np.float32)
         rotations = matrices[:, :3, :3].transpose(0, 2, 1)
@@ -152,7 +152,7 @@ class Open3D:
 def measure(
     case: str, backend: str, scene: Scene, robots: int, rounds: int, clock: str, python: str
 ) -> dict[str, Any]:
-    """Time all ways of one case."""
+    """Time all methods of a case."""
     clock_s = CLOCKS[clock]
     count = robots if case == "robots" else 1
     scans = LidarpoolScans(scene, sensor_of(case), backend)
@@ -203,7 +203,7 @@ def _time_peer(
     rounds: int,
     clock: str,
 ) -> tuple[list[float], float]:
-    """Time a peer with the poses of the last round, and find its share of hits."""
+    """Time a peer with the poses of the last round; return its times and share of hits."""
     rays = np.concatenate([scans.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
@@ -222,13 +222,13 @@ def _time_peer(
 
 
 def ratio(row: dict[str, Any], method: str, base: str = "cast") -> float:
-    """Median over the rounds of one way's time to another's."""
+    """Return the median over the rounds of a method's time over the time of `base`."""
     pairs = zip(row["seconds"][method], row["seconds"][base], strict=True)
     return float(np.median([max(a, 1e-9) / max(b, 1e-9) for a, b in pairs]))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print what one case took."""
+    """Print the times of a case."""
     print(
         f"\n{row['case']} by {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
         f"{row['triangles']:,} triangles"

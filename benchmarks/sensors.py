@@ -46,14 +46,14 @@ CASES = ("grid", "still", "moving", "turning", "noise", "ten actors", "19 sub-ra
 
 
 def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
-    """Make a way along the street, beside the carrier's, level; the survey is its middle."""
+    """Make a level trajectory along the street, beside the carrier's; the survey is its middle."""
     start, end = np.array(LINE)
     positions = np.array([start, end]) * (speed, 1, 1) + (*shift, 0)
     return Track([-0.5, 0.5], positions, start_s=0, duration_s=0.2)
 
 
 def bend(rate_deg: float = 30.0) -> Track:
-    """Make the way along the street with a carrier that turns, to the left."""
+    """Make the trajectory along the street of a carrier that turns to the left."""
     straight = track()
     half = np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
     quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
@@ -61,7 +61,7 @@ def bend(rate_deg: float = 30.0) -> Track:
 
 
 def surveys(name: str, share: float) -> dict[str, Survey]:
-    """Make the surveys of a model, one for each case but for the actors, which are a scene's.
+    """Make the surveys of a model by case; actors are part of the scene.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
 
 
 def traffic(scene: Scene) -> Scene:
-    """Put ten cars into a scene: five ahead of the carrier, five that come towards it."""
+    """Put ten cars into a scene: five ahead of the carrier, and five oncoming cars."""
     trajectories = [track((8.0 + 6 * k, 3.6 * (k % 2)), 1 - 1.5 * (k % 2)) for k in range(10)]
     cars = [
         Actor(box(f"car {k}", (4.5, 1.8, 1.5)), _on_ground(trajectory))
@@ -108,12 +108,12 @@ def _on_ground(trajectory: Track) -> Track:
 
 
 def cast_scan(rig: Rig) -> list[BatchPoints]:
-    """Cast the one scan there is."""
+    """Cast the only scan of a survey."""
     return list(rig.cast(0, rig.survey.scan_count))
 
 
 def make_columns(batches: list[BatchPoints]) -> int:
-    """Make all columns of a cloud, and count the points."""
+    """Make all columns of a cloud; return the number of points."""
     for returns in batches:
         for column in returns.survey.stored_columns:
             column.make(returns)
@@ -121,7 +121,7 @@ def make_columns(batches: list[BatchPoints]) -> int:
 
 
 class Peer:
-    """A process that casts when it is told to.
+    """Process that casts on request.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class Peer:
         raise RuntimeError(f"The peer ended with {self._process.wait()}")
 
     def cast(self) -> tuple[float, int]:
-        """Seconds of one turn, and how many rays hit."""
+        """Return the time of a revolution, seconds, and the number of hits."""
         assert self._process.stdin is not None
         self._process.stdin.write("cast\n")
         self._process.stdin.flush()
@@ -169,7 +169,7 @@ class Peer:
 
 
 def write_job(survey: Survey, scene: Scene, path: Path) -> None:
-    """Write mesh and rays of a moving sensor for the peers; it is level and faces along x."""
+    """Write mesh and rays of a moving sensor, level and facing along x, for the peers."""
     sensor = survey.sensor
     firings = np.arange(*sensor.firings(0))
     times = sensor.begins_ns(firings)
@@ -192,7 +192,7 @@ def write_job(survey: Survey, scene: Scene, path: Path) -> None:
 def measure(
     name: str, backend: str, scene: Scene, share: float, rounds: int, clock: str, python: str = ""
 ) -> dict[str, Any]:
-    """Time all cases of one model on one backend, and the peers."""
+    """Time all cases of a model on a backend, and the peers."""
     clock_s = CLOCKS[clock]
     crowded = traffic(scene)
     rigs = {
@@ -243,14 +243,14 @@ def _timed(rig: Rig, clock_s: Callable[[], float]) -> tuple[list[float], int]:
 
 
 def ratio(row: dict[str, Any], case: str, base: str, stage: int = 0) -> float:
-    """Median over the rounds of one case's time to another's; casting alone, or 1: all of it."""
+    """Return the median ratio of two cases' times; stage 0 is casting, 1 adds columns."""
     pairs = zip(row["seconds"][case], row["seconds"][base], strict=True)
     ratios = [max(a[min(stage, len(a) - 1)], 1e-9) / max(b[stage], 1e-9) for a, b in pairs]
     return float(np.median(ratios))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print what one model took on one backend."""
+    """Print the times of a model on a backend."""
     print(
         f"\n{row['model']} by {row['backend']}: {row['rays']:,} rays in {row['firings']:,} "
         f"firings, {row['triangles']:,} triangles"

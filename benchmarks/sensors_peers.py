@@ -38,7 +38,7 @@ def _mujoco_model(job: Job) -> tuple[Any, Any]:
 
 
 def mujoco_caster(job: Job) -> Callable[[], int]:
-    """Cast the rays of each firing with one call: they all leave from one place."""
+    """Return a function that casts the rays of each firing with one call, from one origin."""
     import mujoco
 
     model, data = _mujoco_model(job)
@@ -61,7 +61,7 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
 
 
 def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable[[], int]:
-    """Let MuJoCo-LiDAR cast the rays of each place with one call, by azimuth and elevation."""
+    """Return a function that casts each origin's rays with one call of MuJoCo-LiDAR."""
     if backend == "cpu":
         from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
     else:
@@ -93,7 +93,7 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
 
 
 def helios_caster(job: Job) -> Callable[[], int]:
-    """Let it make a spinning scan of its own, with as many rays, on the same way."""
+    """Return a function that casts Helios' spinning scan, with as many rays, on the same line."""
     from pyhelios import Context, LiDARCloud
 
     context = Context()
@@ -129,7 +129,7 @@ CASTERS = {
 
 
 def main() -> None:
-    """Answer each line on standard input with the time of one turn."""
+    """Answer each line on standard input with the time of a cast."""
     name, path, clock = sys.argv[1:]
     clock_s = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
     cast = CASTERS[name](dict(np.load(path)))

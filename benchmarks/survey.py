@@ -31,7 +31,7 @@ MESH = "city.glb"
 
 
 def poses(count: int) -> list[tuple[float, float, float]]:
-    """Places along streets, at the height of a car's roof."""
+    """Return positions along streets, at the height of a car's roof."""
     from lidarscenes.procedural.city import city
 
     lower_m, upper_m = city(TRIANGLES).bounds
@@ -41,7 +41,7 @@ def poses(count: int) -> list[tuple[float, float, float]]:
 
 
 def script(rays: int, folder: Path) -> None:
-    """Survey in one process, as plainly as it goes."""
+    """Run the survey in this process as a plain script would, and write its cloud."""
     import open3d as o3d
 
     from lidarpool import Scene
@@ -80,12 +80,12 @@ def script(rays: int, folder: Path) -> None:
 
 
 def scan_count(rays: int) -> int:
-    """Count the scans of whole turns."""
+    """Return the number of scans, each a whole revolution."""
     return max(1, round(rays / (RAYS_PER_TURN * LAYERS)))
 
 
 def scenario(rays: int, folder: Path) -> Path:
-    """Write mesh and scenario of the same survey."""
+    """Write mesh and scenario of the same survey; return the scenario's path."""
     from lidarscenes.procedural.city import city
     from lidarscenes.writers.scene_file import write_scene
 
@@ -108,7 +108,7 @@ def scenario(rays: int, folder: Path) -> Path:
 
 
 def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
-    """Wall and processor seconds of the process that does one side, and of its children."""
+    """Return wall and processor seconds of the process of a side, including its children."""
     out_folder = folder / side
     out_folder.mkdir(exist_ok=True)
     python = [sys.executable, "-m"]
@@ -131,7 +131,7 @@ def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run the benchmark, or one side of it."""
+    """Run the benchmark, or the script's side alone."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
     parser.add_argument("--rounds", type=int, default=3)
@@ -163,7 +163,7 @@ def main() -> None:
 
 
 def compare(folder: Path) -> None:
-    """Compare both clouds: which points are there, and how far apart they are."""
+    """Print how many points of both clouds agree, and the distances between them."""
     from lidarpool import read_cloud
 
     script_cloud, our_cloud = (

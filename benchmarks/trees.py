@@ -59,7 +59,7 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
 
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
-    """Cast a job's rays; what was seen a ray, and the share that hit."""
+    """Cast a job's rays; return the counters per ray, and the share of hits."""
     directions = np.ascontiguousarray(job.directions @ job.rotation.T)
     n = len(directions)
     distance = np.empty(n)
@@ -100,7 +100,7 @@ def _read_counters(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
 
 
 def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None:
-    """Launch a kernel, see tests/raybeam/host/launch.h."""
+    """Launch a kernel; tests/raybeam/host/launch.h defines its interface."""
     assert getattr(library, f"parameters_{name}")() == len(arguments)
     values = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -108,7 +108,7 @@ def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None
 
 
 def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
-    """Both trees on one job."""
+    """Measure all trees on a job."""
     mesh = local_mesh(job.vertices, job.faces)
     row: dict[str, Any] = {"scene": job.name, "triangles": len(mesh.corners), "rays": job.rays}
     for name, cluster_limits in TREES.items():
@@ -125,7 +125,7 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
 
 
 def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout:
-    """Lay out a mesh with so many clusters left to the sweep."""
+    """Lay out a mesh with limits on the clusters left to the sweep."""
     with (
         patch.object(ploc, "_MAX_CLUSTERS", cluster_limits[0]),
         patch.object(ploc, "_MIN_CLUSTERS", cluster_limits[1]),
@@ -134,7 +134,7 @@ def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print one scene's counts, as a line of a table."""
+    """Print the counts of a scene as a row of the table."""
     cells = [row["scene"], f"{row['triangles']:,}"]
     cells += [" / ".join(f"{row[name][kind]:.2f}" for name in TREES) for kind in KINDS]
     cells.append(f"{row['ours']['nodes'] / row['sweep']['nodes']:.2f}")
@@ -143,7 +143,7 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 2 without a compiler."""
+    """Run from the command line; return 2 without a compiler."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy scenes, few rays")
     parser.add_argument("--scene", action="append", help="only this one; may be given again")
