@@ -54,47 +54,48 @@ def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
 
 
 def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
-    """Make a scene of `PLACES`; return it with the position of a sensor, metres."""
+    """Make a scene of `PLACES`; return the scene, and the position of a sensor, metres."""
     rng = np.random.default_rng(seed)
     if name == "street":
         return city(30_000, seed=seed), (0.0, 0.0, 1.8)
     if name == "forest":
-        ground = box("ground", (-80, -80, -1), (80, 80, 0))
-        count = 120
-        positions = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
-        positions = positions[np.hypot(*positions[:, :2].T) > 2.5]
-        trees = all_trees(0, 0.2)
-        species = rng.integers(0, len(trees), len(positions))
-        yaw = rng.uniform(0, 2 * np.pi, len(positions))
-        scale = rng.uniform(0.6, 1.2, len(positions))
-        return Scene.from_meshes(
-            [ground, *place_instances(trees, species, positions, yaw, scale)]
-        ), (
-            0,
-            0,
-            1.6,
-        )
+        return forest(rng), (0, 0, 1.6)
     if name == "room":
-        x = rng.uniform(5, 9)
-        y = rng.uniform(4, 7)
-        z = rng.uniform(2.4, 3.2)
-        box_count = 8
-        size = 0.8
-        height = 1.2
-    else:
-        x = rng.uniform(30, 60)
-        y = rng.uniform(18, 35)
-        z = rng.uniform(7, 10)
-        box_count = 24
-        size = 2.5
-        height = 5.0
+        size = (rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(2.4, 3.2))
+        return furnished_box(rng, size, 8, (0.8, 0.8, 1.2)), (0.0, 0.0, 1.1)
+    size = (rng.uniform(30, 60), rng.uniform(18, 35), rng.uniform(7, 10))
+    return furnished_box(rng, size, 24, (2.5, 2.5, 5.0)), (0.0, 0.0, 1.1)
+
+
+def forest(rng: np.random.Generator) -> Scene:
+    """Make trees on flat ground; 2.5 m around the origin are free."""
+    ground = box("ground", (-80, -80, -1), (80, 80, 0))
+    count = 120
+    positions = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
+    positions = positions[np.hypot(*positions[:, :2].T) > 2.5]
+    trees = all_trees(0, 0.2)
+    species = rng.integers(0, len(trees), len(positions))
+    yaw = rng.uniform(0, 2 * np.pi, len(positions))
+    scale = rng.uniform(0.6, 1.2, len(positions))
+    instances = place_instances(trees, species, positions, yaw, scale)
+    return Scene.from_meshes([ground, *instances])
+
+
+def furnished_box(
+    rng: np.random.Generator,
+    size: tuple[float, float, float],
+    count: int,
+    max_size: tuple[float, float, float],
+) -> Scene:
+    """Make a closed room of a size with `count` boxes of up to `max_size` in it, metres."""
+    x, y, z = size
     meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
-    for number in range(box_count):
+    for number in range(count):
         a, b = rng.uniform(-0.45, 0.45, 2) * (x, y)
-        w, d, h = rng.uniform(0.15, 1, 3) * (size, size, height)
-        if np.hypot(a, b) > 1.0 + size:
+        w, d, h = rng.uniform(0.15, 1, 3) * max_size
+        if np.hypot(a, b) > 1.0 + max_size[0]:
             meshes.append(box(f"thing-{number}", (a, b, 0), (a + w, b + d, h)))
-    return Scene.from_meshes(meshes), (0.0, 0.0, 1.1)
+    return Scene.from_meshes(meshes)
 
 
 def recorded(
@@ -145,8 +146,8 @@ def trial(
     """Fit a recording; return the true figures and the fitted figures: {name: …}.
 
     Every second sensor has noise by range and errors of its channels, the others noise by energy,
-    a threshold and false alarms. With `place_name`, one of `PLACES`, the second is the error of the fit
-    if it is refused.
+    a threshold and false alarms. With `place_name`, an entry of `PLACES`, the second result is the
+    error message of a refused fit.
     """
     rng = np.random.default_rng(number)
     truth = {
@@ -222,7 +223,8 @@ def main() -> None:
     for place_name, name in sorted({*rows, *missing}):
         held, error, half = np.reshape(rows[place_name, name] or [(0, np.nan, np.nan)], (-1, 3)).T
         print(
-            f"| {place_name} | `{name}` | {len(rows[place_name, name])} | {missing[place_name, name]} "
+            f"| {place_name} | `{name}` "
+            f"| {len(rows[place_name, name])} | {missing[place_name, name]} "
             f"| {100 * held.mean():.1f} % | {100 * np.median(error):+.2f} % "
             f"| {100 * np.median(np.abs(half)):.1f} % |"
         )

@@ -14,7 +14,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -57,10 +57,16 @@ def deviations(ranges: Any) -> Any:
     return 1000 * steps[np.isfinite(steps)]
 
 
-def compare_halves(
-    recording: Recording, model: str | None, white: float | None
-) -> tuple[dict[str, Any], ...]:
-    """Return deviations (n,), shares of lost pulses and scatter of intensity, by source.
+class Comparison(NamedTuple):
+    """Recorded and simulated sweeps of the second half of a recording, by source."""
+
+    deviations_mm: dict[str, Any]  # (n,) each
+    lost: dict[str, float]  # shares of pulses
+    spread: dict[str, float]  # scatter of intensity, relative
+
+
+def compare_halves(recording: Recording, model: str | None, white: float | None) -> Comparison:
+    """Fit the first half of a recording, and simulate the rays of the second half.
 
     LidarError if a half cannot be fitted.
     """
@@ -68,28 +74,59 @@ def compare_halves(
     fit_result = fit(every_second_sweep(recording, 0), model=model, white=white)
     test_stack = SweepStack.read(every_second_sweep(recording, 1))
     rays = select_smooth_rays(test_stack, test_stack.rough_sigma, 0.002)
-    with warnings.catch_warnings(action="ignore"):  # of cells without a return
-        median_ranges = np.nanmedian(test_stack.ranges, axis=0)
-    azimuth_slope = find_surfaces(test_stack, median_ranges, test_stack.rough_sigma).azimuth_slope
+    recorded = flattened_ranges(test_stack, rays)
     energy = np.maximum(rays.intensity / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
-    fitted_noise = fit_result.model.datasheet().noise
-    datasheet_noise = Noise()
-    if model is not None:
-        with suppress(LidarError):  # the model states no performance
-            datasheet_noise = read_model(model).datasheet().noise
-    cell = rays.row, rays.column
-    recorded = test_stack.ranges[:, *cell].astype(float)
-    recorded -= azimuth_slope[cell] * np.nan_to_num(test_stack.azimuth_offsets[:, *cell])
-    sweeps = len(recorded)
-    ranges = {"recorded": recorded, "data sheet": simulate_ranges(datasheet_noise, rays, energy, sweeps),
-              "fitted": simulate_ranges(fitted_noise, rays, energy, sweeps)}  # fmt: skip
-    light = test_stack.intensities[:, *cell].astype(float)
+    noises = {"data sheet": datasheet_noise(model), "fitted": fit_result.model.datasheet().noise}
+    ranges = {"recorded": recorded}
+    for name, noise in noises.items():
+        ranges[name] = simulate_ranges(noise, rays, energy, len(recorded))
+    light = test_stack.intensities[:, rays.row, rays.column].astype(float)
     steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.intensity, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
     lost = {name: float(np.isnan(values).mean()) for name, values in ranges.items()}
     lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps
-    return {name: deviations(values) for name, values in ranges.items()}, lost, spread
+    return Comparison({name: deviations(v) for name, v in ranges.items()}, lost, spread)
+
+
+def flattened_ranges(stack: SweepStack, rays: Any) -> Any:
+    """Return recorded ranges of rays, (s, k) metres, without the effect of azimuth offsets."""
+    with warnings.catch_warnings(action="ignore"):  # of cells without a return
+        median_ranges = np.nanmedian(stack.ranges, axis=0)
+    azimuth_slope = find_surfaces(stack, median_ranges, stack.rough_sigma).azimuth_slope
+    cell = rays.row, rays.column
+    ranges = stack.ranges[:, *cell].astype(float)
+    ranges -= azimuth_slope[cell] * np.nan_to_num(stack.azimuth_offsets[:, *cell])
+    return ranges
+
+
+def datasheet_noise(model: str | None) -> Noise:
+    """Return the noise of a model's data sheet; no noise without a stated performance."""
+    if model is not None:
+        with suppress(LidarError):  # the model states no performance
+            return read_model(model).datasheet().noise
+    return Noise()
+
+
+def print_rows(name: str, comparison: Comparison) -> None:
+    """Print a row of the table for each source of a comparison."""
+    for source, values in comparison.deviations_mm.items():
+        quantiles = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
+        noise = ", ".join(f"{quantile:.1f}" for quantile in quantiles)
+        spread = comparison.spread
+        intensity = f"{100 * spread[source]:.1f} %" if source in spread else "0"
+        lost = f"{100 * comparison.lost[source]:.2f} %"
+        print(f"| {name} | {source} | {noise} | {lost} | {intensity} |", flush=True)
+
+
+def draw_deviations(axes: Any, comparison: Comparison) -> None:
+    """Draw a histogram of deviations for each source of a comparison."""
+    limit = 1.5 * np.quantile(np.abs(comparison.deviations_mm["recorded"]), 0.98)
+    for source, values in comparison.deviations_mm.items():
+        if values.any():  # without noise there is nothing to draw
+            share = np.full(len(values), 1 / len(values))
+            axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
+                      color=COLOURS[source], label=source)  # fmt: skip
 
 
 def main() -> None:
@@ -105,23 +142,13 @@ def main() -> None:
         model, _, white = model.partition(",")
         try:
             recording = open_recording(path)
-            deviations_mm, lost, spread = compare_halves(
-                recording, model or None, float(white) if white else None
-            )
+            comparison = compare_halves(recording, model or None, float(white) if white else None)
         except LidarError as error:
             print(f"| {Path(path).name} | refused | {error} | | |", flush=True)
             continue
+        print_rows(Path(path).name, comparison)
         axes = figure.add_subplot(1, len(options.recordings), number + 1)
-        limit = 1.5 * np.quantile(np.abs(deviations_mm["recorded"]), 0.98)
-        for name, values in deviations_mm.items():
-            median, percentile_95, percentile_99 = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
-            intensity_text = f"{100 * spread[name]:.1f} %" if name in spread else "0"
-            print(f"| {Path(path).name} | {name} | {median:.1f}, {percentile_95:.1f}, {percentile_99:.1f} "
-                  f"| {100 * lost[name]:.2f} % | {intensity_text} |", flush=True)  # fmt: skip
-            if values.any():  # without noise there is nothing to draw
-                share = np.full(len(values), 1 / len(values))
-                axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
-                          color=COLOURS[name], label=name)  # fmt: skip
+        draw_deviations(axes, comparison)
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
     if figure.axes:
         figure.axes[0].legend(fontsize=7, frameon=False)

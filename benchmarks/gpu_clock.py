@@ -41,8 +41,8 @@ class Sizes:
 
 
 QUICK = Sizes(
-    cities=(1000,), large=2000, rays=128 * 16, poses=2, rays_beyond_int=5000, forest=(20, 100), sample=300,
-    leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
+    cities=(1000,), large=2000, rays=128 * 16, poses=2, rays_beyond_int=5000, forest=(20, 100),
+    sample=300, leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
 )  # fmt: skip
 
 

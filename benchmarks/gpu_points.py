@@ -134,29 +134,36 @@ def columns(session: Session) -> Rows:
     for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
         with patch.object(engine, "chunk", chunk):
             yield f"chunks of {chunk:,} rays", time_batches(rig, sizes.batch, sizes.seconds)
+    yield "a batch, ms", split_batch(session, rig)
+    fifth = replace(plain, keep_every=5)
+    yield "every fifth point", time_batches(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
+    row = time_batches(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
+    yield "ten actors", row
+    yield "bits", compare_columns(city(min(sizes.cities)), plain)
+
+
+def split_batch(session: Session, rig: Rig) -> dict[str, float]:
+    """Return the milliseconds of a batch by kernel, and in all."""
     with split_times(session.cupy, rig) as split:
         count = 10
-        casts = batches(rig, sizes.batch)
+        casts = batches(rig, session.sizes.batch)
         start = time.perf_counter()
         for _ in range(count):
             next(casts)()
         wall = 1e3 * (time.perf_counter() - start) / count
         spent = {name: took / count for name, took in split.milliseconds().items()}
-    yield "a batch, ms", {**spent, "all": wall}
-    fifth = replace(plain, keep_every=5)
-    yield "every fifth point", time_batches(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
-    row = time_batches(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
-    yield "ten actors", row
-    small_city = city(min(sizes.cities))
-    middle_scan = plain.scan_count // 2
-    rigs = (Rig(small_city, plain, backend) for backend in ("cuda", "numpy"))
-    device_part, host_part = (
-        columns_of(list(rig.cast(middle_scan, middle_scan + 1))) for rig in rigs
-    )
+    return {**spent, "all": wall}
+
+
+def compare_columns(scene: Scene, drive: Survey) -> dict[str, int]:
+    """Count the values of a scan's columns that differ between the device and NumPy."""
+    scan = drive.scan_count // 2
+    rigs = (Rig(scene, drive, backend) for backend in ("cuda", "numpy"))
+    device_part, host_part = (columns_of(list(rig.cast(scan, scan + 1))) for rig in rigs)
     wrong = sum(
         int((device_part.columns[n] != host_part.columns[n]).sum()) for n in host_part.columns
     )
-    yield "bits", {"points": len(host_part), "different values": wrong}
+    return {"points": len(host_part), "different values": wrong}
 
 
 def durable(session: Session) -> Rows:

@@ -228,38 +228,47 @@ def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -
     device_hits, host_hits = (caster.cast(origin, sample) for caster in casters)
     counts = {"rays": len(sample), "hits": int(host_hits.hit.sum())}
     for name in ("distance", "triangle", "u", "v", "instance"):
-        counts[f"different {name}"] = int(
-            (getattr(device_hits, name) != getattr(host_hits, name)).sum()
-        )
+        differs = getattr(device_hits, name) != getattr(host_hits, name)
+        counts[f"different {name}"] = int(differs.sum())
     rotation, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-    positions = origin + 1e-3 * np.arange(len(sample))[:, None]
+    pattern = Pattern(sample, 0.01 * sample)
+    still = check_scan(pattern, origin, rotation)
+    moving = _moving_scan(pattern, origin, rotation)
+    for name, scan in {"scan": still, "moving scan": moving}.items():
+        device_scan, host_scan = (caster._engine.scan(scan) for caster in casters)
+        counts[f"different {name}"] = _count_different_hits(device_scan, host_scan)
+    counts["different tally"] = int((device_scan.tally != host_scan.tally).sum())  # type: ignore[operator]
+    expected = pattern_rays(pattern, host_scan.ray, moving.poses)
+    counts["different rays"] = _count_different_rays(casters[0], moving, expected)
+    return counts
+
+
+def _moving_scan(pattern: Pattern, origin: Float, rotation: Float) -> Scan:
+    """Make a scan with a pose for each ray, 1 mm apart, and motion within poses."""
+    positions = origin + 1e-3 * np.arange(len(pattern))[:, None]
     rotations = np.broadcast_to(rotation, (len(positions), 3, 3))
     rates = np.full_like(positions, 0.3)
     motion = PoseMotion(np.zeros(1) + 2e-5, rates, rates)
-    pattern = Pattern(sample, 0.01 * sample)
-    moving = check_scan(pattern, positions, rotations, rays_per_pose=1, motion=motion, tally=True)
-    for name, scan in {
-        "scan": check_scan(pattern, origin, rotation),
-        "moving scan": moving,
-    }.items():
-        device_scan, host_scan = (caster._engine.scan(scan) for caster in casters)
-        same_rays = np.array_equal(device_scan.ray, host_scan.ray)
-        wrong = (
-            (device_scan.distance != host_scan.distance)
-            | (device_scan.triangle != host_scan.triangle)
-            if same_rays
-            else [1]
-        )
-        counts[f"different {name}"] = int(np.sum(wrong))
-    counts["different tally"] = int((device_scan.tally != host_scan.tally).sum())  # type: ignore[operator]
-    ray_parts: list[tuple[Float, Float]] = []
-    casters[0].visit(moving, lambda hits: ray_parts.append(tuple(a.get() for a in hits.rays())))
-    origins, directions = pattern_rays(pattern, host_scan.ray, moving.poses)
-    counts["different rays"] = int(sum(
-        (rays != np.concatenate(parts, axis=1).T).sum()
-        for parts, rays in zip(zip(*ray_parts, strict=True), (origins, directions), strict=True)
+    return check_scan(pattern, positions, rotations, rays_per_pose=1, motion=motion, tally=True)
+
+
+def _count_different_hits(device_scan: Any, host_scan: Any) -> int:
+    """Count hits that differ in distance or triangle; 1 if the rays that hit differ."""
+    if not np.array_equal(device_scan.ray, host_scan.ray):
+        return 1
+    differs = device_scan.distance != host_scan.distance
+    differs |= device_scan.triangle != host_scan.triangle
+    return int(np.sum(differs))
+
+
+def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, Float]) -> int:
+    """Count coordinates of the device's rays of hits that differ from expected rays."""
+    parts: list[tuple[Float, Float]] = []
+    caster.visit(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
+    return int(sum(
+        (rays != np.concatenate(arrays, axis=1).T).sum()
+        for arrays, rays in zip(zip(*parts, strict=True), expected, strict=True)
     ))  # fmt: skip
-    return counts
 
 
 def leaks(session: Session) -> Rows:

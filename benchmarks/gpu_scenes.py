@@ -48,12 +48,7 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     pitch = 20.0
     # Odd: there is a crossing at (pitch / 2, pitch / 2), where sensors stand.
     side = 2 * round((np.sqrt(triangles / (5 * 2 * panels**2 + 2)) - 1) / 2) + 1
-    line = np.linspace(-1, 1, panels + 1)
-    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
-    unit = np.ones_like(a)
-    sides = [(a, b, unit), (a, unit, b), (a, -unit, b), (unit, a, b), (-unit, a, b)]
-    face = grid_faces(panels + 1, panels + 1)
-    box, faces = joined([(np.stack(points, axis=-1), face) for points in sides])
+    box, faces = panelled_box(panels)
     x, y = (c.ravel() for c in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     count = side * side
     middle = pitch * (np.stack([x, y], axis=-1) - (side - 1) / 2)
@@ -63,13 +58,28 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     vertices[..., :2] = middle[:, None] + box[:, :2] * half[:, None]
     vertices[..., 2] = (box[:, 2] + 1) / 2 * height[:, None]
     buildings = faces + len(box) * np.arange(count)[:, None, None]
-    edge = pitch * (np.arange(side + 1) - side / 2)
-    gx, gy = np.meshgrid(edge, edge, indexing="ij")
-    ground = np.stack([gx, gy, np.zeros_like(gx)], axis=-1).reshape(-1, 3)
     return joined([
         (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
-        (ground, grid_faces(side + 1, side + 1)),
+        flat_ground(side, pitch),
     ])  # fmt: skip
+
+
+def panelled_box(panels: int) -> Mesh:
+    """Make a box from -1 to 1 without a floor; each face has `panels` x `panels` squares."""
+    line = np.linspace(-1, 1, panels + 1)
+    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
+    unit = np.ones_like(a)
+    sides = [(a, b, unit), (a, unit, b), (a, -unit, b), (unit, a, b), (-unit, a, b)]
+    face = grid_faces(panels + 1, panels + 1)
+    return joined([(np.stack(points, axis=-1), face) for points in sides])
+
+
+def flat_ground(side: int, pitch: float) -> Mesh:
+    """Make a square of `side` x `side` cells at z = 0."""
+    edge = pitch * (np.arange(side + 1) - side / 2)
+    x, y = np.meshgrid(edge, edge, indexing="ij")
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    return vertices, grid_faces(side + 1, side + 1)
 
 
 def revolution(rays: int, layers: int = 128) -> Float:

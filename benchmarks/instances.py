@@ -63,41 +63,55 @@ def peak() -> float:
     return sum(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
 
 
+TreeMesh = tuple[Float, NDArray[np.int64]]
+
+
+def instanced_forest(tree_mesh: TreeMesh, transforms: Float, backend: str) -> RayCaster:
+    """Make a caster of instances of a tree on a ground."""
+    mesh = Mesh(*tree_mesh)
+    reach = _reach(len(transforms))
+    ground = Instance(Mesh(*_GROUND), np.diag([reach, reach, 1.0, 1.0]))
+    instances = [Instance(mesh, matrix) for matrix in transforms]
+    return RayCaster.from_instances([ground, *instances], backend, threads=1)
+
+
+def merged_forest(tree_mesh: TreeMesh, transforms: Float, backend: str) -> RayCaster:
+    """Make a caster of the same trees and ground in a single mesh."""
+    vertices, faces = tree_mesh
+    trees = len(transforms)
+    all_points = [vertices @ m[:, :3].T + m[:, 3] for m in transforms]
+    all_faces = [faces + k * len(vertices) for k in range(trees)]
+    all_points.append(_GROUND[0] * [_reach(trees), _reach(trees), 1])
+    all_faces.append(np.array(_GROUND[1]) + trees * len(vertices))
+    merged = np.concatenate(all_points), np.concatenate(all_faces)
+    del all_points, all_faces
+    return RayCaster(*merged, backend, threads=1)
+
+
+def _reach(trees: int) -> float:
+    """Half the side of the ground, metres."""
+    return float(_APART * np.sqrt(trees) + 50)
+
+
 def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> dict[str, Any]:
-    """Build a forest and scan it; call this in a new process."""
+    """Build a forest and scan the forest; call this function in a new process."""
     tree_mesh = tree(leaves)
-    matrices = tree_transforms(trees)
-    reach = _APART * np.sqrt(trees) + 50
-    ground = np.diag([reach, reach, 1.0, 1.0])
+    transforms = tree_transforms(trees)
+    build = instanced_forest if shared else merged_forest
     RayCaster(*_GROUND, backend, threads=1)  # loads the backend
     memory_before = peak()
     start = time.process_time()
-    if shared:
-        mesh = Mesh(*tree_mesh)
-        instances = [Instance(mesh, matrix) for matrix in matrices]
-        forest = [Instance(Mesh(*_GROUND), ground), *instances]
-        caster = RayCaster.from_instances(forest, backend, threads=1)
-    else:
-        points = [tree_mesh[0] @ m[:, :3].T + m[:, 3] for m in matrices]
-        faces = [tree_mesh[1] + k * len(tree_mesh[0]) for k in range(trees)]
-        ground_mesh = [
-            _GROUND[0] * [reach, reach, 1],
-            np.array(_GROUND[1]) + trees * len(tree_mesh[0]),
-        ]
-        merged = np.concatenate([*points, ground_mesh[0]]), np.concatenate([*faces, ground_mesh[1]])
-        del points, faces
-        caster = RayCaster(*merged, backend, threads=1)
-        del merged
+    caster = build(tree_mesh, transforms, backend)
     built = time.process_time() - start
     memory = peak() - memory_before
     pattern = Pattern(beam_directions(_BEAMS, rays))
     rng = np.random.default_rng(3)
-    spots = np.column_stack([rng.uniform(-30, 30, (_POSES, 2)), np.full(_POSES, 2.0)])
+    positions = np.column_stack([rng.uniform(-30, 30, (_POSES, 2)), np.full(_POSES, 2.0)])
     seconds = []
     hits = 0
-    for spot in (spots[0], *spots):  # the first one twice: to warm up
+    for position in (positions[0], *positions):  # the first twice: to warm up
         start = time.process_time()
-        hits += int(caster.scan(pattern, spot).hits.sum())
+        hits += int(caster.scan(pattern, position).hits.sum())
         seconds.append(time.process_time() - start)
     return {
         "triangles": trees * leaves + 2,

@@ -74,6 +74,20 @@ def terrain_box(triangles: int) -> Closed:
     return Closed("terrain box", np.concatenate([points, lid]), all_faces, inside, 10.0)
 
 
+def count_escaped(mesh: Closed, backend: str, count: int) -> dict[str, float]:
+    """Cast `count` rays from inside a closed mesh; return rays, escaped rays and seconds."""
+    start = time.perf_counter()
+    caster = RayCaster(mesh.vertices, mesh.faces, backend)
+    rng = np.random.default_rng(0)
+    cast = leaks = 0
+    while cast < count:
+        half = -(-min(_PART, count - cast) // 2)
+        arrays = mesh.vertices, mesh.faces
+        leaks += escaped(caster, arrays, mesh.inside, mesh.room, half, rng)
+        cast += 2 * half
+    return {"rays": cast, "escaped": leaks, "seconds": time.perf_counter() - start}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 if a ray escapes from an exact backend."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -87,18 +101,12 @@ def main(arguments: list[str] | None = None) -> int:
     results: dict[str, dict[str, dict[str, float]]] = {name: {} for name in backends}
     for mesh in meshes:
         for name in backends:
-            start = time.perf_counter()
-            caster = RayCaster(mesh.vertices, mesh.faces, name)
-            rng = np.random.default_rng(0)
-            cast = leaks = 0
-            while cast < share:
-                half = -(-min(_PART, share - cast) // 2)
-                pair = mesh.vertices, mesh.faces
-                leaks += escaped(caster, pair, mesh.inside, mesh.room, half, rng)
-                cast += 2 * half
-            took = time.perf_counter() - start
-            results[name][mesh.name] = {"rays": cast, "escaped": leaks, "seconds": took}
-            print(f"{mesh.name:<12} {name:<7} {leaks:>7,} of {cast:,} escaped  ({took:.1f} s)")
+            row = count_escaped(mesh, name, share)
+            results[name][mesh.name] = row
+            print(
+                f"{mesh.name:<12} {name:<7} {row['escaped']:>7,} of {row['rays']:,} escaped  "
+                f"({row['seconds']:.1f} s)"
+            )
     for name in backends:
         rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
         print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")

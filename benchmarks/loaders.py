@@ -124,7 +124,8 @@ def main(*names):
         lidarpool_rate, peer_rate = rates.max(axis=0)
         ratio = np.median(rates[:, 0] / rates[:, 1])
         print(
-            f"{peer.__name__:>10} {lidarpool_rate:6.0f}/s {package:>11} {peer_rate:6.0f}/s {ratio:6.2f}"
+            f"{peer.__name__:>10} {lidarpool_rate:6.0f}/s "
+            f"{package:>11} {peer_rate:6.0f}/s {ratio:6.2f}"
         )
 
 

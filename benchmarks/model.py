@@ -62,44 +62,59 @@ def batches_a_second(
 
     Their processes share `cores`; None: each has its own.
     """
-    batches = batches_per_task([(seconds, 1)], gpus)
-    step_seconds = [costs.step(number, gpus, batches) for number in range(len(STEPS))]
-    free: Counter[Any] = Counter()  # {process: when it is free}
-    idle = [0.0] * (cores or 0)  # when each core is free: a heap
-    slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
-    vary = Random(1).uniform
+    clusters = _Clusters(gpus, seconds, costs, cores, shards)
+    tasks_under_way = shards * max_under_way(gpus, collectors_of(gpus))
     number = count()
     finished_tasks = 0
-    tasks_under_way = shards * max_under_way(gpus, collectors_of(gpus))
-    begin = 0.0
+    start = 0.0
     events = [(0.0, next(number), n % shards, 0) for n in range(tasks_under_way)]
     while finished_tasks < ROUNDS * tasks_under_way:
-        now_s, _, shard, step = heapq.heappop(events)
-        process: Any = STEPS[step], shard
-        if process[0] == "casting":
-            now_s = max(now_s, heapq.heappop(slots[shard]))
-        else:
-            if process[0] == "collectors":
-                collector_slots = product([process], range(collectors_of(gpus)))
-                process = min(collector_slots, key=free.__getitem__)
-            now_s = max(now_s, free[process])
-        if cores:
-            now_s = max(now_s, heapq.heappop(idle))
-            heapq.heappush(idle, now_s + step_seconds[step])
-        now_s += step_seconds[step]
-        if process[0] == "casting":
-            now_s += batches * seconds * vary(1 - VARY, 1 + VARY)
-            heapq.heappush(slots[shard], now_s)
-        else:
-            free[process] = now_s
+        ready_s, _, shard, step = heapq.heappop(events)
+        stop_s = clusters.run_step(ready_s, shard, step)
         following = (step + 1) % len(STEPS)
         finished_tasks += not following
-        if (
-            finished_tasks == tasks_under_way and not following
-        ):  # the first tasks all came at a time
-            begin = now_s
-        heapq.heappush(events, (now_s, next(number), shard, following))
-    return batches * (finished_tasks - tasks_under_way) / (now_s - begin)
+        if finished_tasks == tasks_under_way and not following:  # the first tasks start together
+            start = stop_s
+        heapq.heappush(events, (stop_s, next(number), shard, following))
+    return clusters.batches * (finished_tasks - tasks_under_way) / (stop_s - start)
+
+
+class _Clusters:
+    """Processes of all shards, and the time at which each process is free."""
+
+    def __init__(
+        self, gpus: int, seconds: float, costs: Costs, cores: int | None, shards: int
+    ) -> None:
+        self.batches = batches_per_task([(seconds, 1)], gpus)
+        self._casting_s = self.batches * seconds
+        self._step_s = [costs.step(number, gpus, self.batches) for number in range(len(STEPS))]
+        self._collectors = collectors_of(gpus)
+        self._free: Counter[Any] = Counter()  # {process: when the process is free}
+        self._cores = [0.0] * (cores or 0)  # when each core is free: a heap
+        self._slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
+        self._vary = Random(1).uniform
+
+    def run_step(self, ready_s: float, shard: int, step: int) -> float:
+        """Run a step of a task that is ready at a time; return the time of its end, seconds."""
+        process: Any = STEPS[step], shard
+        time_s = ready_s
+        if process[0] == "casting":
+            time_s = max(time_s, heapq.heappop(self._slots[shard]))
+        else:
+            if process[0] == "collectors":
+                collectors = product([process], range(self._collectors))
+                process = min(collectors, key=self._free.__getitem__)
+            time_s = max(time_s, self._free[process])
+        if self._cores:
+            time_s = max(time_s, heapq.heappop(self._cores))
+            heapq.heappush(self._cores, time_s + self._step_s[step])
+        time_s += self._step_s[step]
+        if process[0] == "casting":
+            time_s += self._casting_s * self._vary(1 - VARY, 1 + VARY)
+            heapq.heappush(self._slots[shard], time_s)
+        else:
+            self._free[process] = time_s
+        return time_s
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:

@@ -239,9 +239,8 @@ def show(row: dict[str, Any]) -> None:
             f"hits {100 * row['hits'][method]:.1f} % of rays"
         )
     ranges_ratio = ratio(row, "ranges")
-    print(
-        f"  the bar of {BAR} x the cast is {'kept' if ranges_ratio <= BAR else 'missed'}: {ranges_ratio:.2f}"
-    )
+    verdict = "kept" if ranges_ratio <= BAR else "missed"
+    print(f"  the bar of {BAR} x the cast is {verdict}: {ranges_ratio:.2f}")
 
 
 def main(arguments: list[str] | None = None) -> int:

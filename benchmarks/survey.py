@@ -40,6 +40,15 @@ def poses(count: int) -> list[tuple[float, float, float]]:
     return [(round(float(x), 3), round(float(y), 3), 2.0) for x, y in positions]
 
 
+def ray_directions() -> np.ndarray:
+    """Return the unit directions of a revolution, (rays, 3)."""
+    azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
+    elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    directions = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1)
+    return directions.reshape(-1, 3)
+
+
 def script(rays: int, folder: Path) -> None:
     """Run the survey in this process as a plain script would, and write its cloud."""
     import open3d as o3d
@@ -52,11 +61,7 @@ def script(rays: int, folder: Path) -> None:
         o3d.core.Tensor(scene.vertices.astype(np.float32)),
         o3d.core.Tensor(scene.faces.astype(np.uint32)),
     )
-    azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
-    elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
-    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    directions = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1)
-    directions = directions.reshape(-1, 3)
+    directions = ray_directions()
     table = np.empty((len(directions), 6), np.float32)
     table[:, 3:] = directions
     columns: dict[str, list[np.ndarray]] = {n: [] for n in ("positions", "scan", "ring", "object")}
@@ -179,8 +184,9 @@ def compare(folder: Path) -> None:
         else np.zeros(1)
     )
     print(
-        f"{len(script_cloud):,} and {len(our_cloud):,} points, {share:.4%} of them in the same place of the "
-        f"order with the same labels; half of these within {np.median(distances):.3f} m, "
+        f"{len(script_cloud):,} and {len(our_cloud):,} points, {share:.4%} of them in the "
+        "same place of the order with the same labels; "
+        f"half of these within {np.median(distances):.3f} m, "
         f"99.9 % within {np.quantile(distances, 0.999):.3f} m"
     )
 

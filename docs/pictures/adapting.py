@@ -176,7 +176,8 @@ def draw(samples: Sequence[Sample]) -> Page:
     )
     page.title(
         "Partitions that grow with their work, on Slurm",
-        f"GPU: adapt [0, {MAX_WORKERS['GPU']}], two GPUs in the cluster · IO: adapt [1, {MAX_WORKERS['IO']}] · "
+        f"GPU: adapt [0, {MAX_WORKERS['GPU']}], two GPUs in the cluster · "
+        f"IO: adapt [1, {MAX_WORKERS['IO']}] · "
         f"jobs that are not needed for {IDLE_S} s end",
     )
     return page

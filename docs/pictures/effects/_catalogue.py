@@ -16,8 +16,8 @@ from lidarpool import Survey
 class Effect(Protocol):
     """A module of an effect.
 
-    A module may also have `with_actors(scene)`, which returns the scene with moving objects, with and without
-    the effect.
+    A module may also have `with_actors(scene)`, which returns the scene with moving objects, for
+    runs with and without the effect.
     """
 
     DRAWS: str  # file name of the picture

@@ -38,8 +38,10 @@ def picture(path: Path) -> None:
         stated = read_model(name).performance.detection
         noise = read_model(name).datasheet().noise
         ranges_m = np.linspace(0.4, 1.5, 23) * stated.range_m
-        detected = [len(cast_scan([wall("W", x)], fixed_beams(RAYS), noise, materials=dark)["range"])
-                for x in ranges_m]  # fmt: skip
+        scans = [
+            cast_scan([wall("W", x)], fixed_beams(RAYS), noise, materials=dark) for x in ranges_m
+        ]
+        detected = [len(scan["range"]) for scan in scans]
         shares.plot(ranges_m, 100 * np.array(detected) / RAYS, "-", lw=1.2, color=colour)
         share = 100 * stated.probability
         label = f"{name}: {stated.range_m:g} m, {share:g} %"

@@ -98,8 +98,8 @@ def picture(path: Path) -> None:
         side = 3.4 if dy == 0 and y > 0 else -3.4
         label_position = (x + 3.5, y) if dy else (x, y + side)
         map_axes.text(
-            *label_position, f"{speed:.0f} m/s", color="white", ha="left" if dy else "center", va="center",
-            fontsize=8, bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
+            *label_position, f"{speed:.0f} m/s", color="white", ha="left" if dy else "center",
+            va="center", fontsize=8, bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
     map_axes.set(
         xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", xlabel="x, m", ylabel="y, m"
@@ -116,9 +116,9 @@ def picture(path: Path) -> None:
         colour = theme.OBJECT_COLOURS[(1, 2, 6)[k]]
         chart.scatter(azimuth[of_car], velocity[of_car], s=5, color=colour, linewidths=0)
         if of_car.any():
-            start = azimuth[of_car].mean(), velocity[of_car].mean()
+            middle = azimuth[of_car].mean(), velocity[of_car].mean()
             chart.annotate(
-                f"car, {speed:.0f} m/s", start, (6, 8), textcoords="offset points", fontsize=8,
+                f"car, {speed:.0f} m/s", middle, (6, 8), textcoords="offset points", fontsize=8,
                 color=colour,
             )  # fmt: skip
     angle = np.linspace(-180, 180, 361)

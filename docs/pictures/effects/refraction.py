@@ -94,7 +94,8 @@ def picture(path: Path) -> None:
             5 if side < 0 else 2
         )
         section.plot(
-            side * (apparent_range * np.sin(angles))[visible_side], (HEIGHT - apparent_range * np.cos(angles))[visible_side],
+            side * (apparent_range * np.sin(angles))[visible_side],
+            (HEIGHT - apparent_range * np.cos(angles))[visible_side],
             color=INK, lw=1, zorder=6, label="floor by Snell's law" if side > 0 else None,
         )  # fmt: skip
     for nadir in np.radians([-20, -40]):
@@ -123,9 +124,9 @@ def picture(path: Path) -> None:
     exact = FLOOR * np.cos(within) * passes**2 * np.exp(-2 * LOSS * water) * 100 / area
     for material, colour, name in ((straight, MUTED, "without"), (wet, RED, "with")):
         _, _, nadir, energy = cast(plain, material)
-        visible_side = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
+        shown = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
         energies.plot(
-            np.degrees(nadir[visible_side]), energy[visible_side], "o", ms=4, mfc="none", color=colour,
+            np.degrees(nadir[shown]), energy[shown], "o", ms=4, mfc="none", color=colour,
             label=f"simulated, {name} refraction",
         )  # fmt: skip
     energies.plot(np.degrees(angles), exact, color=INK, lw=1, label="Snell, Fresnel, Beer–Lambert")
