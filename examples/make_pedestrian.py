@@ -220,7 +220,7 @@ def ankle(phase):
 
 
 def walk(phase):
-    """Return rotations of joints, and positions of the hips, at phases (k,): {joint: (k, 4 or 3)}."""
+    """Return rotations of joints, and positions of the hips, at phases (k,): {joint: (k, …)}."""
     cycle = 2 * np.pi * phase
     swing = np.cos(cycle)  # of the left leg, ahead
     yaw = np.radians(6) * -swing  # turns the left hip ahead

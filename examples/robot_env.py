@@ -29,12 +29,13 @@ class RobotEnv(gymnasium.Env):
     def __init__(self, scene=None):
         sensor = Sensor.grid(RAYS, 1, step_deg=360, max_range_m=FAR_M)
         self.scanner = Scanner(scene or Scene.seed(), sensor, noise=Noise(range_m=0.02), threads=1)
-        low, high = np.float32([0, -1.5]), np.float32([2, 1.5])
-        self.action_space = gymnasium.spaces.Box(low, high)
+        self.action_space = gymnasium.spaces.Box(np.float32([0, -1.5]), np.float32([2, 1.5]))
         # Ranges, distance to the goal, and its direction as cosine and sine.
-        low, high = np.zeros(RAYS + 3, np.float32), np.full(RAYS + 3, FAR_M, np.float32)
-        low[-2:], high[-3:] = -1, (np.inf, 1, 1)
-        self.observation_space = gymnasium.spaces.Box(low, high)
+        minimum = np.zeros(RAYS + 3, np.float32)
+        minimum[-2:] = -1
+        maximum = np.full(RAYS + 3, FAR_M, np.float32)
+        maximum[-3:] = (np.inf, 1, 1)
+        self.observation_space = gymnasium.spaces.Box(minimum, maximum)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -46,8 +47,8 @@ class RobotEnv(gymnasium.Env):
         return self._observed(), {}
 
     def step(self, action):
-        low, high = self.action_space.low, self.action_space.high
-        speed, rate = np.clip(action, low, high).tolist()
+        action = np.clip(action, self.action_space.low, self.action_space.high)
+        speed, rate = action.tolist()
         distance_before = math.dist(self.position, GOAL)
         self.yaw += rate * STEP_S
         self.position += speed * STEP_S * np.array([math.cos(self.yaw), math.sin(self.yaw)])
@@ -73,13 +74,16 @@ class RobotEnv(gymnasium.Env):
 
 if __name__ == "__main__":
     env = RobotEnv()
-    seen, _ = env.reset(seed=1)
+    observation, _ = env.reset(seed=1)
     total = 0.0
     finished = False
     while not finished:  # towards the goal, and away from the nearest surface
-        nearest = seen[:RAYS].argmin() * 2 * math.pi / RAYS
-        yaw_rate = math.atan2(seen[-1], seen[-2]) - 3 * math.sin(nearest) / seen[:RAYS].min()
-        seen, reward, ended, cut, _ = env.step(np.float32([2, yaw_rate]))
+        nearest = observation[:RAYS].argmin() * 2 * math.pi / RAYS
+        yaw_rate = (
+            math.atan2(observation[-1], observation[-2])
+            - 3 * math.sin(nearest) / observation[:RAYS].min()
+        )
+        observation, reward, ended, cut, _ = env.step(np.float32([2, yaw_rate]))
         total += reward
         finished = ended or cut
-    print(f"{env.steps} steps, reward {total:.1f}, {seen[-3]:.1f} m from the goal")
+    print(f"{env.steps} steps, reward {total:.1f}, {observation[-3]:.1f} m from the goal")
