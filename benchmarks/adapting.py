@@ -36,13 +36,13 @@ from poolpart import Partition
 from poolpart.deploy import start_partitions
 
 NAMES = ("A", "B", "C")
-MOST = 3  # workers of a partition
+MAX_WORKERS = 3  # workers of a partition
 IDLE_S = 1.0
 SCHEDULER = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
 
 
 class ProcessJob(dask_jobqueue.local.LocalJob):
-    """A job that is a process of this machine, whether it has begun, runs or has ended."""
+    """Dask-jobqueue job that is a process of this machine, in any state of its life."""
 
     async def _submit_job(self, script: str) -> str:
         command = shlex.split(Path(script).read_text())
@@ -51,7 +51,7 @@ class ProcessJob(dask_jobqueue.local.LocalJob):
         return str(self.process.pid)
 
     async def close(self) -> None:
-        """End the process, which may be ending by itself."""
+        """End the process, which may be ending by itself already."""
         await asyncio.sleep(0.5)
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGTERM)
@@ -60,91 +60,99 @@ class ProcessJob(dask_jobqueue.local.LocalJob):
 
 
 class ProcessCluster(dask_jobqueue.local.LocalCluster):
-    """A cluster of such jobs."""
+    """Cluster of `ProcessJob` jobs."""
 
     job_cls = ProcessJob
 
 
 class Watched(SchedulerPlugin):
-    """Counts workers, and tasks that a worker had when it went."""
+    """Scheduler plugin that counts workers, and tasks lost or taken back when workers leave."""
 
     name = "watched"
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self.most: Counter[str] = Counter()  # workers at a time, by partition
+        self.max_workers: Counter[str] = Counter()  # workers at a time, by partition
 
     def start(self, scheduler: Any) -> None:
-        """Get the scheduler."""
+        """Store the scheduler."""
         self.scheduler = scheduler
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Count a worker."""
+        """Count a worker that joins, and the workers of each partition."""
         self.counts["joined"] += 1
-        here = Counter(str(w.name).partition("-")[0] for w in scheduler.workers.values())
-        self.most |= here
+        workers_of_partition = Counter(
+            str(w.name).partition("-")[0] for w in scheduler.workers.values()
+        )
+        self.max_workers |= workers_of_partition
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Count a worker."""
+        """Count a worker that leaves."""
         self.counts["left"] += 1
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str, **kwargs: Any
     ) -> None:
-        """Count a task that has to run again; nothing here is cancelled."""
+        """Count a task that has to run again; this benchmark cancels no tasks."""
         if start == "processing" and finish not in ("memory", "erred"):
             self.counts["taken back"] += 1
         if start == "memory" and finish == "released" and "remove-worker" in stimulus_id:
             self.counts["lost"] += 1
 
 
-def counted(dask_scheduler: Any = None) -> tuple[Counter[str], Counter[str]]:
-    """Return what was counted; runs on the scheduler."""
+def read_counts(dask_scheduler: Any = None) -> tuple[Counter[str], Counter[str]]:
+    """Return the counts of events and the largest partition sizes; runs on the scheduler."""
     watched = dask_scheduler.plugins[Watched.name]
-    return watched.counts, watched.most
+    return watched.counts, watched.max_workers
 
 
-def run(partition: str, number: int) -> tuple[int, TaskRecord]:
-    """One small task: its number, and where it ran."""
+def run_task(partition: str, number: int) -> tuple[int, TaskRecord]:
+    """Run a small task; return its number and the record of its execution."""
     return recorded("run", partition, int, number)
 
 
 def waves(partition: Partition, sizes: Sequence[int], seed: int) -> list[tuple[int, TaskRecord]]:
-    """Run tasks in waves; returns their numbers and records."""
+    """Run tasks in waves; return their numbers and records."""
     rng = random.Random(f"{seed} {partition.name}")
     ran: list[tuple[int, TaskRecord]] = []
     for size in sizes:
         numbers = range(len(ran), len(ran) + size)
-        ran += partition.map(partial(run, partition.name), numbers, chunk=1, ordered=False)
+        ran += partition.map(partial(run_task, partition.name), numbers, chunk=1, ordered=False)
         time.sleep(rng.uniform(0.0, 4 * IDLE_S))
     return ran
 
 
 def measure(tasks: int, rounds: int, seed: int) -> dict[str, Any]:
-    """Run so many tasks in so many waves a partition, and check where each ran."""
+    """Run `tasks` tasks in `rounds` waves per partition; return figures about their placement."""
     rng = random.Random(seed)
-    each = {name: tasks // len(NAMES) + (n < tasks % len(NAMES)) for n, name in enumerate(NAMES)}
+    task_counts = {
+        name: tasks // len(NAMES) + (n < tasks % len(NAMES)) for n, name in enumerate(NAMES)
+    }
     sizes = {}
-    for name, count in each.items():
+    for name, count in task_counts.items():
         cuts = sorted(rng.sample(range(1, count), rounds - 1))
         sizes[name] = [b - a for a, b in zip([0, *cuts], [*cuts, count], strict=True)]
     options = {"cores": 1, "processes": 1, "memory": "1GB", "log_directory": None}
-    more = ["--host", "127.0.0.1", "--no-dashboard", "--no-nanny"]
-    with ProcessCluster(**options, worker_extra_args=more, scheduler_options=SCHEDULER) as cluster:
-        adaptive = {"adapt": [0, MOST], "idle_s": IDLE_S}
+    worker_arguments = ["--host", "127.0.0.1", "--no-dashboard", "--no-nanny"]
+    with ProcessCluster(
+        **options, worker_extra_args=worker_arguments, scheduler_options=SCHEDULER
+    ) as cluster:
+        adaptive = {"adapt": [0, MAX_WORKERS], "idle_s": IDLE_S}
         start_partitions(cluster, dict.fromkeys(NAMES, adaptive))
         with Client(cluster) as client, ThreadPoolExecutor(len(NAMES)) as threads:
             client.register_plugin(Watched())
-            parts = [Partition(name, client) for name in NAMES]
+            partitions = [Partition(name, client) for name in NAMES]
             began = time.monotonic()
-            ran = [*threads.map(lambda p: waves(p, sizes[p.name], seed), parts)]
+            records_of_partitions = [
+                *threads.map(lambda p: waves(p, sizes[p.name], seed), partitions)
+            ]
             seconds = time.monotonic() - began
-            while any(map(len, parts)):  # all of them shrink to nothing
+            while any(map(len, partitions)):  # all of them shrink to nothing
                 time.sleep(0.2)
-            counts, most = client.run_on_scheduler(counted)
-    for part, answers in zip(parts, ran, strict=True):
-        assert sorted(number for number, _ in answers) == list(range(each[part.name]))
-    records = [record for answers in ran for _, record in answers]
+            counts, max_workers = client.run_on_scheduler(read_counts)
+    for part, answers in zip(partitions, records_of_partitions, strict=True):
+        assert sorted(number for number, _ in answers) == list(range(task_counts[part.name]))
+    records = [record for answers in records_of_partitions for _, record in answers]
     elsewhere = [r for r in records if r.worker.partition("-")[0] != r.partition]
     return {
         "tasks": len(records),
@@ -152,14 +160,14 @@ def measure(tasks: int, rounds: int, seed: int) -> dict[str, Any]:
         "taken_back": counts["taken back"] + counts["lost"],
         "workers_joined": counts["joined"],
         "workers_left": counts["left"],
-        "most_workers": dict(most),
+        "most_workers": dict(max_workers),
         "workers_with_tasks": len({record.worker for record in records}),
         "seconds": round(seconds, 1),
     }
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run the benchmark; returns its figures."""
+    """Run the benchmark; return its figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", type=int, default=100_000)
     parser.add_argument("--waves", type=int, default=10, help="of each partition")

@@ -29,14 +29,14 @@ PER_PART = 10  # scans
 
 
 def limit_memory(extra: int) -> None:
-    """Let this process allocate so many bytes more than it has."""
+    """Limit this process to `extra` bytes above its current data segment."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    held = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
-    resource.setrlimit(resource.RLIMIT_DATA, (held + extra, held + extra))
+    allocated = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
+    resource.setrlimit(resource.RLIMIT_DATA, (allocated + extra, allocated + extra))
 
 
 def make_parts(storage: Storage, points: int) -> StoredCloud:
-    """Write parts of that many points."""
+    """Write random parts with about `points` points; return them as a cloud."""
     rows = PER_SCAN * PER_PART
     chance = np.random.default_rng(1)
     columns = {
@@ -66,10 +66,10 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=100_000_000)
     parser.add_argument("--mebibytes", type=int, default=300)
     parser.add_argument("--folder", type=Path)
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        cloud = make_parts(Storage.at(Path(folder) / "parts"), given.points)
-        limit_memory(given.mebibytes << 20)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        cloud = make_parts(Storage.at(Path(folder) / "parts"), options.points)
+        limit_memory(options.mebibytes << 20)
         began = time.perf_counter()
         path = Path(folder) / "cloud.ply"
         save_cloud(cloud, path, precision_m=0.01)
@@ -77,7 +77,7 @@ def main() -> None:
         size = path.stat().st_size
     print(
         f"{len(cloud):,} points, {size / 1e9:.2f} GB of PLY, in {seconds:.1f} s with at most "
-        f"{given.mebibytes} MiB besides the libraries"
+        f"{options.mebibytes} MiB besides the libraries"
     )
 
 

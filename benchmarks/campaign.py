@@ -48,7 +48,7 @@ splits: {train: 0.8, val: 0.1, test: 0.1}
 
 
 class Samples:
-    """Memory of this process and of LIDAR's worker, by jobs done."""
+    """Memory samples of the driver and of LIDAR's worker, MiB, by finished jobs."""
 
     def __init__(self, lidar: int) -> None:
         self.jobs: list[int] = []
@@ -61,17 +61,17 @@ class Samples:
 
     @property
     def growth(self) -> float:
-        """Memory of the driver, MiB for each job of the last half: a line through the samples."""
+        """Growth of the driver's memory, MiB per job: slope of a line through the last half."""
         half = len(self.jobs) // 2
         if len({*self.jobs[half:]}) < 2:
             return 0.0
         return float(np.polyfit(self.jobs[half:], self.driver[half:], 1)[0])
 
     def __call__(self, progress: Progress) -> None:
-        """Take a sample, if it is time to."""
-        now = time.monotonic()
-        if now >= self._next or progress.jobs_done == progress.jobs:
-            self._next = now + EVERY_S
+        """Take a sample if the last sample is old enough, or if all jobs are finished."""
+        now_s = time.monotonic()
+        if now_s >= self._next or progress.jobs_done == progress.jobs:
+            self._next = now_s + EVERY_S
             self.jobs.append(progress.jobs_done)
             self.driver.append(self._me.memory_info().rss / MIB)
             self.lidar.append(self._worker.memory_info().rss / MIB)
@@ -79,7 +79,7 @@ class Samples:
 
 
 def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, Any], Samples]:
-    """Run a campaign; returns its figures, and the samples of memory."""
+    """Run a campaign; return its figures and the samples of memory."""
     (folder / "base.yaml").write_text(BASE % (rays, layers))
     (folder / "campaign.yaml").write_text(CAMPAIGN % jobs)
     campaign = Campaign.load(folder / "campaign.yaml")
@@ -89,11 +89,11 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
         casting = sum(bool(resources.get(GPU)) for resources, _ in pids.values())
         samples = Samples(lidar)
-        used = time.process_time()
+        driver_s = time.process_time()
         run = campaign.run(folder / "dataset", client=client, on_progress=samples)
-        used = time.process_time() - used
+        driver_s = time.process_time() - driver_s
     wall = samples.seconds
-    beside = (wall - run.casting_seconds / casting) / jobs
+    overhead_s = (wall - run.casting_seconds / casting) / jobs
     figures = {
         "jobs": run.done,
         "failed": len(run.failed),
@@ -101,8 +101,8 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         "wall_s": wall,
         "casting_s": run.casting_seconds,
         "casting_workers": casting,
-        "beside_rays_ms_a_job": 1000 * beside,
-        "driver_and_scheduler_ms_a_job": 1000 * used / jobs,
+        "beside_rays_ms_a_job": 1000 * overhead_s,
+        "driver_and_scheduler_ms_a_job": 1000 * driver_s / jobs,
         "finishing_s": run.seconds - wall,
         "casting_tasks": next((s.tasks for s in run.stages if s.stage == "intersect"), 0),
         "misplaced": sum(stage.violations for stage in run.stages),
@@ -112,7 +112,7 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
 
 
 def draw(samples: Samples, path: Path) -> None:
-    """Draw memory by jobs done."""
+    """Draw memory against finished jobs into `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -128,7 +128,7 @@ def draw(samples: Samples, path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line."""
+    """Run from the command line; return the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--jobs", type=int, default=1000)
     parser.add_argument("--toy", action="store_true", help="jobs of 1,000 rays")

@@ -28,26 +28,28 @@ from lidarpool import Scene, Sensor, Survey, simulate
 UPKEEP = {"heartbeat", "setup", "transfers"}
 
 
-class Counted:
-    """Bytes of messages by kind, by the address at this end of their connection."""
+class TrafficCounts:
+    """Bytes of messages by kind and by local address of the connection."""
 
     def __init__(self) -> None:
         self._bytes: dict[str, Counter[str]] = {}  # {address here: {kind: bytes}}
 
     def add(self, message: Any, frames: list[Any]) -> None:
-        """Count a message."""
-        here = self._bytes.setdefault(_here.get(), Counter())
-        here[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
+        """Add the bytes of a message."""
+        counts_of_address = self._bytes.setdefault(_local_address.get(), Counter())
+        counts_of_address[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
 
     @property
     def scheduler(self) -> Counter[str]:
-        """What the scheduler sent and received: all of its connections end at one address."""
+        """Bytes at the scheduler by kind; all its connections share a local address."""
         return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
 
     def work(self, *, driver: bool = False) -> int:
-        """Bytes that came with work: at the scheduler, or at all other ends in this process."""
-        ends = self._bytes.values()
-        counted = [counts for counts in ends if (counts is not self.scheduler) == driver]
+        """Return the bytes of task messages, at the scheduler or at the driver."""
+        counts_by_address = self._bytes.values()
+        counted = [
+            counts for counts in counts_by_address if (counts is not self.scheduler) == driver
+        ]
         return sum(n for counts in counted for kind, n in counts.items() if kind not in UPKEEP)
 
 
@@ -61,13 +63,15 @@ def _kind(message: Any) -> str:
     return op
 
 
-_here: ContextVar[str] = ContextVar("_here", default="")  # address at this end of a connection
+_local_address: ContextVar[str] = ContextVar(
+    "_here", default=""
+)  # address at this end of a connection
 
 
 @contextmanager
-def counting() -> Iterator[Counted]:
-    """Count what this process sends and receives while the body runs."""
-    counted = Counted()
+def count_traffic() -> Iterator[TrafficCounts]:
+    """Count the bytes that this process sends and receives while the body runs."""
+    counted = TrafficCounts()
     to_frames = tcp.to_frames
     from_frames = tcp.from_frames
     read = tcp.TCP.read
@@ -84,11 +88,11 @@ def counting() -> Iterator[Counted]:
         return message
 
     async def reads(self: Any, *args: Any, **kwargs: Any) -> Any:
-        _here.set(self.local_address)
+        _local_address.set(self.local_address)
         return await read(self, *args, **kwargs)
 
     async def writes(self: Any, *args: Any, **kwargs: Any) -> Any:
-        _here.set(self.local_address)
+        _local_address.set(self.local_address)
         return await write(self, *args, **kwargs)
 
     with (
@@ -101,14 +105,14 @@ def counting() -> Iterator[Counted]:
 
 
 def small_survey(scans: int, keep_every: int) -> Survey:
-    """Describe scans of 128 rays."""
+    """Return a survey of `scans` scans of 128 rays."""
     sensor = Sensor.grid(rays_per_revolution=360, layers=32, step_deg=4)
-    poses = [(0.01 * place, 0.0, 1.0) for place in range(-(-scans // 90))]
+    poses = [(0.01 * index, 0.0, 1.0) for index in range(-(-scans // 90))]
     return Survey(sensor, poses, steps=90, keep_every=keep_every)
 
 
 def count_bytes(scans: int) -> None:
-    """Print bytes a scan: what more scans and more points add to what passes the scheduler."""
+    """Print the scheduler's bytes per additional scan, and with five times as many points."""
     sides = {
         "every 5th point": (scans, 5),
         "all points": (scans, 1),
@@ -116,41 +120,43 @@ def count_bytes(scans: int) -> None:
     }
     work: dict[str, Counter[str]] = {}
     for side, (count, keep_every) in sides.items():
-        what = small_survey(count, keep_every)
-        with counting() as counted:
-            result = simulate(Scene.seed(), what)
+        survey = small_survey(count, keep_every)
+        with count_traffic() as counted:
+            result = simulate(Scene.seed(), survey)
         upkeep = sum(counted.scheduler[kind] for kind in UPKEEP)
         work[side] = Counter({k: n for k, n in counted.scheduler.items() if k not in UPKEEP})
         print(
-            f"{side:16} {what.scan_count:,} scans, {len(result.points):,} points: "
+            f"{side:16} {survey.scan_count:,} scans, {len(result.points):,} points: "
             f"{sum(work[side].values()) / 1e6:.2f} MB in and out of the scheduler, the scene's "
             f"among them, and {upkeep / 1e6:.2f} MB of heartbeats and set-up"
         )
-    one = work["every 5th point"]
-    more = work["twice the scans"]
+    base = work["every 5th point"]
+    doubled = work["twice the scans"]
     points = work["all points"]
-    for kind, count in (more - one).most_common(5):
+    for kind, count in (doubled - base).most_common(5):
         print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
-    added = (sum(more.values()) - sum(one.values())) / scans
+    added = (sum(doubled.values()) - sum(base.values())) / scans
     print(
         f"a further scan adds {added:.0f} bytes; five times the points add "
-        f"{(sum(points.values()) - sum(one.values())) / scans:.0f} bytes a scan"
+        f"{(sum(points.values()) - sum(base.values())) / scans:.0f} bytes a scan"
     )
 
 
 def single_scans() -> Any:
-    """Make the batches of runs so small that each has one scan; tasks still have several."""
+    """Return a patch that limits each batch to one scan; tasks still have several batches."""
     return patch.object(lidarpool.run.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:
-    """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
-    ends = {}
+    """Print the bytes per additional batch of one scan, at the scheduler and at the driver."""
+    bytes_by_batches = {}
     for count in (batches, 3 * batches):
-        with counting() as counted, single_scans():
+        with count_traffic() as counted, single_scans():
             simulate(Scene.seed(), small_survey(count, 5))
-        ends[count] = counted.work(), counted.work(driver=True)
-    scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
+        bytes_by_batches[count] = counted.work(), counted.work(driver=True)
+    scheduler, driver = (np.array(bytes_by_batches[3 * batches]) - bytes_by_batches[batches]) / (
+        2 * batches
+    )
     print(
         f"a further batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
         f"{driver:,.0f} at the driver"
@@ -158,12 +164,12 @@ def count_batches(batches: int) -> None:
 
 
 def main() -> None:
-    """Count both."""
+    """Count bytes of scans and of batches."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
-    given = parser.parse_args()
-    count_bytes(given.scans)
-    count_batches(min(360, given.scans))
+    options = parser.parse_args()
+    count_bytes(options.scans)
+    count_batches(min(360, options.scans))
 
 
 if __name__ == "__main__":

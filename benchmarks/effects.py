@@ -24,8 +24,8 @@ from lidarsim.simulator.rig import Rig
 ROUNDS = 5
 
 
-def seconds(rig: Rig) -> float:
-    """Processor time of casting all scans and making their columns."""
+def stage_seconds(rig: Rig) -> float:
+    """Return the processor time of casting all scans and making their columns, seconds."""
     begin = time.process_time()
     columns_of(list(rig.cast(0, rig.survey.scan_count)))
     return time.process_time() - begin
@@ -34,19 +34,19 @@ def seconds(rig: Rig) -> float:
 def costs(
     effects: Mapping[str, Any], rounds: int = ROUNDS, triangles: int = 20_000
 ) -> dict[str, float]:
-    """Return the time of stage 2 with each effect, relative to the time without: medians."""
+    """Return the median time of stage 2 with each effect, relative to the time without."""
     scene = city(triangles)
-    without = survey_without()
-    plain = Rig(scene, without)
+    plain_survey = survey_without()
+    plain = Rig(scene, plain_survey)
     rigs = {}  # {effect: (with it, without it)}
     for name, effect in effects.items():
-        moving = effect.of(scene) if hasattr(effect, "of") else None
-        bare = plain if moving is None else Rig(moving, without)
-        rigs[name] = Rig(moving or scene, effect.on(without)), bare
+        moving_scene = effect.with_actors(scene) if hasattr(effect, "with_actors") else None
+        bare = plain if moving_scene is None else Rig(moving_scene, plain_survey)
+        rigs[name] = Rig(moving_scene or scene, effect.with_effect(plain_survey)), bare
     ratios: dict[str, list[float]] = {name: [] for name in rigs}
     for number in range(rounds + 1):
         for name, (rig, bare) in rigs.items():
-            ratio = seconds(rig) / seconds(bare)
+            ratio = stage_seconds(rig) / stage_seconds(bare)
             if number:  # the first compiles and fills caches
                 ratios[name].append(ratio)
     return {name: statistics.median(values) for name, values in ratios.items()}

@@ -30,7 +30,7 @@ PLACES = ("room", "street", "hall", "forest")
 
 
 def street() -> Scene:
-    """Make the ground, a wall on either side and one at the end; above them is sky."""
+    """Make the ground, two side walls and an end wall below an open sky."""
     corners = {
         "ground": [(-80, -60, -1.7), (80, -60, -1.7), (80, 60, -1.7), (-80, 60, -1.7)],
         "left": [(-80, 4, -1.7), (80, 4, -1.7), (80, 4, 6), (-80, 4, 6)],
@@ -38,12 +38,15 @@ def street() -> Scene:
         "end": [(30, -9, -1.7), (30, 4, -1.7), (30, 4, 3), (30, -9, 3)],
     }
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return Scene.from_meshes(SceneMesh(name, np.array(at), faces) for name, at in corners.items())
+    return Scene.from_meshes(
+        SceneMesh(name, np.array(corners_of_wall), faces)
+        for name, corners_of_wall in corners.items()
+    )
 
 
-def box(name: str, low: Any, high: Any) -> SceneMesh:
+def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
     """Make a box between two corners, metres."""
-    x, y, z = np.transpose([low, high]).astype(float)
+    x, y, z = np.transpose([lower_m, upper_m]).astype(float)
     corners = np.array([(a, b, c) for a in x for b in y for c in z])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
@@ -51,45 +54,48 @@ def box(name: str, low: Any, high: Any) -> SceneMesh:
 
 
 def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
-    """Make one of `PLACES`, and the position of a sensor in it, metres."""
+    """Make a scene of `PLACES`; return the scene, and the position of a sensor, metres."""
     rng = np.random.default_rng(seed)
     if name == "street":
         return city(30_000, seed=seed), (0.0, 0.0, 1.8)
     if name == "forest":
-        ground = box("ground", (-80, -80, -1), (80, 80, 0))
-        count = 120
-        at = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
-        at = at[np.hypot(*at[:, :2].T) > 2.5]
-        trees = all_trees(0, 0.2)
-        kind = rng.integers(0, len(trees), len(at))
-        yaw = rng.uniform(0, 2 * np.pi, len(at))
-        scale = rng.uniform(0.6, 1.2, len(at))
-        return Scene.from_meshes([ground, *place_instances(trees, kind, at, yaw, scale)]), (
-            0,
-            0,
-            1.6,
-        )
+        return forest(rng), (0, 0, 1.6)
     if name == "room":
-        x = rng.uniform(5, 9)
-        y = rng.uniform(4, 7)
-        z = rng.uniform(2.4, 3.2)
-        things = 8
-        size = 0.8
-        height = 1.2
-    else:
-        x = rng.uniform(30, 60)
-        y = rng.uniform(18, 35)
-        z = rng.uniform(7, 10)
-        things = 24
-        size = 2.5
-        height = 5.0
+        size = (rng.uniform(5, 9), rng.uniform(4, 7), rng.uniform(2.4, 3.2))
+        return furnished_box(rng, size, 8, (0.8, 0.8, 1.2)), (0.0, 0.0, 1.1)
+    size = (rng.uniform(30, 60), rng.uniform(18, 35), rng.uniform(7, 10))
+    return furnished_box(rng, size, 24, (2.5, 2.5, 5.0)), (0.0, 0.0, 1.1)
+
+
+def forest(rng: np.random.Generator) -> Scene:
+    """Make trees on flat ground; 2.5 m around the origin are free."""
+    ground = box("ground", (-80, -80, -1), (80, 80, 0))
+    count = 120
+    positions = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
+    positions = positions[np.hypot(*positions[:, :2].T) > 2.5]
+    trees = all_trees(0, 0.2)
+    species = rng.integers(0, len(trees), len(positions))
+    yaw = rng.uniform(0, 2 * np.pi, len(positions))
+    scale = rng.uniform(0.6, 1.2, len(positions))
+    instances = place_instances(trees, species, positions, yaw, scale)
+    return Scene.from_meshes([ground, *instances])
+
+
+def furnished_box(
+    rng: np.random.Generator,
+    size: tuple[float, float, float],
+    count: int,
+    max_size: tuple[float, float, float],
+) -> Scene:
+    """Make a closed room of a size with `count` boxes of up to `max_size` in it, metres."""
+    x, y, z = size
     meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
-    for number in range(things):
+    for number in range(count):
         a, b = rng.uniform(-0.45, 0.45, 2) * (x, y)
-        w, d, h = rng.uniform(0.15, 1, 3) * (size, size, height)
-        if np.hypot(a, b) > 1.0 + size:
+        w, d, h = rng.uniform(0.15, 1, 3) * max_size
+        if np.hypot(a, b) > 1.0 + max_size[0]:
             meshes.append(box(f"thing-{number}", (a, b, 0), (a + w, b + d, h)))
-    return Scene.from_meshes(meshes), (0.0, 0.0, 1.1)
+    return Scene.from_meshes(meshes)
 
 
 def recorded(
@@ -97,18 +103,18 @@ def recorded(
     bias: Any = 0.0,
     sweeps: int = SWEEPS,
     scene: Scene | None = None,
-    at: tuple[float, float, float] = (0, 0, 0),
+    position: tuple[float, float, float] = (0, 0, 0),
     columns: int = COLUMNS,
     cache: Path | None = None,
 ) -> Recording:
-    """Sweeps of a sensor that stands in the street, with an error of each channel in metres."""
+    """Record sweeps of a standing sensor, with an error of each channel in metres."""
     if cache is None or not cache.exists():
         sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
         scanner = Scanner(
             scene or street(), sensor, columns=["intensity"], noise=noise, precision_m=1e-4,
             coordinates="sensor", threads=1,
         )  # fmt: skip
-        clouds = [scanner.sweep(at, number=number) for number in range(sweeps)]
+        clouds = [scanner.sweep(position, number=number) for number in range(sweeps)]
         arrays = {
             f"{name}{number}": values
             for number, cloud in enumerate(clouds)
@@ -134,12 +140,14 @@ def recorded(
     return Recording("simulated", sweeps, read, energies=True)
 
 
-def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict[str, float], Any]:
-    """Figures that a recording was made with, and those that were fitted: {name: …}.
+def trial(
+    number: int, cache: Path | None = None, place_name: str = ""
+) -> tuple[dict[str, float], Any]:
+    """Fit a recording; return the true figures and the fitted figures: {name: …}.
 
     Every second sensor has noise by range and errors of its channels, the others noise by energy,
-    a threshold and false alarms. With `where`, one of `PLACES`, the second is the error of the fit
-    if it is refused.
+    a threshold and false alarms. With `place_name`, an entry of `PLACES`, the second result is the
+    error message of a refused fit.
     """
     rng = np.random.default_rng(number)
     truth = {
@@ -148,7 +156,7 @@ def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict
         "dropout": rng.uniform(0.005, 0.03),
     }
     bias: Any = 0.0
-    if number // len(PLACES) % 2 if where else number % 2:
+    if number // len(PLACES) % 2 if place_name else number % 2:
         truth["range_per_m"] = rng.uniform(0.0003, 0.001)
         noise = Noise(**truth, seed=number)
         bias = rng.normal(0, 0.005, LAYERS)
@@ -160,27 +168,27 @@ def trial(number: int, cache: Path | None = None, where: str = "") -> tuple[dict
         gate_s = Sensor.grid(max_range_m=FARTHEST_M).gate_s
         noise = Noise(**truth, false_alarm_hz=-np.log1p(-share) / gate_s, seed=number)
         truth["false_alarms"] = share
-    if where:
-        file = None if cache is None else cache / f"{where}-{number}.npz"
-        scene, at = (None, (0, 0, 0)) if file and file.exists() else place(where, number)
-        recording = recorded(noise, bias, 10, scene, at, 600, file)
+    if place_name:
+        file = None if cache is None else cache / f"{place_name}-{number}.npz"
+        scene, position = (None, (0, 0, 0)) if file and file.exists() else place(place_name, number)
+        recording = recorded(noise, bias, 10, scene, position, 600, file)
     else:
         recording = recorded(noise, bias)
     try:
         figures = fit(recording).figures
     except LidarError as error:
-        if not where:
+        if not place_name:
             raise
         return truth, str(error)
-    found = dict(figures["figures"])
+    fitted = dict(figures["figures"])
     if not np.any(bias):
-        return truth, found
-    of_rings = {row["ring"]: row["bias_m"] for row in figures["channels"] if row["bias_m"]}
-    known = [*of_rings]
-    middle = bias[known].mean() if known else 0.0  # biases are beside the mean of these
-    truth |= {f"bias_m of ring {ring}": bias[ring] - middle for ring in range(LAYERS)}
-    found |= {f"bias_m of ring {ring}": estimate for ring, estimate in of_rings.items()}
-    return truth, found
+        return truth, fitted
+    ring_biases = {row["ring"]: row["bias_m"] for row in figures["channels"] if row["bias_m"]}
+    rings = [*ring_biases]
+    mean_bias = bias[rings].mean() if rings else 0.0  # biases are beside the mean of these
+    truth |= {f"bias_m of ring {ring}": bias[ring] - mean_bias for ring in range(LAYERS)}
+    fitted |= {f"bias_m of ring {ring}": estimate for ring, estimate in ring_biases.items()}
+    return truth, fitted
 
 
 def main() -> None:
@@ -189,21 +197,21 @@ def main() -> None:
     parser.add_argument("--places", action="store_true")
     parser.add_argument("--cache", type=Path, help="folder that keeps simulated recordings")
     arguments = parser.parse_args()
-    places = PLACES if arguments.places else ("",)
+    place_names = PLACES if arguments.places else ("",)
     trials = arguments.trials or (40 if arguments.places else 200)
     # {(place, figure): (held, relative error, relative half-width) of each trial}
     rows: dict[tuple[str, str], list[tuple[bool, float, float]]] = defaultdict(list)
     missing: dict[tuple[str, str], int] = defaultdict(int)
     for number in range(trials):
-        where = places[number % len(places)]
-        truth, fitted = trial(number, arguments.cache, where)
+        place_name = place_names[number % len(place_names)]
+        truth, fitted = trial(number, arguments.cache, place_name)
         if isinstance(fitted, str):
-            print(f"{where} {number}: {fitted}")
+            print(f"{place_name} {number}: {fitted}")
             fitted = {}
         for name, true in truth.items():
             estimate = fitted.get(name)
             figure = name.partition(" ")[0]  # of all rings together
-            for key in {(where, figure), ("all", figure)}:
+            for key in {(place_name, figure), ("all", figure)}:
                 if estimate is None:
                     missing[key] += 1
                     continue
@@ -212,10 +220,11 @@ def main() -> None:
                 rows[key].append((held, estimate["value"] / true - 1, half))
     print("| place | figure | trials | not determined | held | median error | median half-width |")
     print("|---|---|--:|--:|--:|--:|--:|")
-    for where, name in sorted({*rows, *missing}):
-        held, error, half = np.reshape(rows[where, name] or [(0, np.nan, np.nan)], (-1, 3)).T
+    for place_name, name in sorted({*rows, *missing}):
+        held, error, half = np.reshape(rows[place_name, name] or [(0, np.nan, np.nan)], (-1, 3)).T
         print(
-            f"| {where} | `{name}` | {len(rows[where, name])} | {missing[where, name]} "
+            f"| {place_name} | `{name}` "
+            f"| {len(rows[place_name, name])} | {missing[place_name, name]} "
             f"| {100 * held.mean():.1f} % | {100 * np.median(error):+.2f} % "
             f"| {100 * np.median(np.abs(half)):.1f} % |"
         )

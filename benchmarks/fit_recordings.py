@@ -14,7 +14,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -30,101 +30,130 @@ from lidarsim.simulator.range_noise import noisy_ranges
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
 
-def half(recording: Recording, first: int) -> Recording:
-    """Every second sweep of a recording."""
+def every_second_sweep(recording: Recording, first: int) -> Recording:
+    """Return a recording of every second sweep, from sweep `first` on."""
     numbers = range(first, recording.count, 2)
     return replace(
         recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
     )
 
 
-def simulated(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
-    """Ranges of rays in sweeps, (s, k), NaN where lost."""
+def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
+    """Simulate the ranges of rays in sweeps, (s, k) metres; NaN where a pulse is lost."""
     keys = np.arange(len(rays.row))
-    out = np.full((sweeps, len(keys)), np.nan)
+    result = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
         across, _ = angle_errors(noise, np.full(len(keys), scan), keys)
         ranges = rays.distance + rays.slope * across  # along the steepest slope
         moved = noisy_ranges(noise, ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
-        seen = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
-        out[scan] = np.where(seen, moved, np.nan)
-    return out
+        detected_rays = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
+        result[scan] = np.where(detected_rays, moved, np.nan)
+    return result
 
 
 def deviations(ranges: Any) -> Any:
-    """Differences of sweeps in turn, over the root of two, millimetres."""
+    """Return differences of successive sweeps divided by √2, millimetres."""
     steps = np.diff(ranges, axis=0) / np.sqrt(2)
     return 1000 * steps[np.isfinite(steps)]
 
 
-def compared(
-    recording: Recording, model: str | None, white: float | None
-) -> tuple[dict[str, Any], ...]:
-    """Deviations (n,) and shares of lost pulses, recorded and simulated; scatter of intensity.
+class Comparison(NamedTuple):
+    """Recorded and simulated sweeps of the second half of a recording, by source."""
+
+    deviations_mm: dict[str, Any]  # (n,) each
+    lost: dict[str, float]  # shares of pulses
+    spread: dict[str, float]  # scatter of intensity, relative
+
+
+def compare_halves(recording: Recording, model: str | None, white: float | None) -> Comparison:
+    """Fit the first half of a recording, and simulate the rays of the second half.
 
     LidarError if a half cannot be fitted.
     """
     SweepStack.read(recording)  # refuses a sensor that moves, which halves may not show
-    found = fit(half(recording, 0), model=model, white=white)
-    other = SweepStack.read(half(recording, 1))
-    rays = select_smooth_rays(other, other.rough_sigma, 0.002)
-    with warnings.catch_warnings(action="ignore"):  # of cells without a return
-        middle = np.nanmedian(other.ranges, axis=0)
-    azimuth_slope = find_surfaces(other, middle, other.rough_sigma).azimuth_slope
+    fit_result = fit(every_second_sweep(recording, 0), model=model, white=white)
+    test_stack = SweepStack.read(every_second_sweep(recording, 1))
+    rays = select_smooth_rays(test_stack, test_stack.rough_sigma, 0.002)
+    recorded = flattened_ranges(test_stack, rays)
     energy = np.maximum(rays.intensity / (white or recording.white or 100), 1 / 400)
     energy = energy * (10 / rays.distance) ** 2
-    fitted = found.model.datasheet().noise
-    sheet = Noise()
-    if model is not None:
-        with suppress(LidarError):  # the model states no performance
-            sheet = read_model(model).datasheet().noise
-    cell = rays.row, rays.column
-    recorded = other.ranges[:, *cell].astype(float)
-    recorded -= azimuth_slope[cell] * np.nan_to_num(other.azimuth_offsets[:, *cell])
-    sweeps = len(recorded)
-    ranges = {"recorded": recorded, "data sheet": simulated(sheet, rays, energy, sweeps),
-              "fitted": simulated(fitted, rays, energy, sweeps)}  # fmt: skip
-    light = other.intensities[:, *cell].astype(float)
+    noises = {"data sheet": datasheet_noise(model), "fitted": fit_result.model.datasheet().noise}
+    ranges = {"recorded": recorded}
+    for name, noise in noises.items():
+        ranges[name] = simulate_ranges(noise, rays, energy, len(recorded))
+    light = test_stack.intensities[:, rays.row, rays.column].astype(float)
     steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.intensity, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
-    lost = {name: float(np.isnan(one).mean()) for name, one in ranges.items()}
+    lost = {name: float(np.isnan(values).mean()) for name, values in ranges.items()}
     lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps
-    return {name: deviations(one) for name, one in ranges.items()}, lost, spread
+    return Comparison({name: deviations(v) for name, v in ranges.items()}, lost, spread)
+
+
+def flattened_ranges(stack: SweepStack, rays: Any) -> Any:
+    """Return recorded ranges of rays, (s, k) metres, without the effect of azimuth offsets."""
+    with warnings.catch_warnings(action="ignore"):  # of cells without a return
+        median_ranges = np.nanmedian(stack.ranges, axis=0)
+    azimuth_slope = find_surfaces(stack, median_ranges, stack.rough_sigma).azimuth_slope
+    cell = rays.row, rays.column
+    ranges = stack.ranges[:, *cell].astype(float)
+    ranges -= azimuth_slope[cell] * np.nan_to_num(stack.azimuth_offsets[:, *cell])
+    return ranges
+
+
+def datasheet_noise(model: str | None) -> Noise:
+    """Return the noise of a model's data sheet; no noise without a stated performance."""
+    if model is not None:
+        with suppress(LidarError):  # the model states no performance
+            return read_model(model).datasheet().noise
+    return Noise()
+
+
+def print_rows(name: str, comparison: Comparison) -> None:
+    """Print a row of the table for each source of a comparison."""
+    for source, values in comparison.deviations_mm.items():
+        quantiles = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
+        noise = ", ".join(f"{quantile:.1f}" for quantile in quantiles)
+        spread = comparison.spread
+        intensity = f"{100 * spread[source]:.1f} %" if source in spread else "0"
+        lost = f"{100 * comparison.lost[source]:.2f} %"
+        print(f"| {name} | {source} | {noise} | {lost} | {intensity} |", flush=True)
+
+
+def draw_deviations(axes: Any, comparison: Comparison) -> None:
+    """Draw a histogram of deviations for each source of a comparison."""
+    limit = 1.5 * np.quantile(np.abs(comparison.deviations_mm["recorded"]), 0.98)
+    for source, values in comparison.deviations_mm.items():
+        if values.any():  # without noise there is nothing to draw
+            share = np.full(len(values), 1 / len(values))
+            axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
+                      color=COLOURS[source], label=source)  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="+", metavar="RECORDING[=MODEL[,WHITE]]")
     parser.add_argument("--picture", type=Path)
-    given = parser.parse_args()
-    figure = Figure(figsize=(3.2 * len(given.recordings), 2.8), layout="constrained")
+    options = parser.parse_args()
+    figure = Figure(figsize=(3.2 * len(options.recordings), 2.8), layout="constrained")
     print("| recording | | noise: 50 %, 95 %, 99 % of deviations, mm | pulses lost | intensity |")
     print("|---|---|--:|--:|--:|")
-    for number, text in enumerate(given.recordings):
+    for number, text in enumerate(options.recordings):
         path, _, model = text.partition("=")
         model, _, white = model.partition(",")
         try:
             recording = open_recording(path)
-            off, lost, spread = compared(recording, model or None, float(white) if white else None)
+            comparison = compare_halves(recording, model or None, float(white) if white else None)
         except LidarError as error:
             print(f"| {Path(path).name} | refused | {error} | | |", flush=True)
             continue
-        axes = figure.add_subplot(1, len(given.recordings), number + 1)
-        limit = 1.5 * np.quantile(np.abs(off["recorded"]), 0.98)
-        for name, values in off.items():
-            low, middle, high = np.quantile(np.abs(values), (0.5, 0.95, 0.99))
-            seen = f"{100 * spread[name]:.1f} %" if name in spread else "0"
-            print(f"| {Path(path).name} | {name} | {low:.1f}, {middle:.1f}, {high:.1f} "
-                  f"| {100 * lost[name]:.2f} % | {seen} |", flush=True)  # fmt: skip
-            if values.any():  # without noise there is nothing to draw
-                share = np.full(len(values), 1 / len(values))
-                axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
-                          color=COLOURS[name], label=name)  # fmt: skip
+        print_rows(Path(path).name, comparison)
+        axes = figure.add_subplot(1, len(options.recordings), number + 1)
+        draw_deviations(axes, comparison)
         axes.set(title=f"{Path(path).name}\n{model}", xlabel="deviation, mm", yticks=[])
     if figure.axes:
         figure.axes[0].legend(fontsize=7, frameon=False)
-    if given.picture:
-        figure.savefig(given.picture, dpi=110)
+    if options.picture:
+        figure.savefig(options.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from typing import Any
 from raybeam import available_backends
 from raybeam.registry import choose
 
-from .gpu_clock import QUICK, Here, Sizes, clocks
+from .gpu_clock import QUICK, Session, Sizes, clocks
 
 # {section: (its module, most seconds)}, the most important first; its function is of that name.
 SECTIONS = {
@@ -87,8 +87,8 @@ ROWS = (
 )  # fmt: skip
 
 
-def found(results: dict[str, Any], path: str) -> float | None:
-    """Look up a figure of the results; None if it was not measured."""
+def figure_at(results: dict[str, Any], path: str) -> float | None:
+    """Return a figure of the results by its path, or None if it was not measured."""
     if path == "different":
         checked = [results.get(name, {}) for name in ("bits", "columns")]
         rows = [row for section in checked for row in section.values() if isinstance(row, dict)]
@@ -105,10 +105,10 @@ def found(results: dict[str, Any], path: str) -> float | None:
 
 
 def table(results: dict[str, Any]) -> list[str]:
-    """Make the table of docs/performance.md."""
+    """Return the lines of the table of docs/performance.md."""
     lines = ["| | |", "|---|---|"]
     for name, digits, paths in ROWS:
-        values = [found(results, path) for path in paths]
+        values = [figure_at(results, path) for path in paths]
         words = ["not measured" if v is None else f"{v:,.{digits}f}" for v in values]
         none = all(v is None for v in values)
         lines.append(f"| {name} | {words[0] if none else ', '.join(words)} |")
@@ -116,36 +116,36 @@ def table(results: dict[str, Any]) -> list[str]:
 
 
 def headline(results: dict[str, Any]) -> str:
-    """Name the device, its clock under load, the versions and the date."""
-    about = results.get("device", {}).get("device", {})
+    """Return a line with the device, its clock under load, versions and date."""
+    device = results.get("device", {}).get("device", {})
     clock = results.get("kernels", {}).get("clocks", {}).get("after", {})
-    words = [about.get("name"), *(f"{name} {value}" for name, value in clock.items())]
-    words += [f"{name} {about[name]}" for name in ("driver_cuda", "cupy", "numpy") if about]
-    return ", ".join(word for word in (*words, about.get("date")) if word)
+    words = [device.get("name"), *(f"{name} {value}" for name, value in clock.items())]
+    words += [f"{name} {device[name]}" for name in ("driver_cuda", "cupy", "numpy") if device]
+    return ", ".join(word for word in (*words, device.get("date")) if word)
 
 
 def problems(results: dict[str, Any]) -> list[str]:
-    """List what failed, and what is wrong with the device's answers."""
-    out = [f"{name}: {row['error']}" for name, row in results.items() if "error" in row]
-    if found(results, "different"):
-        out.append("values differ from NumPy's")
-    if found(results, "leaks/edges and corners/escaped"):
-        out.append("rays escape")
-    if found(results, "large/many rays/wrong hits"):
-        out.append("hits of many rays are wrong")
-    return out
+    """List failed sections and wrong results of the device."""
+    failures = [f"{name}: {row['error']}" for name, row in results.items() if "error" in row]
+    if figure_at(results, "different"):
+        failures.append("values differ from NumPy's")
+    if figure_at(results, "leaks/edges and corners/escaped"):
+        failures.append("rays escape")
+    if figure_at(results, "large/many rays/wrong hits"):
+        failures.append("hits of many rays are wrong")
+    return failures
 
 
 def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
-    """Measure a section in this process: its rows so far, again and again."""
+    """Measure a section in this process; yield its rows after each new row."""
     module, seconds = SECTIONS[name]
     rows: dict[str, Any] = {}
-    before = clocks()
+    clocks_before = clocks()
     end = time.monotonic() + seconds
     try:
         section = getattr(importlib.import_module(f".{module}", __package__), name)
         cupy = choose("cuda")._library()  # type: ignore[attr-defined]
-        for title, row in section(Here(cupy, sizes, folder)):
+        for title, row in section(Session(cupy, sizes, folder)):
             rows[title] = row
             print(f"{name}: {title}: {shown(row)}", flush=True)
             yield rows
@@ -157,12 +157,12 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
     except Exception as error:
         traceback.print_exc()
         rows["error"] = f"{type(error).__name__}: {error}"
-    rows["clocks"] = {"before": before, "after": clocks()}
+    rows["clocks"] = {"before": clocks_before, "after": clocks()}
     yield rows
 
 
 def shown(row: Any) -> str:
-    """Write a row in a line, without times where rates are."""
+    """Format a row in a line, without times where rates are present."""
     if not isinstance(row, dict):
         return f"{row:.4g}" if isinstance(row, float) else str(row)
     words = [
@@ -174,12 +174,12 @@ def shown(row: Any) -> str:
 
 
 def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
-    """Measure a section in a process of its own, which is ended when its time is up."""
+    """Measure a section in a new process, which is killed after `seconds`; return its rows."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rows.json")
-        given = ["--in-process", "--only", name, "--json", str(path), *options]
+        arguments = ["--in-process", "--only", name, "--json", str(path), *options]
         process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.gpu", *given], start_new_session=True
+            [sys.executable, "-m", "benchmarks.gpu", *arguments], start_new_session=True
         )
         error = ""
         try:
@@ -196,7 +196,7 @@ def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 1 when something failed or is wrong, 2 without a device."""
+    """Run from the command line; return 1 for failures or wrong results, 2 without a device."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy sizes: whether it works")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
@@ -212,23 +212,23 @@ def main(arguments: list[str] | None = None) -> int:
     end = time.monotonic() + chosen.seconds
     results = {}
 
-    def keep(name: str, rows: dict[str, Any]) -> None:
+    def store(name: str, rows: dict[str, Any]) -> None:
         results[name] = rows
         if chosen.json:
-            said = {"command": sys.argv[1:], "sections": results}
-            beside = chosen.json.with_name(f"{chosen.json.name}.new")
-            beside.write_text(json.dumps(said, indent=1, default=float) + "\n")
-            beside.replace(chosen.json)
+            report = {"command": sys.argv[1:], "sections": results}
+            unfinished = chosen.json.with_name(f"{chosen.json.name}.new")
+            unfinished.write_text(json.dumps(report, indent=1, default=float) + "\n")
+            unfinished.replace(chosen.json)
 
     for name in chosen.only:
-        left = end - time.monotonic()
-        if left < 30:
-            keep(name, {"left out": "no time was left"})
+        remaining_s = end - time.monotonic()
+        if remaining_s < 30:
+            store(name, {"left out": "no time was left"})
         elif chosen.in_process:
             for rows in measured(name, QUICK if chosen.quick else Sizes(), chosen.folder):
-                keep(name, rows)
+                store(name, rows)
         else:
-            keep(name, apart(name, options, min(1.5 * SECTIONS[name][1] + 20, left)))
+            store(name, apart(name, options, min(1.5 * SECTIONS[name][1] + 20, remaining_s)))
     wrong = problems(results)
     if len(chosen.only) > 1:
         print("", headline(results), "", *table(results), "", sep="\n")

@@ -23,13 +23,13 @@ _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.lin
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured; the defaults are for a device, `QUICK` is for a look."""
+    """Sizes of all sections; the defaults are for a device, `QUICK` is for tests."""
 
     cities: tuple[int, ...] = (100_000, 1_000_000)  # triangles
     large: int = 10_000_000
     rays: int = 128 * 2048  # of a revolution
     poses: int = 16  # revolutions of one launch
-    many: int = 1 << 31
+    rays_beyond_int: int = 1 << 31
     forest: tuple[int, int] = (1000, 50_000)  # trees, and leaves of each
     sample: int = 2000  # rays compared with NumPy
     leaks: int = 10_000_000
@@ -41,23 +41,23 @@ class Sizes:
 
 
 QUICK = Sizes(
-    cities=(1000,), large=2000, rays=128 * 16, poses=2, many=5000, forest=(20, 100), sample=300,
-    leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
+    cities=(1000,), large=2000, rays=128 * 16, poses=2, rays_beyond_int=5000, forest=(20, 100),
+    sample=300, leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Here:
-    """What sections need."""
+class Session:
+    """CuPy, sizes and output folder of all sections."""
 
     cupy: Any
     sizes: Sizes
     folder: str  # on the disk that parts are written to
 
 
-def milliseconds(here: Here, launch: Callable[[], object]) -> dict[str, float]:
-    """Median, least and greatest time of a launch on the device, by events."""
-    events = here.cupy.cuda.Event
+def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, float]:
+    """Return median, least and greatest time of a launch on the device, by events."""
+    events = session.cupy.cuda.Event
     launch()
 
     def once() -> float:
@@ -67,14 +67,14 @@ def milliseconds(here: Here, launch: Callable[[], object]) -> dict[str, float]:
         launch()
         stop.record()
         stop.synchronize()
-        return float(here.cupy.cuda.get_elapsed_time(start, stop))
+        return float(session.cupy.cuda.get_elapsed_time(start, stop))
 
-    return _repeated(here, once)
+    return _repeated(session, once)
 
 
-def wall_milliseconds(here: Here, call: Callable[[], object]) -> dict[str, float]:
-    """Median, least and greatest time of a call by the clock, until the device is done."""
-    device = here.cupy.cuda.Device()
+def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str, float]:
+    """Return median, least and greatest wall time of a call, including the device's work."""
+    device = session.cupy.cuda.Device()
     call()
 
     def once() -> float:
@@ -84,11 +84,11 @@ def wall_milliseconds(here: Here, call: Callable[[], object]) -> dict[str, float
         device.synchronize()
         return 1e3 * (time.perf_counter() - start)
 
-    return _repeated(here, once)
+    return _repeated(session, once)
 
 
-def _repeated(here: Here, once: Callable[[], float]) -> dict[str, float]:
-    end = time.monotonic() + here.sizes.seconds
+def _repeated(session: Session, once: Callable[[], float]) -> dict[str, float]:
+    end = time.monotonic() + session.sizes.seconds
     times = [once()]
     while len(times) < _LEAST or (len(times) < _MOST and time.monotonic() < end):
         times.append(once())
@@ -96,7 +96,7 @@ def _repeated(here: Here, once: Callable[[], float]) -> dict[str, float]:
 
 
 class Split:
-    """Adds up times of parts of the work on the device, by events."""
+    """Sums of device times by name of the work, measured by events."""
 
     def __init__(self, cupy: Any) -> None:
         self._cupy = cupy
@@ -104,50 +104,50 @@ class Split:
 
     @contextmanager
     def timed(self, name: str, stream: Any = None) -> Iterator[None]:
-        """Add what is begun inside in a stream, the current one by default."""
+        """Add the device time of the body's work in a stream, by default the current stream."""
         stream = stream or self._cupy.cuda.get_current_stream()
         start = stream.record()
         yield
         self._pairs.append((name, start, stream.record()))
 
     def milliseconds(self) -> dict[str, float]:
-        """Return sums by name, when the device is done."""
+        """Synchronise the device, and return the sums by name, milliseconds."""
         self._cupy.cuda.Device().synchronize()
-        out: Counter[str] = Counter()
+        sums: Counter[str] = Counter()
         for name, start, stop in self._pairs:
-            out[name] += self._cupy.cuda.get_elapsed_time(start, stop)
-        return dict(out)
+            sums[name] += self._cupy.cuda.get_elapsed_time(start, stop)
+        return dict(sums)
 
 
 def pinned(cupy: Any, count: int) -> Any:
-    """Make bytes in page-locked memory."""
+    """Allocate `count` bytes of page-locked memory."""
     return np.frombuffer(cupy.cuda.alloc_pinned_memory(count), np.uint8, count)
 
 
-def to_pinned(here: Here) -> float:
-    """GB/s of a plain copy from the device to page-locked memory: all that the bus gives."""
-    cupy = here.cupy
-    count = here.sizes.copied
+def to_pinned(session: Session) -> float:
+    """Return the bus rate, GB/s: a plain copy from the device to page-locked memory."""
+    cupy = session.cupy
+    count = session.sizes.copied
     array = cupy.zeros(count, np.uint8)
-    out = pinned(cupy, count)
+    buffer = pinned(cupy, count)
     stream = cupy.cuda.get_current_stream()
-    copy = milliseconds(here, lambda: array.get(stream=stream, out=out, blocking=False))
+    copy = milliseconds(session, lambda: array.get(stream=stream, out=buffer, blocking=False))
     return count / copy["ms"] / 1e6
 
 
-def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Tell what the device is, and how fast it copies."""
-    cupy = here.cupy
-    count = here.sizes.copied
+def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the properties of the device, and its copy rates."""
+    cupy = session.cupy
+    count = session.sizes.copied
     runtime = cupy.cuda.runtime
-    about = runtime.getDeviceProperties(cupy.cuda.Device().id)
+    properties = runtime.getDeviceProperties(cupy.cuda.Device().id)
     major, minor = divmod(runtime.driverGetVersion(), 1000)
     yield (
         "device",
         {
-            "name": about["name"].decode(),
-            "memory_gb": round(about["totalGlobalMem"] / 1e9, 1),
-            "multiprocessors": about["multiProcessorCount"],
+            "name": properties["name"].decode(),
+            "memory_gb": round(properties["totalGlobalMem"] / 1e9, 1),
+            "multiprocessors": properties["multiProcessorCount"],
             "driver_cuda": f"{major}.{minor // 10}",
             "runtime": runtime.runtimeGetVersion(),
             "cupy": cupy.__version__,
@@ -159,7 +159,7 @@ def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
     array = cupy.zeros(count, np.uint8)
     plain = np.zeros(count, np.uint8)
     source = pinned(cupy, count)
-    other = cupy.empty_like(array)
+    target = cupy.empty_like(array)
     stream = cupy.cuda.get_current_stream()
     calls = {
         "from pinned": (milliseconds, lambda: array.set(source, stream=stream)),
@@ -167,12 +167,14 @@ def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
         "to fresh": (wall_milliseconds, array.get),
         "from plain": (wall_milliseconds, lambda: array.set(plain)),
     }
-    rates = {name: count / clock(here, call)["ms"] / 1e6 for name, (clock, call) in calls.items()}
-    copied = milliseconds(here, lambda: cupy.copyto(other, array))["ms"]
+    rates = {
+        name: count / clock(session, call)["ms"] / 1e6 for name, (clock, call) in calls.items()
+    }
+    copied = milliseconds(session, lambda: cupy.copyto(target, array))["ms"]
     yield (
         "copies, GB/s",
         {
-            "to pinned": to_pinned(here),
+            "to pinned": to_pinned(session),
             **rates,
             "device, read and write": 2 * count / copied / 1e6,
         },
@@ -180,14 +182,16 @@ def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def clocks() -> dict[str, str]:
-    """Clocks, temperature and power now, in the words of nvidia-smi; nothing without it."""
+    """Return clocks, temperature and power as nvidia-smi reports them; {} without nvidia-smi."""
     program = shutil.which("nvidia-smi")
     if program is None:
         return {}
-    asked = [program, f"--query-gpu={','.join(('driver_version', *_CLOCKS))}", "--format=csv"]
+    command = [program, f"--query-gpu={','.join(('driver_version', *_CLOCKS))}", "--format=csv"]
     try:
-        said = subprocess.run(asked, capture_output=True, text=True, timeout=20).stdout.splitlines()
+        lines = subprocess.run(
+            command, capture_output=True, text=True, timeout=20
+        ).stdout.splitlines()
     except (OSError, subprocess.TimeoutExpired) as error:
         return {"error": str(error)}
-    rows = [[word.strip() for word in line.split(",")] for line in said[:2]]
+    rows = [[word.strip() for word in line.split(",")] for line in lines[:2]]
     return dict(zip(*rows, strict=True)) if len(rows) == 2 else {}

@@ -30,7 +30,7 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import Outbox
 
-from .gpu_clock import Here, Sizes, Split, to_pinned
+from .gpu_clock import Session, Sizes, Split, to_pinned
 
 Rows = Iterator[tuple[str, dict[str, Any]]]
 START = "spawn"  # how processes start; the tests fork
@@ -39,22 +39,25 @@ _ROOM = 4e9  # bytes
 
 
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
-    """Make a drive of an OS1-128 at 10 m/s along the street."""
-    way = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
+    """Return a drive of an OS1-128 at 10 m/s along the street."""
+    positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
     sensor = load_sensor("ouster/os1-128", step_deg=sizes.step_deg)
-    drive = Track([0, seconds], way)
+    drive = Track([0, seconds], positions)
     return Survey(sensor, trajectory=drive, keep_every=1, columns=["time", "range"])
 
 
 def traffic(scene: Scene) -> Scene:
-    """Put ten cars on the street."""
-    ways = [Track([0, 10], [[k * 8 - 40, 3.6, 0], [k * 8 + 40, 3.6, 0]]) for k in range(10)]
-    cars = (Actor(box(f"car {k}", (4.5, 1.8, 1.5)), way) for k, way in enumerate(ways))
+    """Return the scene with ten cars on the street."""
+    trajectories = [Track([0, 10], [[k * 8 - 40, 3.6, 0], [k * 8 + 40, 3.6, 0]]) for k in range(10)]
+    cars = (
+        Actor(box(f"car {k}", (4.5, 1.8, 1.5)), trajectory)
+        for k, trajectory in enumerate(trajectories)
+    )
     return replace(scene, actors=tuple(cars))
 
 
 def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
-    """Give functions that cast a batch, and make its columns as a GPU worker does; for ever."""
+    """Yield functions that cast a batch and make its columns, endlessly."""
     spec = rig.survey.scan(0)
     size = max(1, rays // ((spec.firings[1] - spec.firings[0]) * spec.channels))
     count = rig.survey.scan_count
@@ -62,44 +65,44 @@ def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
         yield lambda first=first: columns_of(list(rig.cast(first, min(first + size, count))))
 
 
-def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
-    """Make batches for so many seconds."""
-    made = batches(rig, rays)
-    part = next(made)()
+def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
+    """Make batches for `seconds`; return points per second and times per batch."""
+    casts = batches(rig, rays)
+    part = next(casts)()
     times = []
     points = 0
     start = time.perf_counter()
     while len(times) < 3 or time.perf_counter() - start < seconds:
         began = time.perf_counter()
-        points += len(next(made)())
+        points += len(next(casts)())
         times.append(time.perf_counter() - began)
     took = sum(times)
-    kept = [column for name, column in part.columns.items() if name != "sensor"]
+    stored_columns = [column for name, column in part.columns.items() if name != "sensor"]
     return {
         "mpoints_s": points / took / 1e6,
         "batch_points": points / len(times),
         "batch_ms": 1e3 * float(np.median(times)),
-        "bytes_a_point": sum(column.itemsize for column in kept),
+        "bytes_a_point": sum(column.itemsize for column in stored_columns),
     }
 
 
 @contextmanager
-def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
-    """Take the times of kernels and of copies of columns."""
+def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
+    """Measure the device times of kernels and of copies of columns while the body runs."""
     split = Split(cupy)
     engine = rig._caster.caster._engine
     run = engine._run  # type: ignore[attr-defined]
     kernel = lidarsim.simulator.device._kernel
     send = Outbox.send
 
-    def running(name: str, *given: Any) -> None:
+    def running(name: str, *arguments: Any) -> None:
         with split.timed(name):
-            run(name, *given)
+            run(name, *arguments)
 
-    def columns(*given: Any) -> Callable[..., None]:
+    def columns(*kernel_arguments: Any) -> Callable[..., None]:
         def launch(*arguments: Any) -> None:
             with split.timed("columns"):
-                kernel(*given)(*arguments)
+                kernel(*kernel_arguments)(*arguments)
 
         return launch
 
@@ -116,63 +119,74 @@ def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
         yield split
 
 
-def columns(here: Here) -> Rows:
-    """Points a second into host memory: a plain survey, larger batches, and ten actors."""
-    sizes = here.sizes
-    bus = to_pinned(here)
+def columns(session: Session) -> Rows:
+    """Yield points per second into host memory: a plain survey, large batches, ten actors."""
+    sizes = session.sizes
+    bus = to_pinned(session)
     scene = city(sizes.cities[-1])
     plain = survey(sizes)
     rig = Rig(scene, plain, "cuda")
     for name, rays in {"plain": sizes.batch, "larger batches": 8 * sizes.batch}.items():
-        row = timed(rig, rays, 3 * sizes.seconds)
+        row = time_batches(rig, rays, 3 * sizes.seconds)
         row["bus_share"] = row["mpoints_s"] * row["bytes_a_point"] / 1e3 / bus
         yield name, row
     engine: Any = rig._caster.caster._engine
     for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
         with patch.object(engine, "chunk", chunk):
-            yield f"chunks of {chunk:,} rays", timed(rig, sizes.batch, sizes.seconds)
-    with watched(here.cupy, rig) as split:
+            yield f"chunks of {chunk:,} rays", time_batches(rig, sizes.batch, sizes.seconds)
+    yield "a batch, ms", split_batch(session, rig)
+    fifth = replace(plain, keep_every=5)
+    yield "every fifth point", time_batches(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
+    row = time_batches(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
+    yield "ten actors", row
+    yield "bits", compare_columns(city(min(sizes.cities)), plain)
+
+
+def split_batch(session: Session, rig: Rig) -> dict[str, float]:
+    """Return the milliseconds of a batch by kernel, and in all."""
+    with split_times(session.cupy, rig) as split:
         count = 10
-        made = batches(rig, sizes.batch)
+        casts = batches(rig, session.sizes.batch)
         start = time.perf_counter()
         for _ in range(count):
-            next(made)()
+            next(casts)()
         wall = 1e3 * (time.perf_counter() - start) / count
         spent = {name: took / count for name, took in split.milliseconds().items()}
-    yield "a batch, ms", {**spent, "all": wall}
-    fifth = replace(plain, keep_every=5)
-    yield "every fifth point", timed(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
-    row = timed(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
-    yield "ten actors", row
-    few = city(min(sizes.cities))
-    turn = plain.scan_count // 2
-    rigs = (Rig(few, plain, backend) for backend in ("cuda", "numpy"))
-    mine, other = (columns_of(list(rig.cast(turn, turn + 1))) for rig in rigs)
-    wrong = sum(int((mine.columns[n] != other.columns[n]).sum()) for n in other.columns)
-    yield "bits", {"points": len(other), "different values": wrong}
+    return {**spent, "all": wall}
 
 
-def durable(here: Here) -> Rows:
-    """Points a second in parts on a disk and in memory, by as many threads as make it faster."""
-    rig = Rig(city(here.sizes.cities[-1]), survey(here.sizes), "cuda")
+def compare_columns(scene: Scene, drive: Survey) -> dict[str, int]:
+    """Count the values of a scan's columns that differ between the device and NumPy."""
+    scan = drive.scan_count // 2
+    rigs = (Rig(scene, drive, backend) for backend in ("cuda", "numpy"))
+    device_part, host_part = (columns_of(list(rig.cast(scan, scan + 1))) for rig in rigs)
+    wrong = sum(
+        int((device_part.columns[n] != host_part.columns[n]).sum()) for n in host_part.columns
+    )
+    return {"points": len(host_part), "different values": wrong}
+
+
+def durable(session: Session) -> Rows:
+    """Yield points per second in parts on disk and in memory, at the best number of threads."""
+    rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()
-    for name, place in {"memory": memory, "disk": here.folder}.items():
-        if shutil.disk_usage(place).free < _ROOM and here.sizes == Sizes():
-            yield name, {"left out": f"less than {_ROOM / 1e9:.0f} GB are free in {place}"}
+    for name, parent in {"memory": memory, "disk": session.folder}.items():
+        if shutil.disk_usage(parent).free < _ROOM and session.sizes == Sizes():
+            yield name, {"left out": f"less than {_ROOM / 1e9:.0f} GB are free in {parent}"}
             continue
         rows: list[dict[str, float]] = []
         threads = 1
         while threads <= 2 * (os.cpu_count() or 1):
-            with tempfile.TemporaryDirectory(dir=place) as folder:
-                rows.append(_written(here, rig, Storage.at(folder), threads))
+            with tempfile.TemporaryDirectory(dir=parent) as folder:
+                rows.append(_written(session, rig, Storage.at(folder), threads))
             threads *= 2
             if len(rows) > 1 and rows[-1]["mpoints_s"] < 1.1 * rows[-2]["mpoints_s"]:
                 break
         yield name, {**max(rows, key=lambda row: row["mpoints_s"]), "tried": rows}
 
 
-def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, float]:
-    """Cast in this thread, and make and write parts in others, as collectors do."""
+def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict[str, float]:
+    """Cast in this thread; make and write parts in worker threads, as collectors do."""
     room = threading.Semaphore(2 * threads)
     sizes = []
 
@@ -184,15 +198,15 @@ def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, 
         finally:
             room.release()
 
-    made = batches(rig, here.sizes.batch)
+    casts = batches(rig, session.sizes.batch)
     points = 0
     written = []
-    next(made)()
+    next(casts)()
     start = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
-        while len(written) < 2 * threads or time.perf_counter() - start < 2 * here.sizes.seconds:
+        while len(written) < 2 * threads or time.perf_counter() - start < 2 * session.sizes.seconds:
             room.acquire()
-            part = next(made)()
+            part = next(casts)()
             points += len(part)
             written.append(pool.submit(write, part, f"{len(written) % _PARTS}.npz"))
         for future in written:
@@ -201,25 +215,29 @@ def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, 
     return {"threads": threads, "mpoints_s": points / took / 1e6, "gb_s": sum(sizes) / took / 1e9}
 
 
-def sharing(here: Here) -> Rows:
-    """Points a second into host memory: two threads, one process, two that share the device."""
-    rig = Rig(city(here.sizes.cities[-1]), survey(here.sizes), "cuda")
+def sharing(session: Session) -> Rows:
+    """Yield points per second into host memory by two threads, one process, two processes."""
+    rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     with ThreadPoolExecutor(2) as pool:
-        both = [pool.submit(timed, rig, here.sizes.batch, here.sizes.seconds) for _ in range(2)]
-        yield "2 threads", {"mpoints_s": sum(found.result()["mpoints_s"] for found in both)}
+        futures = [
+            pool.submit(time_batches, rig, session.sizes.batch, session.sizes.seconds)
+            for _ in range(2)
+        ]
+        yield "2 threads", {"mpoints_s": sum(future.result()["mpoints_s"] for future in futures)}
     del rig
     context = multiprocessing.get_context(START)
     totals = []
     for count in (1, 2):
         barrier = context.Barrier(count)
-        out = context.Queue()
+        rates_queue = context.Queue()
         started = [
-            context.Process(target=_share, args=(here.sizes, barrier, out)) for _ in range(count)
+            context.Process(target=_share, args=(session.sizes, barrier, rates_queue))
+            for _ in range(count)
         ]
         for process in started:
             process.start()
         try:
-            rates = [out.get(timeout=60) for _ in started]
+            rates = [rates_queue.get(timeout=60) for _ in started]
         finally:
             for process in started:
                 process.terminate()
@@ -229,24 +247,29 @@ def sharing(here: Here) -> Rows:
     yield "two to one", {"ratio": totals[1] / totals[0]}
 
 
-def _share(sizes: Sizes, barrier: Any, out: Any) -> None:
+def _share(sizes: Sizes, barrier: Any, rates_queue: Any) -> None:
     rig = Rig(city(sizes.cities[-1]), survey(sizes), "cuda")
     next(batches(rig, sizes.batch))()
     barrier.wait(60)
-    out.put(timed(rig, sizes.batch, 3 * sizes.seconds)["mpoints_s"])
+    rates_queue.put(time_batches(rig, sizes.batch, 3 * sizes.seconds)["mpoints_s"])
 
 
-def run(here: Here) -> Rows:
-    """Run a survey with its cluster, from rays to parts on the disk."""
+def run(session: Session) -> Rows:
+    """Run surveys on a local cluster, from rays to parts on the disk; yield their rates."""
     from lidarpool import simulate
 
-    drive = survey(here.sizes, here.sizes.survey / (10 * 1024 * 128))  # it turns ten times a second
+    drive = survey(
+        session.sizes, session.sizes.survey / (10 * 1024 * 128)
+    )  # it turns ten times a second
     for name, every in {"all points": 1, "every fifth point": 5}.items():
-        given = replace(drive, keep_every=every)
-        with tempfile.TemporaryDirectory(dir=here.folder) as folder:
+        kept_survey = replace(drive, keep_every=every)
+        with tempfile.TemporaryDirectory(dir=session.folder) as folder:
             start = time.perf_counter()
             result = simulate(
-                city(here.sizes.cities[-1]), given, backend="cuda", folder=Path(folder) / "run"
+                city(session.sizes.cities[-1]),
+                kept_survey,
+                backend="cuda",
+                folder=Path(folder) / "run",
             )
             wall = time.perf_counter() - start
             points = len(result.points)

@@ -10,7 +10,7 @@ Float = NDArray[np.float64]
 
 
 def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]:
-    """Two triangles for each cell of a grid of vertices."""
+    """Return two triangles for each cell of a grid of vertices."""
     i = np.arange(rows - 1)[:, None] * columns
     j = np.arange(columns if wrap else columns - 1)[None, :]
     k = (j + 1) % columns
@@ -19,7 +19,7 @@ def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Concatenate several meshes."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
     return (
         np.concatenate([vertices for vertices, _ in meshes]),
@@ -28,30 +28,27 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def six_objects() -> Mesh:
-    """Six surfaces of revolution, 80 by 80, as in the default survey."""
+    """Make six surfaces of revolution, 80 by 80, as in the default survey."""
     polar = np.linspace(0, np.pi, 80)[:, None]
-    around = np.arange(80) * 2 * np.pi / 80
+    azimuth = np.arange(80) * 2 * np.pi / 80
     radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
     height = np.broadcast_to(2 - 2 * np.cos(polar), (80, 80))
-    one = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1).reshape(-1, 3)
-    places = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    vertices = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1).reshape(
+        -1, 3
+    )
+    positions = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
     faces = grid_faces(80, 80, wrap=True)
-    return joined([(one + np.array([x, y, 0]), faces) for x, y in places])
+    return joined([(vertices + np.array([x, y, 0]), faces) for x, y in positions])
 
 
 def city(triangles: int, seed: int = 0) -> Mesh:
-    """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
+    """Make streets of panelled box buildings on flat ground, about `triangles` triangles."""
     rng = np.random.default_rng(seed)
     panels = 4
     pitch = 20.0
     # Odd: there is a crossing at (pitch / 2, pitch / 2), where sensors stand.
     side = 2 * round((np.sqrt(triangles / (5 * 2 * panels**2 + 2)) - 1) / 2) + 1
-    line = np.linspace(-1, 1, panels + 1)
-    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
-    one = np.ones_like(a)
-    sides = [(a, b, one), (a, one, b), (a, -one, b), (one, a, b), (-one, a, b)]
-    face = grid_faces(panels + 1, panels + 1)
-    box, faces = joined([(np.stack(points, axis=-1), face) for points in sides])
+    box, faces = panelled_box(panels)
     x, y = (c.ravel() for c in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     count = side * side
     middle = pitch * (np.stack([x, y], axis=-1) - (side - 1) / 2)
@@ -61,17 +58,32 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     vertices[..., :2] = middle[:, None] + box[:, :2] * half[:, None]
     vertices[..., 2] = (box[:, 2] + 1) / 2 * height[:, None]
     buildings = faces + len(box) * np.arange(count)[:, None, None]
-    edge = pitch * (np.arange(side + 1) - side / 2)
-    gx, gy = np.meshgrid(edge, edge, indexing="ij")
-    ground = np.stack([gx, gy, np.zeros_like(gx)], axis=-1).reshape(-1, 3)
     return joined([
         (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
-        (ground, grid_faces(side + 1, side + 1)),
+        flat_ground(side, pitch),
     ])  # fmt: skip
 
 
+def panelled_box(panels: int) -> Mesh:
+    """Make a box from -1 to 1 without a floor; each face has `panels` x `panels` squares."""
+    line = np.linspace(-1, 1, panels + 1)
+    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
+    unit = np.ones_like(a)
+    sides = [(a, b, unit), (a, unit, b), (a, -unit, b), (unit, a, b), (-unit, a, b)]
+    face = grid_faces(panels + 1, panels + 1)
+    return joined([(np.stack(points, axis=-1), face) for points in sides])
+
+
+def flat_ground(side: int, pitch: float) -> Mesh:
+    """Make a square of `side` x `side` cells at z = 0."""
+    edge = pitch * (np.arange(side + 1) - side / 2)
+    x, y = np.meshgrid(edge, edge, indexing="ij")
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    return vertices, grid_faces(side + 1, side + 1)
+
+
 def revolution(rays: int, layers: int = 128) -> Float:
-    """Return unit directions of one turn of a lidar with a field of view of 60 degrees."""
+    """Return unit directions of a lidar's revolution; the field of view is 60 degrees."""
     azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)
     elevation = np.radians(np.linspace(-30, 30, layers))
     level = np.cos(elevation)
@@ -80,7 +92,7 @@ def revolution(rays: int, layers: int = 128) -> Float:
 
 
 def beam_directions(beams: int, rays: int) -> Float:
-    """Make unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
+    """Return unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
     azimuth = np.linspace(0, 2 * np.pi, max(1, rays // beams), endpoint=False)[:, None]
     elevation = np.radians(np.linspace(-15, 45, beams))
     flat = np.cos(elevation)
@@ -90,7 +102,7 @@ def beam_directions(beams: int, rays: int) -> Float:
 
 
 def track(firings: int) -> tuple[Float, Float]:
-    """Positions (k, 3) and rotations (k, 3, 3) of a head that moves by 1 m and turns by 5 degrees.
+    """Return positions (k, 3) and rotations (k, 3, 3) of a head that moves 1 m and turns 5 degrees.
 
     It is tilted by 2 degrees, so that no rotation is about an axis.
     """

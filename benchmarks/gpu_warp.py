@@ -11,7 +11,7 @@ import warp
 
 from raybeam import RayCaster
 
-from .gpu_clock import Here, wall_milliseconds
+from .gpu_clock import Session, wall_milliseconds
 from .gpu_rays import MIDDLE, Rows, name_of, revolutions
 from .gpu_scenes import Float, city, revolution
 from .raycast_warp import first_hits
@@ -22,60 +22,63 @@ _BUILDERS = (("lbvh", None), ("cubql", None), ("sah", 2_000_000))
 _LEAF_SIZES = (1, 2, 4)
 
 
-def peers(here: Here, where: str = "cuda:0") -> Rows:
-    """Rates of Warp's ray query in the cities, with every way of building its tree."""
+def peers(session: Session, device: str = "cuda:0") -> Rows:
+    """Yield rates of Warp's ray query in the cities, by tree builder and leaf size."""
     warp.config.quiet = True
     warp.init()
-    once = revolution(here.sizes.rays)
+    once = revolution(session.sizes.rays)
     directions = {
         # As many rays at a time as our launches have.
-        "coherent": np.tile(once, (here.sizes.poses, 1)),
-        "shuffled": np.tile(np.random.default_rng(0).permutation(once), (here.sizes.poses, 1)),
+        "coherent": np.tile(once, (session.sizes.poses, 1)),
+        "shuffled": np.tile(np.random.default_rng(0).permutation(once), (session.sizes.poses, 1)),
     }
-    for count in here.sizes.cities:
+    for count in session.sizes.cities:
         vertices, faces = city(count)
-        points = warp.array(np.float32(vertices - MIDDLE), dtype=warp.vec3, device=where)
-        corners = warp.array(np.int32(faces).ravel(), dtype=warp.int32, device=where)
-        for builder, most in _BUILDERS:
-            if most is not None and len(faces) > most:
+        points = warp.array(np.float32(vertices - MIDDLE), dtype=warp.vec3, device=device)
+        corners = warp.array(np.int32(faces).ravel(), dtype=warp.int32, device=device)
+        for builder, max_faces in _BUILDERS:
+            if max_faces is not None and len(faces) > max_faces:
                 continue
             for size in _LEAF_SIZES:
                 start = time.perf_counter()
                 mesh = warp.Mesh(points, corners, bvh_constructor=builder, bvh_leaf_size=size)
-                warp.synchronize_device(where)
+                warp.synchronize_device(device)
                 row: dict[str, Any] = {"build_s": time.perf_counter() - start}
                 for name, rays in directions.items():
-                    row[name] = _cast(mesh, rays, where, here.sizes.seconds / 3)
+                    row[name] = _cast(mesh, rays, device, session.sizes.seconds / 3)
                 yield f"{name_of(count)}, {builder}, leaves of {size}", row
 
 
-def mujoco(here: Here, where: str = "cuda:0") -> Rows:
-    """Rates of MuJoCo-LiDAR's Warp backend and ours, from poses to distances on the host."""
-    vertices, faces = city(here.sizes.cities[0])
-    once = revolution(here.sizes.rays)
-    scan = revolutions(here, once)
+def mujoco(session: Session, device: str = "cuda:0") -> Rows:
+    """Yield rates of MuJoCo-LiDAR's Warp backend and of raybeam, from poses to host distances."""
+    vertices, faces = city(session.sizes.cities[0])
+    once = revolution(session.sizes.rays)
+    scan = revolutions(session, once)
     origins = scan.poses.positions
-    rays = np.tile(once, (here.sizes.poses, 1))
+    rays = np.tile(once, (session.sizes.poses, 1))
     job = {"vertices": vertices, "faces": faces, "origins": origins, "directions": rays}
-    theirs = mujoco_lidar_caster(job, "warp", where)
-    ours = RayCaster(vertices, faces, backend="cuda")
-    casts = {"MuJoCo-LiDAR": theirs, "raybeam": lambda: int(ours._engine.scan(scan).hits.sum())}
+    mujoco_cast = mujoco_lidar_caster(job, "warp", device)
+    caster = RayCaster(vertices, faces, backend="cuda")
+    casts = {
+        "MuJoCo-LiDAR": mujoco_cast,
+        "raybeam": lambda: int(caster._engine.scan(scan).hits.sum()),
+    }
     for name, cast in casts.items():
         hits = cast()
-        took = wall_milliseconds(here, cast)
+        took = wall_milliseconds(session, cast)
         yield name, {"hits": hits / len(rays), "grays_s": len(rays) / took["ms"] / 1e6, **took}
 
 
-def _cast(mesh: Any, directions: Float, where: str, seconds: float) -> dict[str, float]:
+def _cast(mesh: Any, directions: Float, device: str, seconds: float) -> dict[str, float]:
     n = len(directions)
-    rays = warp.array(np.float32(directions), dtype=warp.vec3, device=where)
-    distance = warp.empty(n, dtype=warp.float32, device=where)
-    face = warp.empty(n, dtype=warp.int32, device=where)
-    given = {"inputs": [mesh.id, warp.vec3(), rays, distance, face], "device": where}
+    rays = warp.array(np.float32(directions), dtype=warp.vec3, device=device)
+    distance = warp.empty(n, dtype=warp.float32, device=device)
+    face = warp.empty(n, dtype=warp.int32, device=device)
+    launch_options = {"inputs": [mesh.id, warp.vec3(), rays, distance, face], "device": device}
     times: list[float] = []
     end = None
     while end is None or len(times) < 3 or time.monotonic() < end:
-        took = _timed(lambda: warp.launch(first_hits, n, **given), where)
+        took = _timed(lambda: warp.launch(first_hits, n, **launch_options), device)
         if end is None:  # the first compiles
             end = time.monotonic() + seconds
         else:
@@ -84,14 +87,14 @@ def _cast(mesh: Any, directions: Float, where: str, seconds: float) -> dict[str,
     return {"ms": took, "grays_s": n / took / 1e6, "hits": int((face.numpy() >= 0).sum()) / n}
 
 
-def _timed(launch: Any, where: str) -> float:
-    """Milliseconds by events on a CUDA device, by the clock elsewhere."""
-    if not warp.get_device(where).is_cuda:
+def _timed(launch: Any, device: str) -> float:
+    """Time a launch, milliseconds: by events on a CUDA device, by the wall clock elsewhere."""
+    if not warp.get_device(device).is_cuda:
         began = time.perf_counter()
         launch()
         return 1e3 * (time.perf_counter() - began)
-    start, stop = (warp.Event(where, enable_timing=True) for _ in range(2))
-    stream = warp.get_stream(where)
+    start, stop = (warp.Event(device, enable_timing=True) for _ in range(2))
+    stream = warp.get_stream(device)
     stream.record_event(start)
     launch()
     stream.record_event(stop)

@@ -28,7 +28,7 @@ _PART = 250_000
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """A closed mesh, a point inside it, and how far that may be moved."""
+    """Closed mesh, a point inside the mesh, and a distance by which the point may be moved."""
 
     name: str
     vertices: NDArray[np.float64]
@@ -38,7 +38,7 @@ class Closed:
 
 
 def closed_meshes(triangles: int) -> Iterator[Closed]:
-    """Cube, sphere, the six objects of the default survey, a terrain box of so many triangles."""
+    """Yield a cube, a sphere, the default survey's six objects, and a box of terrain."""
     x = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     sides = np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
@@ -57,7 +57,7 @@ def closed_meshes(triangles: int) -> Iterator[Closed]:
 
 
 def terrain_box(triangles: int) -> Closed:
-    """Fractal ground under a lid of the same grid, with walls around."""
+    """Make fractal ground below a lid of the same grid, joined by walls."""
     ground = terrain(triangles // 2)
     points = np.array(ground.vertices)
     faces = np.array(ground.faces)
@@ -70,12 +70,26 @@ def terrain_box(triangles: int) -> Closed:
     a, b = edges[first[times == 1]].T  # the rim: edges of one triangle only
     walls = np.concatenate([np.stack([b, a, a + n], -1), np.stack([b, a + n, b + n], -1)])
     inside = np.array([0.0, 0.0, points[:, 2].max() + 20])
-    whole = np.concatenate([faces, faces[:, ::-1] + n, walls])
-    return Closed("terrain box", np.concatenate([points, lid]), whole, inside, 10.0)
+    all_faces = np.concatenate([faces, faces[:, ::-1] + n, walls])
+    return Closed("terrain box", np.concatenate([points, lid]), all_faces, inside, 10.0)
+
+
+def count_escaped(mesh: Closed, backend: str, count: int) -> dict[str, float]:
+    """Cast `count` rays from inside a closed mesh; return rays, escaped rays and seconds."""
+    start = time.perf_counter()
+    caster = RayCaster(mesh.vertices, mesh.faces, backend)
+    rng = np.random.default_rng(0)
+    cast = leaks = 0
+    while cast < count:
+        half = -(-min(_PART, count - cast) // 2)
+        arrays = mesh.vertices, mesh.faces
+        leaks += escaped(caster, arrays, mesh.inside, mesh.room, half, rng)
+        cast += 2 * half
+    return {"rays": cast, "escaped": leaks, "seconds": time.perf_counter() - start}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 1 when a ray escapes from an exact backend."""
+    """Run from the command line; return 1 if a ray escapes from an exact backend."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rays", type=int, default=10_000_000, help="for each backend, in all")
     parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
@@ -87,18 +101,12 @@ def main(arguments: list[str] | None = None) -> int:
     results: dict[str, dict[str, dict[str, float]]] = {name: {} for name in backends}
     for mesh in meshes:
         for name in backends:
-            start = time.perf_counter()
-            caster = RayCaster(mesh.vertices, mesh.faces, name)
-            rng = np.random.default_rng(0)
-            cast = leaks = 0
-            while cast < share:
-                half = -(-min(_PART, share - cast) // 2)
-                pair = mesh.vertices, mesh.faces
-                leaks += escaped(caster, pair, mesh.inside, mesh.room, half, rng)
-                cast += 2 * half
-            took = time.perf_counter() - start
-            results[name][mesh.name] = {"rays": cast, "escaped": leaks, "seconds": took}
-            print(f"{mesh.name:<12} {name:<7} {leaks:>7,} of {cast:,} escaped  ({took:.1f} s)")
+            row = count_escaped(mesh, name, share)
+            results[name][mesh.name] = row
+            print(
+                f"{mesh.name:<12} {name:<7} {row['escaped']:>7,} of {row['rays']:,} escaped  "
+                f"({row['seconds']:.1f} s)"
+            )
     for name in backends:
         rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
         print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")

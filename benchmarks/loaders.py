@@ -34,51 +34,51 @@ from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 
 POINTS = 30_000
-TURNS = 20
+REVOLUTIONS = 20
 JOBS = 6
 ROUNDS = 15
 
 
-def webdataset(place):
+def webdataset(folder):
     import webdataset as wds
 
-    yield from wds.WebDataset([*map(str, place.rglob("*.tar"))], shardshuffle=False).decode()
+    yield from wds.WebDataset([*map(str, folder.rglob("*.tar"))], shardshuffle=False).decode()
 
 
-def kitti(place):
+def kitti(root):
     import pykitti
 
-    for folder in (place / "sequences").iterdir():
-        drive = pykitti.odometry(str(place), folder.name)
+    for folder in (root / "sequences").iterdir():
+        drive = pykitti.odometry(str(root), folder.name)
         for number, points in enumerate(drive.velo):  # the labels as semantic-kitti-api reads them
             labels = np.fromfile(folder / f"labels/{number:06}.label", np.uint32)
             yield points, labels & 0xFFFF, labels >> 16, drive.poses[number]
 
 
-def nuscenes(place):
+def nuscenes(folder):
     from nuscenes.nuscenes import NuScenes
     from nuscenes.utils.data_classes import LidarPointCloud
 
-    tables = NuScenes("v1.0-lidarpool", str(place), verbose=False)
+    tables = NuScenes("v1.0-lidarpool", str(folder), verbose=False)
     for row in tables.sample_data:
         path, boxes, _ = tables.get_sample_data(row["token"])
         yield LidarPointCloud.from_file(path), boxes
 
 
-def parquet(place):
+def parquet(root):
     import pyarrow.dataset
 
-    for folder in (place / "points").iterdir():
+    for folder in (root / "points").iterdir():
         table = pyarrow.dataset.dataset(folder)
         scan = pyarrow.dataset.field("scan")
-        scans = np.load(place / f"sweeps/{int(folder.name[4:]):04}.npz")["scans"]
+        scans = np.load(root / f"sweeps/{int(folder.name[4:]):04}.npz")["scans"]
         for first, stop in pairwise(scans):
             rows = table.to_table(filter=(scan >= first) & (scan < stop), use_threads=False)
             yield {name: rows[name].to_numpy() for name in rows.column_names}
 
 
-def lidarpool(place, with_boxes):
-    for sweep in lp.sweeps(place):
+def lidarpool(folder, with_boxes):
+    for sweep in lp.sweeps(folder):
         yield sweep.points, sweep.columns, sweep.pose, with_boxes and sweep.boxes
 
 
@@ -86,17 +86,17 @@ WITH_BOXES = webdataset, nuscenes
 PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parquet: "pyarrow"}
 
 
-def write(place, name):
+def write(folder, name):
     """Write a data set of sweeps past a car."""
     track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
-    scans = TURNS * 36
+    scans = REVOLUTIONS * 36
     car = Actor(box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
     scene = lp.Scene.seed().with_actors((car,))
     survey = lp.Survey(lp.Sensor.grid(360, 4), trajectory=track, steps=scans)
     sweeps = Sweeps.from_survey(survey, scene)
     rng = np.random.default_rng(1)
-    count = TURNS * POINTS
-    data = DataSet(Storage.at(place), name)
+    count = REVOLUTIONS * POINTS
+    data = DataSet(Storage.at(folder), name)
     rows = np.arange(count)
     columns = {"scan": np.arange(count) * scans // count}
     columns |= {"ray": rows % 40, "channel": rows % 4, "class": rng.integers(0, 30, count)}
@@ -114,16 +114,19 @@ def main(*names):
         if (names and peer.__name__ not in names) or find_spec(package) is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            write(place := Path(folder), peer.__name__)
-            reads = partial(lidarpool, place, peer in WITH_BOXES), partial(peer, place)
+            write(data_folder := Path(folder), peer.__name__)
+            reads = partial(lidarpool, data_folder, peer in WITH_BOXES), partial(peer, data_folder)
             rates = np.empty((ROUNDS, 2))
-            for turn in np.ndindex(rates.shape):  # in turns: a busy machine slows down both
+            for index in np.ndindex(rates.shape):  # in turns: a busy machine slows down both
                 begin = time.process_time()
-                count = sum(1 for _ in reads[turn[1]]())
-                rates[turn] = count / (time.process_time() - begin)
-        ours, theirs = rates.max(axis=0)
+                count = sum(1 for _ in reads[index[1]]())
+                rates[index] = count / (time.process_time() - begin)
+        lidarpool_rate, peer_rate = rates.max(axis=0)
         ratio = np.median(rates[:, 0] / rates[:, 1])
-        print(f"{peer.__name__:>10} {ours:6.0f}/s {package:>11} {theirs:6.0f}/s {ratio:6.2f}")
+        print(
+            f"{peer.__name__:>10} {lidarpool_rate:6.0f}/s "
+            f"{package:>11} {peer_rate:6.0f}/s {ratio:6.2f}"
+        )
 
 
 if __name__ == "__main__":

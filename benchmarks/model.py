@@ -33,80 +33,97 @@ SECONDS = (0.05, 0.2, 1.0)  # of casting a batch
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds of processor time of each process: {name: (for a task, for each receipt in it)}.
+    """Processor time of each process, seconds: {name: (per task, per receipt of the task)}.
 
     Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
     """
 
-    each: dict[str, tuple[float, float]]
+    per_step: dict[str, tuple[float, float]]
     member: float
 
     def step(self, number: int, gpus: int, batches: int) -> float:
-        """Seconds of a step of a task with so many batches."""
+        """Return the time of a step of a task with `batches` batches, seconds."""
         name = STEPS[number]
-        task, receipt = self.each[name]
+        task, receipt = self.per_step[name]
         task += gpus * self.member if name == "scheduler" else 0
         seconds = task / STEPS.count(name) + (batches * receipt if number >= RECEIPT - 1 else 0)
         return seconds / (1 - HEARTBEATS) if name == "scheduler" else seconds
 
 
 def collectors_of(gpus: int) -> int:
-    """Give the number of collectors of so many GPU workers, as `benchmarks.scale` starts them."""
+    """Return the number of collectors that `benchmarks.scale` starts for `gpus` GPU workers."""
     return max(2, gpus // GPUS_EACH)
 
 
 def batches_a_second(
     gpus: int, seconds: float, costs: Costs, cores: int | None = None, shards: int = 1
 ) -> float:
-    """Batches of so many seconds that clusters with a scheduler each cast in a second, together.
+    """Return the rate of batches of `seconds` that `shards` clusters cast together, per second.
 
     Their processes share `cores`; None: each has its own.
     """
-    batches = batches_per_task([(seconds, 1)], gpus)
-    takes = [costs.step(number, gpus, batches) for number in range(len(STEPS))]
-    free: Counter[Any] = Counter()  # {process: when it is free}
-    idle = [0.0] * (cores or 0)  # when each core is free: a heap
-    slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
-    vary = Random(1).uniform
+    clusters = _Clusters(gpus, seconds, costs, cores, shards)
+    tasks_under_way = shards * max_under_way(gpus, collectors_of(gpus))
     number = count()
-    done = 0
-    most = shards * max_under_way(gpus, collectors_of(gpus))
-    begin = 0.0
-    events = [(0.0, next(number), n % shards, 0) for n in range(most)]
-    while done < ROUNDS * most:
-        now, _, shard, step = heapq.heappop(events)
+    finished_tasks = 0
+    start = 0.0
+    events = [(0.0, next(number), n % shards, 0) for n in range(tasks_under_way)]
+    while finished_tasks < ROUNDS * tasks_under_way:
+        ready_s, _, shard, step = heapq.heappop(events)
+        stop_s = clusters.run_step(ready_s, shard, step)
+        following = (step + 1) % len(STEPS)
+        finished_tasks += not following
+        if finished_tasks == tasks_under_way and not following:  # the first tasks start together
+            start = stop_s
+        heapq.heappush(events, (stop_s, next(number), shard, following))
+    return clusters.batches * (finished_tasks - tasks_under_way) / (stop_s - start)
+
+
+class _Clusters:
+    """Processes of all shards, and the time at which each process is free."""
+
+    def __init__(
+        self, gpus: int, seconds: float, costs: Costs, cores: int | None, shards: int
+    ) -> None:
+        self.batches = batches_per_task([(seconds, 1)], gpus)
+        self._casting_s = self.batches * seconds
+        self._step_s = [costs.step(number, gpus, self.batches) for number in range(len(STEPS))]
+        self._collectors = collectors_of(gpus)
+        self._free: Counter[Any] = Counter()  # {process: when the process is free}
+        self._cores = [0.0] * (cores or 0)  # when each core is free: a heap
+        self._slots = [[0.0] * gpus for _ in range(shards)]  # when each slot is free: heaps
+        self._vary = Random(1).uniform
+
+    def run_step(self, ready_s: float, shard: int, step: int) -> float:
+        """Run a step of a task that is ready at a time; return the time of its end, seconds."""
         process: Any = STEPS[step], shard
+        time_s = ready_s
         if process[0] == "casting":
-            now = max(now, heapq.heappop(slots[shard]))
+            time_s = max(time_s, heapq.heappop(self._slots[shard]))
         else:
             if process[0] == "collectors":
-                those = product([process], range(collectors_of(gpus)))
-                process = min(those, key=free.__getitem__)
-            now = max(now, free[process])
-        if cores:
-            now = max(now, heapq.heappop(idle))
-            heapq.heappush(idle, now + takes[step])
-        now += takes[step]
+                collectors = product([process], range(self._collectors))
+                process = min(collectors, key=self._free.__getitem__)
+            time_s = max(time_s, self._free[process])
+        if self._cores:
+            time_s = max(time_s, heapq.heappop(self._cores))
+            heapq.heappush(self._cores, time_s + self._step_s[step])
+        time_s += self._step_s[step]
         if process[0] == "casting":
-            now += batches * seconds * vary(1 - VARY, 1 + VARY)
-            heapq.heappush(slots[shard], now)
+            time_s += self._casting_s * self._vary(1 - VARY, 1 + VARY)
+            heapq.heappush(self._slots[shard], time_s)
         else:
-            free[process] = now
-        following = (step + 1) % len(STEPS)
-        done += not following
-        if done == most and not following:  # the first tasks all came at a time
-            begin = now
-        heapq.heappush(events, (now, next(number), shard, following))
-    return batches * (done - most) / (now - begin)
+            self._free[process] = time_s
+        return time_s
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
-    """Share of the time that the GPU workers cast."""
+    """Return the share of the time that the GPU workers cast."""
     return min(1.0, batches_a_second(gpus, seconds, costs) * seconds / gpus)
 
 
 def limit(gpus: int, seconds: float, costs: Costs) -> str:
-    """Name what is busiest: the process that the others wait for."""
+    """Return the name of the busiest process, for which the rest of the cluster waits."""
     batches = batches_per_task([(seconds, 1)], gpus)
     load: Counter[str] = Counter()
     for number, name in enumerate(STEPS):
@@ -116,16 +133,16 @@ def limit(gpus: int, seconds: float, costs: Costs) -> str:
     return load.most_common(1)[0][0]
 
 
-def schedulers(gpus: int, seconds: float, costs: Costs, least: float = 0.9) -> int:
-    """How many clusters, each with a scheduler and driver, keep all GPUs so busy."""
+def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -> int:
+    """Return the number of clusters that keep all GPUs busy for at least a share of the time."""
     shards = 1
-    while busy(-(-gpus // shards), seconds, costs) < least:
+    while busy(-(-gpus // shards), seconds, costs) < min_busy:
         shards += max(1, shards // 8)
     return shards
 
 
 def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
-    """Draw how busy the GPUs of one scheduler are, and what was read."""
+    """Draw how busy the GPUs of a scheduler are by the model, with measured runs as dots."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -133,9 +150,9 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
     for seconds, colour in zip(SECONDS, ("#e4752e", "#2a6fb0", "#3b8f5a"), strict=True):
         shares = [100 * busy(gpus, seconds, costs) for gpus in GPUS]
         axes.plot(GPUS, shares, color=colour, label=f"batches of {seconds:g} s")
-        there = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
-        places = [run["gpus"] for run in there], [100 * run["busy"] for run in there]
-        axes.plot(*places, "o", color=colour)
+        runs = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
+        points = [run["gpus"] for run in runs], [100 * run["busy"] for run in runs]
+        axes.plot(*points, "o", color=colour)
     axes.plot([], [], "o", color="0.4", label="read")
     axes.set(xscale="log", xlabel="GPU workers of one scheduler", ylim=(0, 105))
     axes.set_ylabel("time that they cast, %")
@@ -147,7 +164,7 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line."""
+    """Run from the command line; return rates, limits and shards by case."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     for name in dict.fromkeys(STEPS):
         words = "ms of it for a task, and for each receipt in it"
@@ -158,8 +175,8 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--cores", type=int, help="of the machine of those")
     parser.add_argument("--picture", type=Path, help="draw the busy share here")
     chosen = parser.parse_args(arguments)
-    each = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
-    costs = Costs(each, chosen.member / 1e6)
+    per_step = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
+    costs = Costs(per_step, chosen.member / 1e6)
     rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
     read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():

@@ -68,7 +68,7 @@ def left_turn(duration_s: float) -> Track:
 
 
 def survey_of(model: str, sweeps: int) -> Survey:
-    """Make the survey of a sensor on a car, with some sweeps."""
+    """Make the survey of a sensor on a car, with `sweeps` sweeps."""
     sensor = load_sensor(model)
     track = left_turn(sweeps * SWEEP_S + SWEEP_S)
     return Survey(
@@ -81,7 +81,7 @@ def survey_of(model: str, sweeps: int) -> Survey:
 
 
 def cloud_of(survey: Survey, scene: Scene) -> Cloud:
-    """Cast a survey in this process."""
+    """Cast a survey in this process; return its cloud."""
     rig = Rig(scene, survey, "embree")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
@@ -90,7 +90,7 @@ def cloud_of(survey: Survey, scene: Scene) -> Cloud:
 
 
 def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
-    """Return the points of each sweep in the sensor's axes at the end of the sweep, (n, 3) each."""
+    """Return the points of each sweep in the sensor frame at the end of the sweep, (n, 3) each."""
     sweeps = cloud.sweeps()
     points = []
     for number, sweep in enumerate(sweeps.points(cloud)):
@@ -101,7 +101,7 @@ def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
 
 
 def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
-    """Play a bag through KISS-ICP, and compare the points of its sweeps with the expected ones."""
+    """Play a bag through KISS-ICP; return the distances of its points from the expected points."""
     from kiss_icp.config.parser import load_config
     from kiss_icp.datasets.rosbag import RosbagDataset
     from kiss_icp.kiss_icp import KissICP
@@ -122,7 +122,7 @@ def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
 
 
 def measured(model: str, sweeps: int, triangles: int) -> dict[bool, Distances]:
-    """Simulate a drive, write the drive as a bag, and play it: {whether deskewed: distances}."""
+    """Simulate a drive, write its bag and play the bag: {whether deskewed: distances}."""
     survey = survey_of(model, sweeps)
     cloud = cloud_of(survey, city(triangles))
     expected = true_points(survey, cloud)
@@ -137,14 +137,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a toy size, for tests")
     parser.add_argument("--sweeps", type=int, default=64)
     parser.add_argument("--model", default="ouster/os1-64")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     if find_spec("kiss_icp") is None:
         print("This needs KISS-ICP: pip install kiss-icp.", file=sys.stderr)
         return 1
-    if given.quick:
-        given.sweeps = 14
-        given.model = "velodyne/vlp16"
-    results = measured(given.model, given.sweeps, 20_000 if given.quick else 200_000)
+    if options.quick:
+        options.sweeps = 14
+        options.model = "velodyne/vlp16"
+    results = measured(options.model, options.sweeps, 20_000 if options.quick else 200_000)
     print("| deskewing | median, m | 95 %, m |")
     print("|---|--:|--:|")
     for deskew, errors in results.items():

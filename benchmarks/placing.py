@@ -35,23 +35,23 @@ _numbers = itertools.count()
 
 
 class _Silence:
-    """Stands for the connection to a worker, which hears nothing."""
+    """Stand-in for the connection to a worker; drops all messages."""
 
     def send(self, *messages: Any) -> None:
         """Drop messages."""
 
     async def close(self) -> None:
-        """Do nothing."""
+        """Keep the connection open."""
 
     abort = close
 
     def closed(self) -> bool:
-        """Return True: nothing is left to close."""
+        """Return True, so that no connection is closed."""
         return True
 
 
 def add_workers(scheduler: Any, number: int) -> None:
-    """Add simulated workers of one thread; every second one declares the partition."""
+    """Add simulated workers of one thread; every second worker declares the partition."""
     for index in range(number):
         address = f"tcp://10.{index >> 16}.{index >> 8 & 255}.{index & 255}:1"
         worker = WorkerState(
@@ -76,7 +76,7 @@ def add_workers(scheduler: Any, number: int) -> None:
 
 
 class Tasks:
-    """Places and ends tasks of a partition, or of others."""
+    """Tasks of a partition, or without a partition, that are placed and ended by hand."""
 
     def __init__(self, scheduler: Any, partition: bool) -> None:
         self.scheduler = scheduler
@@ -84,8 +84,8 @@ class Tasks:
         self.name = f"tasks{next(_numbers)}"
         self.count = 0
 
-    def place(self, number: int) -> tuple[list[Any], float]:
-        """Place tasks; returns their states and the seconds that it took."""
+    def assign(self, number: int) -> tuple[list[Any], float]:
+        """Place tasks; return their states and the elapsed seconds."""
         states = []
         for _ in range(number):
             self.count += 1
@@ -104,7 +104,7 @@ class Tasks:
         return states, seconds
 
     def end(self, states: list[Any]) -> None:
-        """End tasks, and forget them."""
+        """End tasks, and remove them from the scheduler."""
         for state in states:
             self.scheduler.transition(
                 state.key, "memory", "benchmark", worker=state.processing_on.address,
@@ -114,25 +114,25 @@ class Tasks:
 
 
 def cost_us(scheduler: Any, partition: bool, number: int) -> float:
-    """Microseconds to place a task, the best of three rounds."""
+    """Return the microseconds to place a task, the minimum of three rounds."""
     tasks = Tasks(scheduler, partition)
     rounds = []
     for _ in range(3):
-        states, seconds = tasks.place(number)
+        states, seconds = tasks.assign(number)
         tasks.end(states)
         rounds.append(seconds / number * 1e6)
     return min(rounds)
 
 
 class Flow(NamedTuple):
-    """How tasks of random durations flow through a cluster."""
+    """Flow of tasks of random durations through a cluster."""
 
     mean_end: float  # when a task ends on average, in mean durations
     longest_queue: int  # tasks that one worker had at a time
 
 
 def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
-    """Simulate tasks: three for two workers are placed at once, another whenever one ends."""
+    """Simulate tasks: three per two workers are placed at once, then a new task per ended task."""
     workers = len(scheduler.workers) // 2
     rng = random.Random(7)
     durations = [rng.expovariate(1.0) for _ in range(workers * tasks_per_worker)]
@@ -140,37 +140,37 @@ def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
     queues: dict[Any, deque[Any]] = defaultdict(deque)  # {worker: states of its tasks}
     events: list[tuple[float, int, Any]] = []  # heap: end, number of the task, worker
     numbers: dict[Any, int] = {}  # {state of a task: its number}
-    ends: list[float] = []
+    end_times: list[float] = []
     longest_queue = 0
 
-    def start_next(worker: Any, now: float) -> None:
+    def start_next(worker: Any, time_s: float) -> None:
         if queues[worker]:
             number = numbers[queues[worker][0]]
-            heapq.heappush(events, (now + durations[number], number, worker))
+            heapq.heappush(events, (time_s + durations[number], number, worker))
 
-    def add(count: int, now: float) -> None:
+    def add(count: int, time_s: float) -> None:
         nonlocal longest_queue
-        states, _ = tasks.place(min(count, len(durations) - len(numbers)))
+        states, _ = tasks.assign(min(count, len(durations) - len(numbers)))
         for state in states:
             numbers[state] = len(numbers)
             queue = queues[state.processing_on]
             queue.append(state)
             longest_queue = max(longest_queue, len(queue))
             if len(queue) == 1:
-                start_next(state.processing_on, now)
+                start_next(state.processing_on, time_s)
 
     add(workers * 3 // 2, 0.0)
     while events:
-        now, _, worker = heapq.heappop(events)
-        ends.append(now)
+        event_time, _, worker = heapq.heappop(events)
+        end_times.append(event_time)
         tasks.end([queues[worker].popleft()])
-        start_next(worker, now)
-        add(1, now)
-    return Flow(sum(ends) / len(ends), longest_queue)
+        start_next(worker, event_time)
+        add(1, event_time)
+    return Flow(sum(end_times) / len(end_times), longest_queue)
 
 
 async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, Any]:
-    """Measure one size of cluster, with poolpart's rule and without."""
+    """Measure a size of cluster, with poolpart's rule and without."""
     figures: dict[str, Any] = {"workers": number}
     for label in ("dask", "poolpart"):
         async with Scheduler(port=0, host="127.0.0.1", dashboard=False) as scheduler:

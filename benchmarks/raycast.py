@@ -27,7 +27,7 @@ from .raycast_peers import ENGINES
 from .raycast_scenes import Job, jobs
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
-_MOMENT_S = 0.15  # an engine's turn takes about that long at least
+_CALLS_S = 0.15  # an engine's turn takes about that long at least
 _VERSIONS = (
     "numpy",
     "open3d-cpu",
@@ -40,8 +40,8 @@ _VERSIONS = (
 )
 
 
-def timed(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, int]:
-    """Seconds of one call, as a mean over some, and what it returned."""
+def time_call(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, int]:
+    """Return the mean time of a call, seconds, and the number of hits."""
     start = clock()
     for _ in range(repeats):
         hits = cast()
@@ -49,27 +49,27 @@ def timed(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, 
 
 
 def measure(
-    job: Job, engines: list[Engine], rounds: int, moment: float, clock: Callable[[], float]
+    job: Job, engines: list[Engine], rounds: int, calls_s: float, clock: Callable[[], float]
 ) -> dict[str, Any]:
-    """Rates of all engines on one job."""
+    """Measure the rates of all engines on a job."""
     ready: list[tuple[Engine, Cast, int]] = []
     builds = {}
     for engine in engines:
         start = clock()
         cast = engine.prepare(job)
         builds[engine.name] = clock() - start
-        timed(cast, 1, clock)
-        once, _ = timed(cast, 1, clock)
-        ready.append((engine, cast, max(1, int(moment / max(once, 1e-6)))))
+        time_call(cast, 1, clock)
+        call_s, _ = time_call(cast, 1, clock)
+        ready.append((engine, cast, max(1, int(calls_s / max(call_s, 1e-6)))))
     rates: dict[str, list[float]] = {engine.name: [] for engine in engines}
     hits = {}
-    for turn in range(rounds):
+    for round_number in range(rounds):
         # Whoever is first finds the caches as the last one left them: not always the same two.
-        shift = turn % len(ready)
+        shift = round_number % len(ready)
         for engine, cast, repeats in ready[shift:] + ready[:shift]:
-            seconds, found = timed(cast, repeats, clock)
+            seconds, hit_count = time_call(cast, repeats, clock)
             rates[engine.name].append(engine.rays(job) / max(seconds, 1e-9) / 1e6)
-            hits[engine.name] = found / engine.rays(job)
+            hits[engine.name] = hit_count / engine.rays(job)
     return {
         "scene": job.name,
         "triangles": len(job.faces),
@@ -77,7 +77,7 @@ def measure(
         "rays": job.rays,
         "engines": {
             engine.name: {
-                "ours": engine.ours,
+                "ours": engine.is_raybeam,
                 "peer": engine.peer,
                 "mrays_s": rates[engine.name],
                 "hit_share": hits[engine.name],
@@ -89,19 +89,19 @@ def measure(
 
 
 def best_peer(row: dict[str, Any]) -> str | None:
-    """Name of the peer with the highest median rate, on the device or not."""
+    """Return the name of the peer with the highest median rate, or None without peers."""
     peers = {k: np.median(v["mrays_s"]) for k, v in row["engines"].items() if v["peer"]}
     return max(peers, key=lambda name: peers[name]) if peers else None
 
 
-def ratio(row: dict[str, Any], one: str, other: str) -> float:
-    """Median over the rounds of how many times faster one engine was than another."""
-    rates = [np.array(row["engines"][name]["mrays_s"]) for name in (one, other)]
+def ratio(row: dict[str, Any], engine: str, base: str) -> float:
+    """Return the median over the rounds of the rate of an engine over the rate of `base`."""
+    rates = [np.array(row["engines"][name]["mrays_s"]) for name in (engine, base)]
     return float(np.median(rates[0] / rates[1]))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print one job's rates."""
+    """Print the rates of a job."""
     print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
     peer = best_peer(row)
     for name, entry in row["engines"].items():
@@ -118,22 +118,22 @@ def show(row: dict[str, Any]) -> None:
 
 
 def findings(row: dict[str, Any]) -> list[str]:
-    """Say what the targets are about."""
-    has = row["engines"]
-    out = []
-    if "Open3D, bare" in has and "embree" in has:
-        out.append(f"embree is {ratio(row, 'embree', 'Open3D, bare'):.2f} x bare Open3D")
-    if "brute force, NumPy" in has and "numpy" in has:
-        out.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
-    return out
+    """Return sentences about the ratios that have targets."""
+    engines = row["engines"]
+    sentences = []
+    if "Open3D, bare" in engines and "embree" in engines:
+        sentences.append(f"embree is {ratio(row, 'embree', 'Open3D, bare'):.2f} x bare Open3D")
+    if "brute force, NumPy" in engines and "numpy" in engines:
+        sentences.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
+    return sentences
 
 
 def environment(threads: int, clock: str) -> dict[str, Any]:
-    """Where and with what it was measured."""
-    found = {}
+    """Return the machine, versions and settings of a measurement."""
+    versions = {}
     for name in _VERSIONS:
         try:
-            found[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
     return {
@@ -145,7 +145,7 @@ def environment(threads: int, clock: str) -> dict[str, Any]:
         "threads": threads,
         "clock": clock,
         "python": platform.python_version(),
-        "versions": found,
+        "versions": versions,
     }
 
 
@@ -179,7 +179,11 @@ def main(arguments: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"there is no scene {', '.join(unknown)}: {', '.join(makers)}")
     engines = []
-    for engine in (made(chosen.threads) for made in ENGINES if made.name not in chosen.without):
+    for engine in (
+        engine_class(chosen.threads)
+        for engine_class in ENGINES
+        if engine_class.name not in chosen.without
+    ):
         reason = engine.missing()
         if reason:
             print(f"{engine.name} is left out: {reason}")
@@ -190,8 +194,8 @@ def main(arguments: list[str] | None = None) -> int:
         if not chosen.scene or name in chosen.scene:
             job = make()
             for order in (job, job.shuffled()):
-                rounds, moment = (2, 0.0) if quick else (chosen.rounds, _MOMENT_S)
-                results.append(measure(order, engines, rounds, moment, CLOCKS[chosen.clock]))
+                rounds, calls_s = (2, 0.0) if quick else (chosen.rounds, _CALLS_S)
+                results.append(measure(order, engines, rounds, calls_s, CLOCKS[chosen.clock]))
                 show(results[-1])
     if chosen.json:
         report = {"environment": environment(chosen.threads, chosen.clock), "jobs": results}

@@ -23,10 +23,10 @@ Cast = Callable[[], int]
 
 
 class Engine(ABC):
-    """One way to cast rays."""
+    """Engine that casts rays."""
 
     name: ClassVar[str]
-    ours: ClassVar[bool] = False
+    is_raybeam: ClassVar[bool] = False
     # Brute force is not what anybody would use instead; it is there to be divided by.
     peer: ClassVar[bool] = True
 
@@ -35,29 +35,29 @@ class Engine(ABC):
 
     @abstractmethod
     def missing(self) -> str:
-        """Why it cannot take part; "" when it can."""
+        """Return the reason why the engine is not available, or an empty string."""
 
     @abstractmethod
     def prepare(self, job: Job) -> Cast:
-        """Build what it needs once for a mesh."""
+        """Build the engine's tree; return a function that casts the job's rays and counts hits."""
 
     def rays(self, job: Job) -> int:
-        """How many of the job's rays it casts in one call."""
+        """Return the number of rays that a call casts."""
         return job.rays
 
 
-class _Ours(Engine):
-    """Poses in, hits out: makes the rays, casts them and gathers the hits."""
+class _RaybeamEngine(Engine):
+    """Backend of raybeam, from poses to hits: makes the rays, casts them and gathers hits."""
 
-    ours = True
+    is_raybeam = True
     peer = False
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return why the backend is not available, or an empty string."""
         return available_backends()[self.name]
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build a `RayCaster`; return a function that scans from all origins."""
         caster = RayCaster(job.vertices, job.faces, self.name, threads=self.threads)
         pattern = Pattern(job.directions)
         return lambda: sum(
@@ -65,57 +65,57 @@ class _Ours(Engine):
         )
 
 
-class Numpy(_Ours):
-    """The numpy backend."""
+class Numpy(_RaybeamEngine):
+    """Backend `numpy`."""
 
     name = "numpy"
 
 
-class Embree(_Ours):
-    """The embree backend."""
+class Embree(_RaybeamEngine):
+    """Backend `embree`."""
 
     name = "embree"
 
 
-class Cuda(_Ours):
-    """The cuda backend, hits copied to the host."""
+class Cuda(_RaybeamEngine):
+    """Backend `cuda`, with hits copied to the host."""
 
     name = "cuda"
 
 
 class BruteForce(Engine):
-    """Every ray against every triangle in NumPy, on as many rays as a moment allows."""
+    """Brute force in NumPy: a subset of the rays against all triangles."""
 
     name = "brute force, NumPy"
     peer = False
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return an empty string: NumPy is installed."""
         return ""
 
     def rays(self, job: Job) -> int:
-        """See `Engine.rays`."""
+        """Return the size of the subset that a moment allows."""
         return min(len(job.directions), max(4, 4_000_000 // len(job.faces)))
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Compute edges and products of the origin; return a function that casts the subset."""
         first, second, third = (job.vertices[job.faces[:, k]] for k in range(3))
-        edge = second - first
-        other = third - first
+        first_edge = second - first
+        second_edge = third - first
         step = len(job.directions) // self.rays(job)
-        some = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
-        away = job.origins[0] - first
-        q = np.cross(away, edge)
-        height = (other * q).sum(axis=1)
+        directions = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
+        from_corner = job.origins[0] - first
+        q = np.cross(from_corner, first_edge)
+        height = (second_edge * q).sum(axis=1)
 
-        def one(direction: Float) -> bool:
+        def is_hit(direction: Float) -> bool:
             # Moeller and Trumbore (1997); what depends on the origin only is worked out before.
-            p = np.cross(direction, other)
+            p = np.cross(direction, second_edge)
             with np.errstate(divide="ignore", invalid="ignore"):
-                inverse = 1 / (edge * p).sum(axis=1)
-                u = (away * p).sum(axis=1) * inverse
+                inverse = 1 / (first_edge * p).sum(axis=1)
+                u = (from_corner * p).sum(axis=1) * inverse
                 v = (q @ direction) * inverse
                 t = height * inverse
             return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any())
 
-        return lambda: sum(map(one, some))
+        return lambda: sum(map(is_hit, directions))

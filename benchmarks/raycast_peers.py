@@ -17,17 +17,17 @@ _MISS = 0xFFFFFFFF
 
 
 class Open3D(Engine):
-    """A bare loop over `RaycastingScene.cast_rays` with rays that were made before."""
+    """Bare loop over `RaycastingScene.cast_rays` with prepared rays."""
 
     name = "Open3D, bare"
     chunk = 1 << 17
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Open3D, or an empty string."""
         return "" if importlib.util.find_spec("open3d") else "pip install open3d-cpu"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Open3D's scene and the chunks of rays; return a function that casts the chunks."""
         import open3d
 
         scene = _open3d_scene(job, self.threads)
@@ -47,18 +47,18 @@ class Open3D(Engine):
         return cast
 
 
-class Open3DWhole(Open3D):
-    """The same, rays made and hits gathered in NumPy as one would write it down."""
+class Open3DWithNumpy(Open3D):
+    """Open3D with rays made and hits gathered in NumPy, as a script would do."""
 
     name = "Open3D + NumPy"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Open3D's scene; return a function that makes rays, casts and gathers hits."""
         import open3d
 
         scene = _open3d_scene(job, self.threads)
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             directions = job.directions @ job.rotation.T
             rays = np.hstack([np.tile(origin, (len(directions), 1)), directions])
             tensor = open3d.core.Tensor(rays.astype(np.float32))
@@ -69,50 +69,50 @@ class Open3DWhole(Open3D):
             points = origin + t[hit, None] * directions[hit]
             return len(points) if len(triangle[hit]) == len(points) else -1
 
-        return lambda: sum(one(origin) for origin in job.origins)
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
 
 class Trimesh(Engine):
-    """The fastest query of trimesh with embreex: poses in, triangles out, no distances."""
+    """Fastest query of trimesh with embreex: from poses to triangles, without distances."""
 
     name = "trimesh + embreex"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install embreex, or an empty string."""
         return "" if importlib.util.find_spec("embreex") else "pip install embreex"
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build the intersector; return a function that queries from all origins."""
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
         scene = RayMeshIntersector(trimesh.Trimesh(job.vertices, job.faces, process=False))
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             directions = job.directions @ job.rotation.T
             return self.hits(scene, np.tile(origin, (len(directions), 1)), directions)
 
-        one(job.origins[0])  # builds the tree
-        return lambda: sum(one(origin) for origin in job.origins)
+        count_hits(job.origins[0])  # builds the tree
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
     def hits(self, scene: Any, origins: Float, directions: Float) -> int:
-        """Ask for the triangles that are hit."""
+        """Return the number of rays that hit a triangle."""
         return int((scene.intersects_first(origins, directions) >= 0).sum())
 
 
 class TrimeshPoints(Trimesh):
-    """The query that answers what our backends do: where which ray hits which triangle."""
+    """Query of trimesh with the results of our backends: points, rays and triangles."""
 
     name = "trimesh, points"
 
     def hits(self, scene: Any, origins: Float, directions: Float) -> int:
-        """Ask for points, rays and triangles."""
+        """Return the number of hit points."""
         points, _, _ = scene.intersects_location(origins, directions, multiple_hits=False)
         return len(points)
 
 
 class Warp(Engine):
-    """Warp's mesh_query_ray, rays that were made before, answers on the host."""
+    """Warp's mesh_query_ray with prepared rays and results on the host."""
 
     name = "Warp CPU"
     device: ClassVar[str] = "cpu"
@@ -120,13 +120,13 @@ class Warp(Engine):
     builder: ClassVar[str] = "sah"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Warp, or an empty string."""
         if not importlib.util.find_spec("warp"):
             return "pip install warp-lang"
         return ""
 
     def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
+        """Build Warp's mesh and arrays; return a function that launches a kernel per origin."""
         import warp
 
         from .raycast_warp import first_hits
@@ -136,28 +136,28 @@ class Warp(Engine):
             indices=warp.array(job.faces.reshape(-1), dtype=int, device=self.device),
             bvh_constructor=self.builder,
         )
-        turned = (job.directions @ job.rotation.T).astype(np.float32)
-        directions = warp.array(turned, dtype=warp.vec3, device=self.device)
-        n = len(turned)
+        turned_directions = (job.directions @ job.rotation.T).astype(np.float32)
+        directions = warp.array(turned_directions, dtype=warp.vec3, device=self.device)
+        n = len(turned_directions)
         t = warp.empty(n, dtype=float, device=self.device)
         face = warp.empty(n, dtype=int, device=self.device)
 
-        def one(origin: Float) -> int:
+        def count_hits(origin: Float) -> int:
             inputs = [mesh.id, warp.vec3(*origin.tolist()), directions, t, face]
             warp.launch(first_hits, dim=n, inputs=inputs, device=self.device)
             return int((face.numpy() >= 0).sum()) if len(t.numpy()) == n else -1
 
-        return lambda: sum(one(origin) for origin in job.origins)
+        return lambda: sum(count_hits(origin) for origin in job.origins)
 
 
 class WarpCuda(Warp):
-    """The same on the device."""
+    """Warp's mesh_query_ray on a CUDA device."""
 
     name = "Warp CUDA"
     device = "cuda:0"
 
     def missing(self) -> str:
-        """See `Engine.missing`."""
+        """Return how to install Warp, or that a CUDA device is missing, or an empty string."""
         import_error = super().missing()
         if import_error:
             return import_error
@@ -178,7 +178,7 @@ def _open3d_scene(job: Job, threads: int) -> Any:
 
 
 def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
-    """Rays (n, 6) of all origins, made before they are cast."""
+    """Return the rays (n, 6) of all origins, in chunks."""
     directions = job.directions @ job.rotation.T
     chunks = []
     for origin in origins:
@@ -191,5 +191,5 @@ def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
 
 ENGINES: tuple[type[Engine], ...] = (
     Cuda, Embree, Numpy,
-    Open3D, Open3DWhole, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
+    Open3D, Open3DWithNumpy, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
 )  # fmt: skip

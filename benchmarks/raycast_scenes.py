@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A mesh and the rays to cast at it.
+    """Mesh and rays to cast at the mesh.
 
     Attributes
     ----------
@@ -52,13 +52,13 @@ class Job:
         return len(self.origins) * len(self.directions)
 
     def shuffled(self) -> Job:
-        """Return the same rays in no order."""
+        """Return the job with the same rays in random order."""
         directions = np.random.default_rng(0).permutation(self.directions)
         return replace(self, directions=directions, order="shuffled")
 
 
-def _turned(degrees: float) -> Float:
-    """Rotation of a sensor that is not set up level: about z, then a little about x."""
+def _tilted_rotation(degrees: float) -> Float:
+    """Return the rotation of a tilted sensor: about z, then by two degrees about x."""
     a = np.radians(degrees)
     b = np.radians(2.0)
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
@@ -67,56 +67,58 @@ def _turned(degrees: float) -> Float:
 
 
 def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
-    """Make a job of one turn of a sensor."""
+    """Make a job of a sensor's revolution."""
     return Job(
         name,
         np.array(scene.vertices),
         np.array(scene.faces),
         np.atleast_2d(np.asarray(origins, dtype=np.float64)),
         sensor.directions(np.arange(sensor.period)).reshape(-1, 3),
-        _turned(17.0),
+        _tilted_rotation(17.0),
     )
 
 
 def _lidar(rays: int) -> Sensor:
-    """Make a sensor of 128 rings and 45 degrees, with so many rays in a turn."""
+    """Make a sensor of 128 rings and 45 degrees, with about `rays` rays per revolution."""
     return Sensor.grid(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
 
 
 def survey_job(rays: int) -> Job:
-    """Make the default survey: its scene, its sensor, its three poses."""
+    """Make a job of the default survey: its scene, its sensor, its three poses."""
     survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     origins = np.array([pose.position for pose in survey.poses])
-    turn = max(36, min(survey.sensor.period or 0, rays // 120))
-    sensor = replace(survey.sensor, head=replace(survey.sensor.head, firings_per_turn=turn))
+    firings_per_revolution = max(36, min(survey.sensor.period or 0, rays // 120))
+    sensor = replace(
+        survey.sensor, head=replace(survey.sensor.head, firings_per_turn=firings_per_revolution)
+    )
     return _job("default survey", Scene.seed(), origins, sensor)
 
 
 def city_job(triangles: int, rays: int) -> Job:
-    """Make a city, the sensor on the crossing in its middle."""
+    """Make a city, with the sensor on the central crossing."""
     return _job(
         f"city {triangles:.0e}".replace("e+0", "e"), city(triangles), [0, 0, 2], _lidar(rays)
     )
 
 
 def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
-    """Make a city, the sensor at places in streets, or in buildings, where all rays hit."""
+    """Make a city, with the sensor in streets, or in buildings where all rays hit."""
     scene = city(triangles)
     sensor = _lidar(rays)
-    low, high = scene.bounds
+    lower_m, upper_m = scene.bounds
     random = np.random.default_rng(0)
-    places = np.full((24, 3), low[2] + 2)
-    places[:, :2] = low[:2] + (high - low)[:2] * random.uniform(0.3, 0.7, (24, 2))
+    positions = np.full((24, 3), lower_m[2] + 2)
+    positions[:, :2] = lower_m[:2] + (upper_m - lower_m)[:2] * random.uniform(0.3, 0.7, (24, 2))
     caster = RayCaster(scene.vertices, scene.faces)
-    few = sensor.directions(np.arange(36)).reshape(-1, 3)
-    share = np.array([caster.cast(place, few).hit.mean() for place in places])
-    chosen = places[(share > 0.97) == inside][:4]
+    directions = sensor.directions(np.arange(36)).reshape(-1, 3)
+    share = np.array([caster.cast(position, directions).hit.mean() for position in positions])
+    chosen = positions[(share > 0.97) == inside][:4]
     name = f"{'inside' if inside else 'street'} {triangles:.0e}".replace("e+0", "e")
     return _job(name, scene, chosen, sensor)
 
 
 def terrain_job(triangles: int, rays: int) -> Job:
-    """Make a terrain, the sensor 30 m above its middle."""
+    """Make a terrain, with the sensor 30 m above its middle."""
     scene = terrain(triangles)
     down = RayCaster(scene.vertices, scene.faces, "numpy").cast([0.1, 0.2, 1e4], [[0, 0, -1]])
     height = 1e4 - float(down.distance[0]) + 30
@@ -126,17 +128,17 @@ def terrain_job(triangles: int, rays: int) -> Job:
 
 
 def mesh_job(path: Path, rays: int) -> Job:
-    """Read a mesh file, the sensor 1.5 m above the lowest point in its middle."""
+    """Read a mesh file; the sensor is in its middle, 1.5 m above the lowest point."""
     scene = Scene.load(path)
-    low, high = scene.bounds
-    middle = (low + high) / 2
-    return _job(path.stem, scene, [*middle[:2], low[2] + 1.5], _lidar(rays))
+    lower_m, upper_m = scene.bounds
+    middle = (lower_m + upper_m) / 2
+    return _job(path.stem, scene, [*middle[:2], lower_m[2] + 1.5], _lidar(rays))
 
 
 def jobs(
     rays: int, meshes: list[Path], quick: bool, large: bool = False
 ) -> dict[str, Callable[[], Job]]:
-    """Makers of jobs by the name that --scene takes.
+    """Return functions that make jobs, by the name that --scene takes.
 
     Parameters
     ----------
@@ -153,14 +155,16 @@ def jobs(
     if large:
         cities.append(10_000_000)
     hills = 2_000 if quick else 2_000_000
-    out: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
+    makers: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
     for triangles in cities:
         name = f"city-{triangles:.0e}".replace("e+0", "e")
-        out[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
-    for place in ("street", "inside"):
-        most = max(cities[0], 20_000)  # smaller ones have no rooms
-        out[place] = partial(positions_job, most, rays, inside=place == "inside")
-    out[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
+        makers[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
+    for where_positions in ("street", "inside"):
+        city_triangles = max(cities[0], 20_000)  # smaller ones have no rooms
+        makers[where_positions] = partial(
+            positions_job, city_triangles, rays, inside=where_positions == "inside"
+        )
+    makers[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
     for path in meshes:
-        out[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
-    return out
+        makers[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
+    return makers

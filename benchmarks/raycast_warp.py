@@ -13,7 +13,7 @@ def first_hits(
     t: wp.array(dtype=float),  # type: ignore[valid-type]
     face: wp.array(dtype=int),  # type: ignore[valid-type]
 ):
-    """Distance and triangle of the closest hit of each ray; triangle -1 for a miss."""
+    """Write distance and triangle of the closest hit of each ray; triangle -1 for a miss."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, origin, directions[i], 1.0e6)
     if query.result:

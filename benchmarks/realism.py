@@ -41,13 +41,13 @@ from raybeam import available_backends
 
 from .raycast import environment
 
-PLACE = (0.0, 0.0, 1.9)
+POSITION = (0.0, 0.0, 1.9)
 SPEED_M_S = 20.0
-TURN_S = 0.1
+REVOLUTION_S = 0.1
 FIELD_M = (5.0, 60.0)
 COLUMNS = ("time", "range", "intensity", "class", "sensor")
 COUNTS = (10, 100, 300)
-SURVEY: dict[str, Any] = {"poses": [PLACE], "steps": 5 * 36, "columns": COLUMNS}
+SURVEY: dict[str, Any] = {"poses": [POSITION], "steps": 5 * 36, "columns": COLUMNS}
 FAULTS = (
     Fault("dirt", azimuth_deg=(-20, 20), transmission=0.3),
     Fault("dead_channels", channels=[3]),
@@ -60,14 +60,15 @@ PEOPLE_M = (4.0, 30.0)
 
 
 def fine_box(triangles: int) -> SceneMesh:
-    """Make the box of a car of so many triangles, at least."""
+    """Make the box of a car with at least `triangles` triangles."""
     mesh = box("Car", (4.5, 1.8, 1.5))
     vertices = mesh.vertices
     faces = mesh.faces
     while len(faces) < triangles:  # each in four
         corners = vertices[faces]
         middles = (corners + np.roll(corners, -1, axis=1)) / 2
-        (a, b, c), (p, q, r) = corners.transpose(1, 0, 2), middles.transpose(1, 0, 2)
+        a, b, c = corners.transpose(1, 0, 2)
+        p, q, r = middles.transpose(1, 0, 2)
         corners = np.stack([a, p, r, p, b, q, r, q, c, p, q, r], axis=1).reshape(-1, 3)
         vertices = corners
         faces = np.arange(len(corners)).reshape(-1, 3)
@@ -75,25 +76,25 @@ def fine_box(triangles: int) -> SceneMesh:
 
 
 def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
-    """Make cars around the sensor, at 10 m/s, some of which turn."""
+    """Make cars around the sensor, at 10 m/s, with random changes of heading."""
     random = np.random.default_rng(seed)
     angle, heading = random.uniform(0, 2 * np.pi, (2, count))
     radius = random.uniform(*FIELD_M, count)
-    turns = random.uniform(-0.5, 0.5, count)
-    made = []
+    yaw_changes = random.uniform(-0.5, 0.5, count)
+    actors = []
     for k in range(count):
         begin = radius[k] * np.array([np.cos(angle[k]), np.sin(angle[k]), 0])
         ahead = 10 * np.array([np.cos(heading[k]), np.sin(heading[k]), 0])
-        yaw = heading[k] + turns[k] * np.array([0, 1, 1])
+        yaw = heading[k] + yaw_changes[k] * np.array([0, 1, 1])
         quaternions = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
-        made.append(
+        actors.append(
             Actor(mesh, Track([0, 1, 10], [begin, begin + ahead, begin + 10 * ahead], quaternions))
         )
-    return made
+    return actors
 
 
 def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
-    """Make copies of one person around the sensor, at 1.4 m/s, each in another phase."""
+    """Make copies of a person around the sensor, at 1.4 m/s, in different phases."""
     mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4) if walking else None)
@@ -102,20 +103,23 @@ def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
     begin = random.uniform(*PEOPLE_M, count) * [np.cos(angle), np.sin(angle), 0 * angle]
     ahead = 1.4 * np.array([np.cos(heading), np.sin(heading), 0 * heading])
     offsets = random.uniform(0, 1, count).tolist()
-    ways = [Track([0, 1], [a, a + b]) for a, b in zip(begin.T, ahead.T, strict=True)]
-    return [Actor(mesh, way, offset) for way, offset in zip(ways, offsets, strict=True)]
+    trajectories = [Track([0, 1], [a, a + b]) for a, b in zip(begin.T, ahead.T, strict=True)]
+    return [
+        Actor(mesh, trajectory, offset)
+        for trajectory, offset in zip(trajectories, offsets, strict=True)
+    ]
 
 
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
-    """Make a function of the round for each row, which gives its sweep."""
+    """Make a function of the round for each row; each function returns a sweep."""
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
     plain = box("Car", (4.5, 1.8, 1.5))
     fine = fine_box(1_000)
-    way = Track([0, 1], [PLACE, (PLACE[0] + SPEED_M_S, *PLACE[1:])])
+    drive = Track([0, 1], [POSITION, (POSITION[0] + SPEED_M_S, *POSITION[1:])])
 
-    def case(actors: list[Actor], where: Any = PLACE, **options: Any) -> Any:
+    def case(actors: list[Actor], sensor_poses: Any = POSITION, **options: Any) -> Any:
         scanner = Scanner(
             scene.with_actors(tuple(actors)),
             lidar,
@@ -124,7 +128,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
             threads=1,
             **options,
         )
-        return lambda number: scanner.sweep(where, number=number)
+        return lambda number: scanner.sweep(sensor_poses, number=number)
 
     rows = {"bare": case([])}
     for count in counts:
@@ -132,8 +136,8 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         rows[f"{count} meshes"] = case(cars(count, fine, count))
     rows["20 people, rigid"] = case(people(20, 20, walking=False))
     rows["20 people, walking"] = case(people(20, 20, walking=True))
-    some = counts[len(counts) // 2]
-    rows[f"{some} boxes, moving"] = case(cars(some, plain, some), way)
+    middle_count = counts[len(counts) // 2]
+    rows[f"{middle_count} boxes, moving"] = case(cars(middle_count, plain, middle_count), drive)
     for subrays, mode in ((7, "strongest"), (19, "all")):
         beam = Returns(subrays=subrays, divergence_mrad=3, mode=mode)
         rows[f"{subrays} sub-rays"] = case([], returns=beam)
@@ -141,7 +145,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     lasting = Noise(channel_bias_m=0.01, warm_up_m=0.02, ripple_deg=0.02)
     rows["errors that last"] = case([], noise=lasting)
     for name, faults in (("whole survey", ()), ("faults", FAULTS)):
-        rows[name] = turns(scene, Survey(lidar, faults=faults, **SURVEY), backend)
+        rows[name] = revolution_caster(scene, Survey(lidar, faults=faults, **SURVEY), backend)
     noise = Noise(detection_range_m=90)  # without which no weather returns light
     rows["detection"] = case([], noise=noise)
     rows["saturation"] = case([], noise=Noise(detection_range_m=90, saturation=100))
@@ -149,35 +153,37 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
     wet = {"noise": noise, "wet": 1.0}
     paint = [Material("car-*", 0.5, specular_reflectance=0.04), Material("*", 0.5)]
     rows |= {"ghosts": case([], noise=noise, materials=paint), "wet": case([], **wet)}
-    rows[f"{some} boxes, wet"] = case(cars(some, plain, some), **wet)
-    rows[f"{some} boxes, spray"] = case(cars(some, plain, some), **wet, spray_g_m3=5.0)
+    rows[f"{middle_count} boxes, wet"] = case(cars(middle_count, plain, middle_count), **wet)
+    rows[f"{middle_count} boxes, spray"] = case(
+        cars(middle_count, plain, middle_count), **wet, spray_g_m3=5.0
+    )
     beam = Returns(subrays=7, divergence_mrad=3)
     real = {"noise": Noise(detection_range_m=90, range_m=0.02), "returns": beam}
-    rows["real"] = case(cars(some, plain, some), **real, **weather["rain"])
+    rows["real"] = case(cars(middle_count, plain, middle_count), **real, **weather["rain"])
     together = {name: value for options in weather.values() for name, value in options.items()}
     rows["all"] = case(
-        cars(some, fine, some),
-        way,
+        cars(middle_count, fine, middle_count),
+        drive,
         **real,
         **together,
     )
     return rows
 
 
-def turns(scene: Scene, survey: Survey, backend: str) -> Any:
-    """Make a function that casts a turn of a survey, of five, and makes its columns."""
+def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
+    """Return a function that casts a revolution of a survey, of five, and makes its columns."""
     rig = Rig(scene, survey, backend, threads=1)
     scans = survey.scan_count // 5
 
-    def turn(number: int) -> range:
+    def cast_revolution(number: int) -> range:
         part = columns_of([*rig.cast(number * scans, (number + 1) * scans)])
         return range(int(part.counts.sum()))  # as long as its points
 
-    return turn
+    return cast_revolution
 
 
 def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
-    """Time all rows, in another order each round; the first round warms up."""
+    """Time all rows, in a random order each round; the first round warms up."""
     seconds: dict[str, list[float]] = {row: [] for row in rows}
     points = {}
     for number in range(rounds + 1):
@@ -212,11 +218,11 @@ def main(arguments: list[str] | None = None) -> int:
     rows = cases(scene, backend, tuple(options.cars), options.sensor)
     if options.rows is not None:
         rows = {row: rows[row] for row in ["bare", *options.rows]}
-    found = measure(rows, options.rounds)
+    figures_by_row = measure(rows, options.rounds)
     if options.json:
-        print(json.dumps({**environment(1, "cpu"), "backend": backend, "rows": found}))
+        print(json.dumps({**environment(1, "cpu"), "backend": backend, "rows": figures_by_row}))
         return 0
-    for row, figures in found.items():
+    for row, figures in figures_by_row.items():
         print(
             f"{row:20} {figures['ms']:8.2f} ms {figures['times']:6.2f} x bare "
             f"{figures['points']:10,} points"

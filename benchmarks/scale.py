@@ -66,7 +66,7 @@ async def _workers(
     seconds: float = 0.0,
     first: int = 0,
 ) -> None:
-    """Run workers, perhaps each with slots of a partition; batches take `seconds` to cast.
+    """Run workers, optionally with slots of a partition; batches take `seconds` to cast.
 
     Their names count from `first` on.
     """
@@ -77,9 +77,9 @@ async def _workers(
         options |= {"resources": {kind: threads}, "nthreads": threads}
     columns_of = lidarpool.run.pipeline.rigs.columns_of
 
-    def slowly(found: Any) -> Any:
+    def slowly(points: Any) -> Any:
         time.sleep(seconds)
-        return columns_of(found)
+        return columns_of(points)
 
     lidarpool.run.pipeline.rigs.columns_of = slowly
     workers = [
@@ -102,15 +102,15 @@ def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) ->
 
 @contextmanager
 def process(main: Callable[..., Any], *arguments: Any) -> Iterator[tuple[psutil.Process, str]]:
-    """Run `main` in a process of its own; gives it, and the address that it sends when ready."""
+    """Run `main` in a new process; yield the process and the address it sends when ready."""
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    child = context.Process(target=_serve, args=(main, theirs, *arguments), daemon=True)
+    parent_end, child_end = context.Pipe()
+    child = context.Process(target=_serve, args=(main, child_end, *arguments), daemon=True)
     child.start()
-    theirs.close()  # so that the end of the process is the end of the pipe
+    child_end.close()  # so that the end of the process is the end of the pipe
     try:
-        yield psutil.Process(child.pid), ours.recv()
-        ours.send(None)
+        yield psutil.Process(child.pid), parent_end.recv()
+        parent_end.send(None)
         child.join(30)
     finally:
         child.kill()
@@ -122,15 +122,15 @@ def name_of_worker(_: object = None) -> str:
 
 
 def divide(client: Client) -> tuple[list[Partition], float]:
-    """Divide all workers into four partitions; gives those and the seconds it took."""
+    """Divide all workers into four partitions; return the partitions and the elapsed seconds."""
     start = time.perf_counter()
-    rest = Pool.from_client(client)
-    each = len(rest) // len(NAMES)
+    remaining = Pool.from_client(client)
+    workers_per_partition = len(remaining) // len(NAMES)
     parts = []
     for name in NAMES[:-1]:
-        part, rest = rest.partition(name, n_workers=each)
+        part, remaining = remaining.partition(name, n_workers=workers_per_partition)
         parts.append(part)
-    parts.append(rest.partition(NAMES[-1], n_workers=len(rest))[0])
+    parts.append(remaining.partition(NAMES[-1], n_workers=len(remaining))[0])
     return parts, time.perf_counter() - start
 
 
@@ -162,13 +162,13 @@ WAYS = {
 }
 
 
-def cpu_s(process: psutil.Process) -> float:
+def processor_s(process: psutil.Process) -> float:
     times = process.cpu_times()
     return float(times.user + times.system)
 
 
 def measure(workers: int, tasks: int) -> dict[str, Any]:
-    """Figures of a cluster of so many workers."""
+    """Return the figures of a cluster of `workers` workers."""
     with (
         process(_scheduler) as (scheduler, address),
         process(_workers, address, workers),
@@ -176,9 +176,9 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
     ):
         parts, seconds = divide(client)
         members = {part.name: {worker.name for worker in part.workers} for part in parts}
-        before = cpu_s(scheduler)
+        cpu_before = processor_s(scheduler)
         time.sleep(2)
-        idle = (cpu_s(scheduler) - before) / 2
+        idle = (processor_s(scheduler) - cpu_before) / 2
         figures: dict[str, Any] = {
             "seconds_to_partition": round(seconds, 3),
             "scheduler_idle_percent": round(100 * idle, 1),
@@ -186,20 +186,20 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
             "misplaced": 0,
         }
         by_submit(parts[0], workers)  # the first tasks import things
-        for way, (run, share) in WAYS.items():
+        for method, (run, share) in WAYS.items():
             start = time.perf_counter()
             driver = time.process_time()
-            before = cpu_s(scheduler)
+            cpu_before = processor_s(scheduler)
             names = {part.name: run(part, math.ceil(share * tasks / len(parts))) for part in parts}
             wall = time.perf_counter() - start
-            done = sum(map(len, names.values()))
-            busy = cpu_s(scheduler) - before - idle * wall
-            figures[way] = {
-                "tasks_per_second": round(done / wall, 1),
-                "driver_ms": round(1e3 * (time.process_time() - driver) / done, 4),
-                "scheduler_ms": round(1e3 * max(0.0, busy) / done, 4),
+            task_count = sum(map(len, names.values()))
+            busy = processor_s(scheduler) - cpu_before - idle * wall
+            figures[method] = {
+                "tasks_per_second": round(task_count / wall, 1),
+                "driver_ms": round(1e3 * (time.process_time() - driver) / task_count, 4),
+                "scheduler_ms": round(1e3 * max(0.0, busy) / task_count, 4),
             }
-            figures["tasks"] += done
+            figures["tasks"] += task_count
             figures["misplaced"] += sum(
                 worker not in members[name] for name, ran in names.items() for worker in ran
             )
@@ -209,54 +209,63 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
 MINUTE_S = 60.0
 # GPU workers for a collector, and in a process
 GPUS_EACH = 20
-TOGETHER = 25
+WORKERS_PER_PROCESS = 25
 ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
 def small_survey(scans: int) -> Survey:
-    """Describe scans of four rays."""
+    """Return a survey of scans of four rays."""
     sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
     return Survey(sensor, [(0.0, 0.0, 1.0)] * scans, steps=1)
 
 
-class Counts:
-    """Processor time of each kind of process for a receipt, or job, from a fifth of them on."""
+class CostSamples:
+    """Processor time per receipt or job of each kind of process, after a fifth of the work."""
 
-    def __init__(self, all_of_them: int, processes: dict[str, list[psutil.Process]]) -> None:
-        self._all = all_of_them
+    def __init__(self, total: int, processes: dict[str, list[psutil.Process]]) -> None:
+        self._all = total
         self._processes = {"driver": [psutil.Process()], **processes}
-        before = self._cpu_s()
+        cpu_before = self._cpu_s()
         time.sleep(2)
-        self._idle = {name: (s - before[name]) / 2 for name, s in self._cpu_s().items()}
-        self._seen: list[tuple[int, float, dict[str, float]]] = []
+        self._idle = {name: (s - cpu_before[name]) / 2 for name, s in self._cpu_s().items()}
+        self._samples: list[tuple[int, float, dict[str, float]]] = []
 
     def _cpu_s(self) -> dict[str, float]:
-        return {name: sum(map(cpu_s, those)) for name, those in self._processes.items()}
+        return {
+            name: sum(map(processor_s, processes)) for name, processes in self._processes.items()
+        }
 
     def __call__(self, progress: Progress) -> None:
-        """Look how much is done, and what it took."""
-        done = progress.jobs_done if progress.jobs else progress.collected
-        if not self._seen or done > self._seen[-1][0]:
-            if done <= self._all // 5:
-                self._seen.clear()
-            self._seen.append((done, time.perf_counter(), self._cpu_s()))
+        """Sample the progress and the processor times."""
+        finished = progress.jobs_done if progress.jobs else progress.collected
+        if not self._samples or finished > self._samples[-1][0]:
+            if finished <= self._all // 5:
+                self._samples.clear()
+            self._samples.append((finished, time.perf_counter(), self._cpu_s()))
 
     def figures(self) -> dict[str, float]:
-        """Return what was done a second, and milliseconds for each without heartbeats."""
-        (least, start, before), *_, (most, end, after) = self._seen
+        """Return items per second, and milliseconds per item without heartbeats."""
+        (first_count, start, cpu_before), *_, (last_count, stop, cpu_after) = self._samples
         took = {
-            name: after[name] - before[name] - self._idle[name] * (end - start) for name in after
+            name: cpu_after[name] - cpu_before[name] - self._idle[name] * (stop - start)
+            for name in cpu_after
         }
-        each = {f"{name}_ms": round(1e3 * s / (most - least), 3) for name, s in took.items()}
+        per_item_ms = {
+            f"{name}_ms": round(1e3 * s / (last_count - first_count), 3) for name, s in took.items()
+        }
         idle = round(100 * self._idle["scheduler"], 1)
-        return {"a_second": round((most - least) / (end - start), 1), **each, "idle_percent": idle}
+        return {
+            "a_second": round((last_count - first_count) / (stop - start), 1),
+            **per_item_ms,
+            "idle_percent": idle,
+        }
 
 
 @contextmanager
 def casting_cluster(
     gpus: int, seconds: float
 ) -> Iterator[tuple[Client, dict[str, list[psutil.Process]]]]:
-    """Start workers that cast slowly, and a worker of LIDAR; gives the processes of each kind."""
+    """Start slow casting workers and a worker of LIDAR; yield a client and processes by kind."""
     with ExitStack() as stack:
 
         def start(main: Callable[..., Any], *arguments: Any) -> tuple[psutil.Process, str]:
@@ -265,18 +274,18 @@ def casting_cluster(
         scheduler, address = start(_scheduler)
         lidar, _ = start(_workers, address, 1, ("LIDAR", 8 + gpus // GPUS_EACH))
         casting = [
-            start(_workers, address, min(TOGETHER, gpus - n), ("GPU", 1), seconds, n)[0]
-            for n in range(0, gpus, TOGETHER)
+            start(_workers, address, min(WORKERS_PER_PROCESS, gpus - n), ("GPU", 1), seconds, n)[0]
+            for n in range(0, gpus, WORKERS_PER_PROCESS)
         ]
         processes = {"scheduler": [scheduler], "collectors": [lidar], "casting": casting}
         yield stack.enter_context(Client(address)), processes
 
 
 def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
-    """Run a survey with batches of one scan; its figures, and the share of a minute of casting."""
+    """Run a survey with batches of one scan; return its figures and the share of casting."""
     with casting_cluster(gpus, seconds) as (client, processes), single_scans():
         simulate(ROOM, small_survey(gpus), client=client, backend="numpy")
-        counts = Counts(scans, processes)
+        counts = CostSamples(scans, processes)
         with tempfile.TemporaryDirectory() as folder:
             result = simulate(
                 ROOM, small_survey(scans), client=client, backend="numpy",
@@ -284,25 +293,25 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
                 collectors=max(2, gpus // GPUS_EACH),
             )  # fmt: skip
     casting = next(stage for stage in result.stages if stage.stage == "intersect")
-    lasts = min(MINUTE_S, casting.stop - casting.start)
-    until = casting.start + lasts
-    spans = [max(0.0, min(one.stop, until) - one.start) for one in casting.records]
-    kept = len(casting.records) / casting.tasks  # of thousands, every second one
-    share = round(sum(spans) / kept / (lasts * gpus), 3)
+    casting_s = min(MINUTE_S, casting.stop - casting.start)
+    until = casting.start + casting_s
+    spans = [max(0.0, min(record.stop, until) - record.start) for record in casting.records]
+    recorded_share = len(casting.records) / casting.tasks  # of thousands, every second one
+    share = round(sum(spans) / recorded_share / (casting_s * gpus), 3)
     return {**counts.figures(), "busy": share, "gpus": gpus, "seconds": seconds}
 
 
-def measure_shards(shards: int, *of_each: Any) -> dict[str, float]:
-    """Run `measure_receipts` in several clusters at a time; the sum of rates, means of the rest."""
+def measure_shards(shards: int, *arguments: Any) -> dict[str, float]:
+    """Run `measure_receipts` in several clusters at a time; return summed rates, other means."""
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(shards, mp_context=spawn) as pool:
-        rows = list(pool.map(measure_receipts, *([value] * shards for value in of_each)))
+        rows = list(pool.map(measure_receipts, *([value] * shards for value in arguments)))
     mean = {name: round(sum(row[name] for row in rows) / shards, 3) for name in rows[0]}
     return mean | {"a_second": sum(row["a_second"] for row in rows), "shards": shards}
 
 
 def measure_jobs(jobs: int) -> dict[str, float]:
-    """Run a campaign of tiny jobs; its figures."""
+    """Run a campaign of tiny jobs; return its figures."""
     with casting_cluster(4, 0.0) as (client, processes), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "campaign.yaml"
         data = Path(folder) / "data"
@@ -310,17 +319,17 @@ def measure_jobs(jobs: int) -> dict[str, float]:
         file.write_text(CAMPAIGN % 20)
         Campaign.load(file).run(Path(folder) / "first", client=client)
         file.write_text(CAMPAIGN % jobs)
-        counts = Counts(jobs, processes)
+        counts = CostSamples(jobs, processes)
         Campaign.load(file).run(data, client=client, on_progress=counts)
     return counts.figures()
 
 
 def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | None:
-    """Of driver and scheduler together; None where the smallest took no time to speak of."""
-    least, most = (
+    """Return the growth of driver and scheduler time together, or None from zero."""
+    smallest_ms, largest_ms = (
         figures["driver_ms"] + figures["scheduler_ms"] for figures in (smallest, largest)
     )
-    return round(most / least, 2) if least else None
+    return round(largest_ms / smallest_ms, 2) if smallest_ms else None
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
@@ -337,12 +346,12 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     if options.receipts is not None:
         for count in options.workers:
-            of = f"{options.shards} x {count} workers, batches of {options.receipts:g} s"
-            rows[of] = measure_shards(options.shards, count, options.receipts, options.scans)
+            title = f"{options.shards} x {count} workers, batches of {options.receipts:g} s"
+            rows[title] = measure_shards(options.shards, count, options.receipts, options.scans)
     if options.jobs:
         rows[f"{options.jobs} tiny jobs"] = measure_jobs(options.jobs)
-    for of, figures in rows.items():
-        print(f"{of}: {', '.join(f'{name} {value:g}' for name, value in figures.items())}")
+    for title, figures in rows.items():
+        print(f"{title}: {', '.join(f'{name} {value:g}' for name, value in figures.items())}")
     if options.json and rows:
         options.json.write_text(json.dumps(rows, indent=1) + "\n")
     return rows or measure_tasks(options)
@@ -358,14 +367,14 @@ def measure_tasks(options: argparse.Namespace) -> dict[str, Any]:
             f"{figures['misplaced']} of {figures['tasks']} misplaced, scheduler idle at "
             f"{figures['scheduler_idle_percent']}% of a core"
         )
-        for way in WAYS:
-            a_second, driver, scheduler = figures[way].values()
+        for method in WAYS:
+            a_second, driver, scheduler = figures[method].values()
             print(
-                f"  {way:<11} {a_second:9.1f} a second, driver {driver:.3f} ms, "
+                f"  {method:<11} {a_second:9.1f} a second, driver {driver:.3f} ms, "
                 f"scheduler {scheduler:.3f} ms"
             )
-    ends = clusters[min(clusters)], clusters[max(clusters)]
-    grown = {way: growth(ends[0][way], ends[1][way]) for way in WAYS}
+    extremes = clusters[min(clusters)], clusters[max(clusters)]
+    grown = {method: growth(extremes[0][method], extremes[1][method]) for method in WAYS}
     print(f"growth from {min(clusters)} to {max(clusters)} workers: {grown}")
     results = {"tasks": options.tasks, "workers": clusters, "growth": grown}
     if options.json:

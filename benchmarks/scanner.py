@@ -43,14 +43,14 @@ HEIGHT_M = 1.8
 
 
 def sensor_of(case: str) -> Sensor:
-    """Make the sensor of a case; a robot has 64 rays around it."""
+    """Make the sensor of a case; a robot's sensor has 64 rays around it."""
     if case == "robots":
         return Sensor.grid(64, 1, step_deg=360, max_range_m=30)
     return load_sensor(case)
 
 
 def poses_of(count: int, number: int) -> Float:
-    """Poses of a round, (count, 4, 4): on the street, each turned by another angle."""
+    """Return the poses of a round, (count, 4, 4): on the street, with random yaw."""
     random = np.random.default_rng(number)
     angle = random.uniform(-np.pi, np.pi, count)
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -63,8 +63,8 @@ def poses_of(count: int, number: int) -> Float:
     return poses
 
 
-class Ours:
-    """The cast alone, and the scanner, with the same rays.
+class LidarpoolScans:
+    """Cast alone, and scanners, with the same rays.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ class Ours:
         self.noisy = Scanner(scene, sensor, noise=noise, backend=backend, threads=1)
 
     def cast(self, poses: Float) -> int:
-        """Cast the rays from poses (k, 4, 4), and count the hits."""
-        found = self.caster.scan(
+        """Cast the rays from poses (k, 4, 4); return the number of hits."""
+        hits = self.caster.scan(
             self.pattern,
             poses[:, :3, 3],
             poses[:, :3, :3],
@@ -95,56 +95,56 @@ class Ours:
             t_min=self.sensor.min_range_m,
             t_max=self.sensor.max_range_m,
         )
-        return len(found)
+        return len(hits)
 
     def ranges(self, poses: Float) -> Any:
-        """Make images."""
+        """Make range images."""
         return self.scanner.ranges(poses)
 
     def noise(self, poses: Float) -> Any:
-        """Make images with noise."""
+        """Make range images with noise."""
         return self.noisy.ranges(poses)
 
     def sweep(self, poses: Float) -> int:
-        """Make the cloud of one pose."""
+        """Make the cloud of a pose; return its number of points."""
         return len(self.scanner.sweep(poses[0, :3, 3]))
 
     def moving(self, poses: Float) -> int:
-        """Make the cloud of a sensor at 20 m/s."""
-        ends = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
-        return len(self.scanner.sweep(Track([0, 0.2], ends)))
+        """Make the cloud of a sensor at 20 m/s; return its number of points."""
+        positions = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
+        return len(self.scanner.sweep(Track([0, 0.2], positions)))
 
 
 class Open3D:
-    """Open3D's scene, and the rays in NumPy."""
+    """Open3D's scene, with rays made in NumPy."""
 
-    def __init__(self, scene: Scene, ours: Ours) -> None:
+    def __init__(self, scene: Scene, scans: LidarpoolScans) -> None:
         import open3d
 
         self.core = open3d.core
-        self.ours = ours
+        self.scans = scans
         self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
         self.scene.add_triangles(
             self.core.Tensor(scene.vertices.astype(np.float32)),
             self.core.Tensor(scene.faces.astype(np.uint32)),
         )
-        self.rays = np.array(ours.pattern.directions, np.float32)
-        origins = ours.pattern.origins
+        self.rays = np.array(scans.pattern.directions, np.float32)
+        origins = scans.pattern.origins
         self.origins = None if origins is None else np.array(origins, np.float32)
 
     def ranges(self, poses: Float) -> Any:
-        """Make images."""
+        """Make range images."""
         count = len(self.rays)
         matrices = poses.astype(np.float32)
-        turns = matrices[:, :3, :3].transpose(0, 2, 1)
+        rotations = matrices[:, :3, :3].transpose(0, 2, 1)
         rays = np.empty((len(poses), count, 6), np.float32)
         rays[..., :3] = matrices[:, None, :3, 3]
         if self.origins is not None:
-            rays[..., :3] += self.origins @ turns
-        rays[..., 3:] = self.rays @ turns
-        found = self.scene.cast_rays(self.core.Tensor.from_numpy(rays), nthreads=1)
-        range_m = found["t_hit"].numpy()
-        sensor = self.ours.sensor
+            rays[..., :3] += self.origins @ rotations
+        rays[..., 3:] = self.rays @ rotations
+        answer = self.scene.cast_rays(self.core.Tensor.from_numpy(rays), nthreads=1)
+        range_m = answer["t_hit"].numpy()
+        sensor = self.scans.sensor
         range_m[(range_m < sensor.min_range_m) | (range_m > sensor.max_range_m)] = np.inf
         return range_m
 
@@ -152,37 +152,37 @@ class Open3D:
 def measure(
     case: str, backend: str, scene: Scene, robots: int, rounds: int, clock: str, python: str
 ) -> dict[str, Any]:
-    """Time all ways of one case."""
-    now = CLOCKS[clock]
+    """Time all methods of a case."""
+    clock_s = CLOCKS[clock]
     count = robots if case == "robots" else 1
-    ours = Ours(scene, sensor_of(case), backend)
-    ways: dict[str, Callable[[Float], Any]] = {
-        "cast": ours.cast,
-        "ranges": ours.ranges,
-        "noise": ours.noise,
+    scans = LidarpoolScans(scene, sensor_of(case), backend)
+    methods: dict[str, Callable[[Float], Any]] = {
+        "cast": scans.cast,
+        "ranges": scans.ranges,
+        "noise": scans.noise,
     }
     if case != "robots":
-        ways |= {"sweep": ours.sweep, "moving": ours.moving}
+        methods |= {"sweep": scans.sweep, "moving": scans.moving}
     if importlib.util.find_spec("open3d"):
-        ways["open3d"] = Open3D(scene, ours).ranges
-    rays = len(ours.pattern) * count
-    seconds: dict[str, list[float]] = {way: [] for way in ways}
+        methods["open3d"] = Open3D(scene, scans).ranges
+    rays = len(scans.pattern) * count
+    seconds: dict[str, list[float]] = {method: [] for method in methods}
     hits: dict[str, float] = {}
     for number in range(rounds + 1):
         poses = poses_of(count, number)
         # Each finds caches and memory as the last one left them: not always the same one.
-        for way in np.random.default_rng(number).permutation(list(ways)).tolist():
-            start = now()
-            found = ways[way](poses)
-            spent = now() - start
+        for method in np.random.default_rng(number).permutation(list(methods)).tolist():
+            start = clock_s()
+            answer = methods[method](poses)
+            spent = clock_s() - start
             if number:  # the first round warms up
-                seconds[way].append(spent)
-            hit = found if isinstance(found, int) else np.isfinite(found).sum()
-            hits[way] = float(hit / rays)
+                seconds[method].append(spent)
+            hit = answer if isinstance(answer, int) else np.isfinite(answer).sum()
+            hits[method] = float(hit / rays)
     if python:
         for peer in PEERS:
-            found = _peer(peer, python, ours, scene, poses, rounds, clock)
-            seconds[peer], hits[peer] = found
+            answer = _time_peer(peer, python, scans, scene, poses, rounds, clock)
+            seconds[peer], hits[peer] = answer
     return {
         "case": case,
         "backend": backend,
@@ -194,11 +194,17 @@ def measure(
     }
 
 
-def _peer(
-    name: str, python: str, ours: Ours, scene: Scene, poses: Float, rounds: int, clock: str
+def _time_peer(
+    name: str,
+    python: str,
+    scans: LidarpoolScans,
+    scene: Scene,
+    poses: Float,
+    rounds: int,
+    clock: str,
 ) -> tuple[list[float], float]:
-    """Time a peer with the poses of the last round, and find its share of hits."""
-    rays = np.concatenate([ours.directions @ pose[:3, :3].T for pose in poses])
+    """Time a peer with the poses of the last round; return its times and share of hits."""
+    rays = np.concatenate([scans.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
         np.savez(
@@ -207,33 +213,34 @@ def _peer(
             faces=scene.faces,
             origins=poses[:, :3, 3],
             directions=rays,
-            far=min(ours.sensor.max_range_m, 1e10),
+            far=min(scans.sensor.max_range_m, 1e10),
         )
         peer = Peer(name, python, job, clock)
-        turns = [peer.cast() for _ in range(rounds + 1)][1:]
+        casts = [peer.cast() for _ in range(rounds + 1)][1:]
         peer.close()
-    return [spent for spent, _ in turns], turns[-1][1] / len(rays)
+    return [spent for spent, _ in casts], casts[-1][1] / len(rays)
 
 
-def ratio(row: dict[str, Any], way: str, other: str = "cast") -> float:
-    """Median over the rounds of one way's time to another's."""
-    pairs = zip(row["seconds"][way], row["seconds"][other], strict=True)
+def ratio(row: dict[str, Any], method: str, base: str = "cast") -> float:
+    """Return the median over the rounds of a method's time over the time of `base`."""
+    pairs = zip(row["seconds"][method], row["seconds"][base], strict=True)
     return float(np.median([max(a, 1e-9) / max(b, 1e-9) for a, b in pairs]))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print what one case took."""
+    """Print the times of a case."""
     print(
         f"\n{row['case']} by {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
         f"{row['triangles']:,} triangles"
     )
-    for way, seconds in row["seconds"].items():
+    for method, seconds in row["seconds"].items():
         print(
-            f"  {way:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, way):6.2f} x cast; "
-            f"hits {100 * row['hits'][way]:.1f} % of rays"
+            f"  {method:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, method):6.2f} x cast; "
+            f"hits {100 * row['hits'][method]:.1f} % of rays"
         )
-    found = ratio(row, "ranges")
-    print(f"  the bar of {BAR} x the cast is {'kept' if found <= BAR else 'missed'}: {found:.2f}")
+    ranges_ratio = ratio(row, "ranges")
+    verdict = "kept" if ranges_ratio <= BAR else "missed"
+    print(f"  the bar of {BAR} x the cast is {verdict}: {ranges_ratio:.2f}")
 
 
 def main(arguments: list[str] | None = None) -> int:

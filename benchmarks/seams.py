@@ -14,7 +14,7 @@ Index = NDArray[np.integer]
 def seam_rays(
     vertices: Float, faces: Index, origins: Float, count: int, rng: np.random.Generator
 ) -> Float:
-    """Directions from origins to points of edges: corners, middles, and anywhere between."""
+    """Return directions from origins to points of edges: corners, middles, and between."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edge = vertices[edges[rng.integers(len(edges), size=count)]]
     part = rng.choice([0.0, 0.5, 1.0, np.nan], count)
@@ -30,7 +30,7 @@ def escaped(
     count: int,
     rng: np.random.Generator,
 ) -> int:
-    """Count the rays that hit nothing: of `count` from one point and as many from others.
+    """Count escaping rays: `count` rays from a point and `count` rays from points around it.
 
     Parameters
     ----------

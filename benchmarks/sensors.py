@@ -41,27 +41,27 @@ from .raycast import CLOCKS, environment
 MODELS = ("velodyne/vlp16", "ouster/os1-128", "velodyne/hdl64e-s3")
 PEERS = ("mujoco", "pyhelios3d")
 BAR = 1.15  # of a moving sensor's time to a still grid's, without noise
-WAY = ((-10.0, -1.8, 2.0), (10.0, -1.8, 2.0))  # along the street, in a second
+LINE = ((-10.0, -1.8, 2.0), (10.0, -1.8, 2.0))  # along the street, in a second
 CASES = ("grid", "still", "moving", "turning", "noise", "ten actors", "19 sub-rays")
 
 
 def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
-    """Make a way along the street, beside the carrier's, level; the survey is its middle."""
-    start, end = np.array(WAY)
-    way = np.array([start, end]) * (speed, 1, 1) + (*shift, 0)
-    return Track([-0.5, 0.5], way, start_s=0, duration_s=0.2)
+    """Make a level trajectory along the street, beside the carrier's; the survey is its middle."""
+    start, end = np.array(LINE)
+    positions = np.array([start, end]) * (speed, 1, 1) + (*shift, 0)
+    return Track([-0.5, 0.5], positions, start_s=0, duration_s=0.2)
 
 
 def bend(rate_deg: float = 30.0) -> Track:
-    """Make the way along the street with a carrier that turns, to the left."""
+    """Make the trajectory along the street of a carrier that turns to the left."""
     straight = track()
     half = np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
-    turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
-    return replace(straight, quaternions=turns)
+    quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    return replace(straight, quaternions=quaternions)
 
 
 def surveys(name: str, share: float) -> dict[str, Survey]:
-    """Make the surveys of a model, one for each case but for the actors, which are a scene's.
+    """Make the surveys of a model by case; actors are part of the scene.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
     """
     sensor = load_sensor(name, step_deg=360 * share)
     first, stop = sensor.firings(0)
-    low, high = sensor.beams.elevation[[0, -1]]
+    first_elevation, last_elevation = sensor.beams.elevation[[0, -1]]
     grid = Sensor(
-        Beams(np.linspace(low, high, sensor.channels)),
+        Beams(np.linspace(first_elevation, last_elevation, sensor.channels)),
         Spin(round((stop - first) / share), step_deg=360 * share),
         sensor.min_range_m,
         sensor.max_range_m,
     )
-    middle = [tuple(np.mean(WAY, axis=0))]
+    middle = [tuple(np.mean(LINE, axis=0))]
     common: dict[str, Any] = {"steps": 1, "keep_every": 1, "columns": ["time", "range"]}
     moving = Survey(sensor, trajectory=track(), **common)
     return {
@@ -94,31 +94,34 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
 
 
 def traffic(scene: Scene) -> Scene:
-    """Put ten cars into a scene: five ahead of the carrier, five that come towards it."""
-    ways = [track((8.0 + 6 * k, 3.6 * (k % 2)), 1 - 1.5 * (k % 2)) for k in range(10)]
-    cars = [Actor(box(f"car {k}", (4.5, 1.8, 1.5)), _on_ground(way)) for k, way in enumerate(ways)]
+    """Put ten cars into a scene: five ahead of the carrier, and five oncoming cars."""
+    trajectories = [track((8.0 + 6 * k, 3.6 * (k % 2)), 1 - 1.5 * (k % 2)) for k in range(10)]
+    cars = [
+        Actor(box(f"car {k}", (4.5, 1.8, 1.5)), _on_ground(trajectory))
+        for k, trajectory in enumerate(trajectories)
+    ]
     return replace(scene, actors=tuple(cars))
 
 
-def _on_ground(way: Track) -> Track:
-    return replace(way, positions=np.asarray(way.positions) * (1, 1, 0))
+def _on_ground(trajectory: Track) -> Track:
+    return replace(trajectory, positions=np.asarray(trajectory.positions) * (1, 1, 0))
 
 
-def turn(rig: Rig) -> list[BatchPoints]:
-    """Cast the one scan there is."""
+def cast_scan(rig: Rig) -> list[BatchPoints]:
+    """Cast the only scan of a survey."""
     return list(rig.cast(0, rig.survey.scan_count))
 
 
-def columns(found: list[BatchPoints]) -> int:
-    """Make all columns of a cloud, and count the points."""
-    for returns in found:
+def make_columns(batches: list[BatchPoints]) -> int:
+    """Make all columns of a cloud; return the number of points."""
+    for returns in batches:
         for column in returns.survey.stored_columns:
             column.make(returns)
-    return sum(len(returns) for returns in found)
+    return sum(len(returns) for returns in batches)
 
 
 class Peer:
-    """A process that casts when it is told to.
+    """Process that casts on request.
 
     Parameters
     ----------
@@ -151,7 +154,7 @@ class Peer:
         raise RuntimeError(f"The peer ended with {self._process.wait()}")
 
     def cast(self) -> tuple[float, int]:
-        """Seconds of one turn, and how many rays hit."""
+        """Return the time of a revolution, seconds, and the number of hits."""
         assert self._process.stdin is not None
         self._process.stdin.write("cast\n")
         self._process.stdin.flush()
@@ -166,18 +169,18 @@ class Peer:
 
 
 def write_job(survey: Survey, scene: Scene, path: Path) -> None:
-    """Write mesh and rays of a moving sensor for the peers; it is level and faces along x."""
+    """Write mesh and rays of a moving sensor, level and facing along x, for the peers."""
     sensor = survey.sensor
     firings = np.arange(*sensor.firings(0))
     times = sensor.begins_ns(firings)
-    places, _ = survey.path.poses(0, times)
+    positions, _ = survey.path.poses(0, times)
     offsets = sensor.origins(firings)  # one call has one origin: the middle of the beams'
     seconds = (times[-1] - times[0]) / (len(times) - 1) * len(times) / 1e9
     np.savez(
         path,
         vertices=scene.vertices,
         faces=scene.faces,
-        origins=places if offsets is None else places + offsets.mean(axis=1),
+        origins=positions if offsets is None else positions + offsets.mean(axis=1),
         directions=sensor.directions(firings).reshape(-1, 3),
         elevations=sensor.beams.elevation,
         way=survey.path.poses(0, np.array([0.0, 1e9 * seconds]))[0],
@@ -189,8 +192,8 @@ def write_job(survey: Survey, scene: Scene, path: Path) -> None:
 def measure(
     name: str, backend: str, scene: Scene, share: float, rounds: int, clock: str, python: str = ""
 ) -> dict[str, Any]:
-    """Time all cases of one model on one backend, and the peers."""
-    now = CLOCKS[clock]
+    """Time all cases of a model on a backend, and the peers."""
+    clock_s = CLOCKS[clock]
     crowded = traffic(scene)
     rigs = {
         case: Rig(crowded if case == "ten actors" else scene, survey, backend, threads=1)
@@ -212,7 +215,7 @@ def measure(
                     spent, count = peers[case].cast()
                     times = [spent]
                 else:
-                    times, count = _timed(rigs[case], now)
+                    times, count = _timed(rigs[case], clock_s)
                 if number:  # the first round warms up
                     seconds.setdefault(case, []).append(times)
                 hits[case] = count / rigs["moving"].survey.ray_count
@@ -227,27 +230,27 @@ def measure(
         "firings": survey.ray_count // survey.sensor.channels,
         "hits": hits,
         "seconds": seconds,
-        "peers": {peer: made.version for peer, made in peers.items()},
+        "peers": {peer: process.version for peer, process in peers.items()},
     }
 
 
-def _timed(rig: Rig, now: Callable[[], float]) -> tuple[list[float], int]:
-    start = now()
-    found = turn(rig)
-    cast = now() - start
-    count = columns(found)
-    return [cast, now() - start], count
+def _timed(rig: Rig, clock_s: Callable[[], float]) -> tuple[list[float], int]:
+    start = clock_s()
+    batches = cast_scan(rig)
+    cast = clock_s() - start
+    count = make_columns(batches)
+    return [cast, clock_s() - start], count
 
 
-def ratio(row: dict[str, Any], one: str, other: str, which: int = 0) -> float:
-    """Median over the rounds of one case's time to another's; casting alone, or 1: all of it."""
-    pairs = zip(row["seconds"][one], row["seconds"][other], strict=True)
-    found = [max(a[min(which, len(a) - 1)], 1e-9) / max(b[which], 1e-9) for a, b in pairs]
-    return float(np.median(found))
+def ratio(row: dict[str, Any], case: str, base: str, stage: int = 0) -> float:
+    """Return the median ratio of two cases' times; stage 0 is casting, 1 adds columns."""
+    pairs = zip(row["seconds"][case], row["seconds"][base], strict=True)
+    ratios = [max(a[min(stage, len(a) - 1)], 1e-9) / max(b[stage], 1e-9) for a, b in pairs]
+    return float(np.median(ratios))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print what one model took on one backend."""
+    """Print the times of a model on a backend."""
     print(
         f"\n{row['model']} by {row['backend']}: {row['rays']:,} rays in {row['firings']:,} "
         f"firings, {row['triangles']:,} triangles"
@@ -259,9 +262,9 @@ def show(row: dict[str, Any]) -> None:
         if case in CASES:
             line += f"; with columns {times[1]:9.2f} ms  {ratio(row, case, base, 1):6.3f} x"
         print(f"{line}; points {100 * row['hits'][case]:.1f} % of rays")
-    found = ratio(row, "moving", "grid")
-    kept = "kept" if found <= BAR else "missed"
-    print(f"  the bar of {BAR} x a still grid is {kept}: {found:.3f}")
+    moving_ratio = ratio(row, "moving", "grid")
+    verdict = "kept" if moving_ratio <= BAR else "missed"
+    print(f"  the bar of {BAR} x a still grid is {verdict}: {moving_ratio:.3f}")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -38,14 +38,14 @@ def _mujoco_model(job: Job) -> tuple[Any, Any]:
 
 
 def mujoco_caster(job: Job) -> Callable[[], int]:
-    """Cast the rays of each firing with one call: they all leave from one place."""
+    """Return a function that casts the rays of each firing with one call, from one origin."""
     import mujoco
 
     model, data = _mujoco_model(job)
     origins = np.ascontiguousarray(job["origins"])
     beams = len(job["directions"]) // len(origins)
     rays = np.ascontiguousarray(job["directions"].reshape(len(origins), 3 * beams))
-    far = float(job.get("far", 1e10))
+    max_range_m = float(job.get("far", 1e10))
     geom = np.empty((len(origins), beams), np.int32)
     distance = np.empty((len(origins), beams))
 
@@ -53,15 +53,15 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
         for k in range(len(origins)):
             mujoco.mj_multiRay(
                 model, data, origins[k], rays[k], None, True, -1, geom[k], distance[k], None,
-                beams, far,
+                beams, max_range_m,
             )  # fmt: skip
-        return int(((distance >= 0) & (distance <= far)).sum())
+        return int(((distance >= 0) & (distance <= max_range_m)).sum())
 
     return cast
 
 
 def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable[[], int]:
-    """Let MuJoCo-LiDAR cast the rays of each place with one call, by azimuth and elevation."""
+    """Return a function that casts each origin's rays with one call of MuJoCo-LiDAR."""
     if backend == "cpu":
         from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
     else:
@@ -71,13 +71,13 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
         warp.config.quiet = True
         warp.set_device(device)
     model, data = _mujoco_model(job)
-    places = len(job["origins"])
-    far = float(job.get("far", 1e10))
-    caster = Caster(model, cutoff_dist=far)
+    origin_count = len(job["origins"])
+    max_range_m = float(job.get("far", 1e10))
+    caster = Caster(model, cutoff_dist=max_range_m)
     caster.update(data)
-    poses = np.tile(np.eye(4), (places, 1, 1))
+    poses = np.tile(np.eye(4), (origin_count, 1, 1))
     poses[:, :3, 3] = job["origins"]
-    x, y, z = job["directions"].reshape(places, -1, 3).transpose(2, 0, 1)
+    x, y, z = job["directions"].reshape(origin_count, -1, 3).transpose(2, 0, 1)
     azimuths = np.arctan2(y, x)
     elevations = np.arctan2(z, np.hypot(x, y))
 
@@ -86,14 +86,14 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
         for pose, azimuth, elevation in zip(poses, azimuths, elevations, strict=True):
             caster.trace_rays(pose, azimuth, elevation)
             distance = caster.get_distances()
-            hits += int(((distance > 0) & (distance < far)).sum())
+            hits += int(((distance > 0) & (distance < max_range_m)).sum())
         return hits
 
     return cast
 
 
 def helios_caster(job: Job) -> Callable[[], int]:
-    """Let it make a spinning scan of its own, with as many rays, on the same way."""
+    """Return a function that casts Helios' spinning scan, with as many rays, on the same line."""
     from pyhelios import Context, LiDARCloud
 
     context = Context()
@@ -129,15 +129,15 @@ CASTERS = {
 
 
 def main() -> None:
-    """Answer each line on standard input with the time of one turn."""
+    """Answer each line on standard input with the time of a cast."""
     name, path, clock = sys.argv[1:]
-    now = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
+    clock_s = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
     cast = CASTERS[name](dict(np.load(path)))
     print("ready", version(name.partition(" ")[0]), flush=True)
     for _ in sys.stdin:
-        start = now()
+        start = clock_s()
         hits = cast()
-        print(json.dumps({"seconds": now() - start, "hits": hits}), flush=True)
+        print(json.dumps({"seconds": clock_s() - start, "hits": hits}), flush=True)
 
 
 if __name__ == "__main__":

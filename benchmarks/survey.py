@@ -31,32 +31,37 @@ MESH = "city.glb"
 
 
 def poses(count: int) -> list[tuple[float, float, float]]:
-    """Places along streets, at the height of a car's roof."""
+    """Return positions along streets, at the height of a car's roof."""
     from lidarscenes.procedural.city import city
 
-    low, high = city(TRIANGLES).bounds
+    lower_m, upper_m = city(TRIANGLES).bounds
     rng = np.random.default_rng(0)
-    places = low[:2] + (high[:2] - low[:2]) * rng.uniform(0.25, 0.75, (count, 2))
-    return [(round(float(x), 3), round(float(y), 3), 2.0) for x, y in places]
+    positions = lower_m[:2] + (upper_m[:2] - lower_m[:2]) * rng.uniform(0.25, 0.75, (count, 2))
+    return [(round(float(x), 3), round(float(y), 3), 2.0) for x, y in positions]
 
 
-def script(rays: int, out: Path) -> None:
-    """Survey in one process, as plainly as it goes."""
+def ray_directions() -> np.ndarray:
+    """Return the unit directions of a revolution, (rays, 3)."""
+    azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
+    elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    directions = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1)
+    return directions.reshape(-1, 3)
+
+
+def script(rays: int, folder: Path) -> None:
+    """Run the survey in this process as a plain script would, and write its cloud."""
     import open3d as o3d
 
     from lidarpool import Scene
 
-    scene = Scene.load(out.parent / MESH)
+    scene = Scene.load(folder.parent / MESH)
     caster = o3d.t.geometry.RaycastingScene()
     caster.add_triangles(
         o3d.core.Tensor(scene.vertices.astype(np.float32)),
         o3d.core.Tensor(scene.faces.astype(np.uint32)),
     )
-    azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
-    elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
-    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    directions = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1)
-    directions = directions.reshape(-1, 3)
+    directions = ray_directions()
     table = np.empty((len(directions), 6), np.float32)
     table[:, 3:] = directions
     columns: dict[str, list[np.ndarray]] = {n: [] for n in ("positions", "scan", "ring", "object")}
@@ -72,20 +77,20 @@ def script(rays: int, out: Path) -> None:
         columns["ring"].append((hit % LAYERS).astype(np.uint16))
         columns["object"].append(scene.face_object[face[hit]])
     cloud = o3d.t.geometry.PointCloud()
-    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    cloud.point.positions = o3d.core.Tensor(whole["positions"].astype(np.float32))
+    merged = {name: np.concatenate(parts) for name, parts in columns.items()}
+    cloud.point.positions = o3d.core.Tensor(merged["positions"].astype(np.float32))
     for name in ("scan", "ring", "object"):
-        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(whole[name])[:, None])
-    o3d.t.io.write_point_cloud(str(out / "cloud.ply"), cloud, write_ascii=False)
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(merged[name])[:, None])
+    o3d.t.io.write_point_cloud(str(folder / "cloud.ply"), cloud, write_ascii=False)
 
 
 def scan_count(rays: int) -> int:
-    """Count the scans of whole turns."""
+    """Return the number of scans, each a whole revolution."""
     return max(1, round(rays / (RAYS_PER_TURN * LAYERS)))
 
 
 def scenario(rays: int, folder: Path) -> Path:
-    """Write mesh and scenario of the same survey."""
+    """Write mesh and scenario of the same survey; return the scenario's path."""
     from lidarscenes.procedural.city import city
     from lidarscenes.writers.scene_file import write_scene
 
@@ -107,73 +112,82 @@ def scenario(rays: int, folder: Path) -> Path:
     return path
 
 
-def timed(side: str, rays: int, folder: Path) -> tuple[float, float]:
-    """Wall and processor seconds of the process that does one side, and of its children."""
-    out = folder / side
-    out.mkdir(exist_ok=True)
-    here = [sys.executable, "-m"]
+def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
+    """Return wall and processor seconds of the process of a side, including its children."""
+    out_folder = folder / side
+    out_folder.mkdir(exist_ok=True)
+    python = [sys.executable, "-m"]
     command = {
-        "script": [*here, "benchmarks.survey", "--script", str(out), "--rays", str(rays)],
-        "ours": [*here, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--only", "cloud"],
-        "pictures": [*here, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
+        "script": [*python, "benchmarks.survey", "--script", str(out_folder), "--rays", str(rays)],
+        "ours": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--only", "cloud"],
+        "pictures": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
     }[side]
     if side != "script":
-        command += ["--no-plan", "--out", str(out)]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        command += ["--no-plan", "--out", str(out_folder)]
+    usage_before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     wall = time.perf_counter() - began
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    usage_after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = (
+        usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
+    )
     return wall, cpu
 
 
 def main() -> None:
-    """Run the benchmark, or one side of it."""
+    """Run the benchmark, or the script's side alone."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--pictures", action="store_true", help="also with pictures and report")
     parser.add_argument("--script", type=Path, metavar="FOLDER", help="only do the script's side")
-    given = parser.parse_args()
-    if given.script:
-        script(given.rays, given.script)
+    options = parser.parse_args()
+    if options.script:
+        script(options.rays, options.script)
         return
-    sides = ["script", "ours", *(["pictures"] if given.pictures else [])]
+    sides = ["script", "ours", *(["pictures"] if options.pictures else [])]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        scenario(given.rays, folder)
+        scenario(options.rays, folder)
         times: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
-        for _ in range(given.rounds):
-            for side, found in times.items():
-                found.append(timed(side, given.rays, folder))
-                wall, cpu = found[-1]
+        for _ in range(options.rounds):
+            for side, side_times in times.items():
+                side_times.append(time_side(side, options.rays, folder))
+                wall, cpu = side_times[-1]
                 print(f"{side:8} {wall:7.2f} s wall {cpu:7.2f} s processor", flush=True)
         compare(folder)
-    for which, what in enumerate(("wall time", "processor time")):
+    for index, quantity in enumerate(("wall time", "processor time")):
         pairs = zip(times["ours"], times["script"], strict=True)
-        ratio = statistics.median(a[which] / b[which] for a, b in pairs)
-        print(f"{what}: ours {ratio:.2f} x the script's, median of {given.rounds}")
-    if given.pictures:
+        ratio = statistics.median(a[index] / b[index] for a, b in pairs)
+        print(f"{quantity}: ours {ratio:.2f} x the script's, median of {options.rounds}")
+    if options.pictures:
         pairs = zip(times["pictures"], times["ours"], strict=True)
-        more = statistics.median(a[0] - b[0] for a, b in pairs)
-        print(f"pictures and report: {more:.1f} s more")
+        pictures_s = statistics.median(a[0] - b[0] for a, b in pairs)
+        print(f"pictures and report: {pictures_s:.1f} s more")
 
 
 def compare(folder: Path) -> None:
-    """Compare both clouds: which points are there, and how far apart they are."""
+    """Print how many points of both clouds agree, and the distances between them."""
     from lidarpool import read_cloud
 
-    one, other = (read_cloud(folder / side / "cloud.ply") for side in ("script", "ours"))
-    same = len(one) == len(other) and np.logical_and.reduce(
-        [one[name] == other[name] for name in ("scan", "channel", "object")]
+    script_cloud, our_cloud = (
+        read_cloud(folder / side / "cloud.ply") for side in ("script", "ours")
     )
-    share = float(np.mean(same))
-    apart = np.abs(one.positions - other.positions).max(axis=1)[same] if share else np.zeros(1)
+    equal_rows = len(script_cloud) == len(our_cloud) and np.logical_and.reduce(
+        [script_cloud[name] == our_cloud[name] for name in ("scan", "channel", "object")]
+    )
+    share = float(np.mean(equal_rows))
+    distances = (
+        np.abs(script_cloud.positions - our_cloud.positions).max(axis=1)[equal_rows]
+        if share
+        else np.zeros(1)
+    )
     print(
-        f"{len(one):,} and {len(other):,} points, {share:.4%} of them in the same place of the "
-        f"order with the same labels; half of these within {np.median(apart):.3f} m, "
-        f"99.9 % within {np.quantile(apart, 0.999):.3f} m"
+        f"{len(script_cloud):,} and {len(our_cloud):,} points, {share:.4%} of them in the "
+        "same place of the order with the same labels; "
+        f"half of these within {np.median(distances):.3f} m, "
+        f"99.9 % within {np.quantile(distances, 0.999):.3f} m"
     )
 
 

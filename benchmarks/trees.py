@@ -42,7 +42,7 @@ _STACK = 256
 _BLOCK = 128
 
 
-def compiled(folder: Path) -> ctypes.CDLL:
+def compile_kernels(folder: Path) -> ctypes.CDLL:
     """Compile intersect.cu for the CPU, with counters."""
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
@@ -59,14 +59,14 @@ def compiled(folder: Path) -> ctypes.CDLL:
 
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
-    """Cast a job's rays; what was seen a ray, and the share that hit."""
+    """Cast a job's rays; return the counters per ray, and the share of hits."""
     directions = np.ascontiguousarray(job.directions @ job.rotation.T)
     n = len(directions)
     distance = np.empty(n)
-    place = np.empty(n, np.int32)
-    places = lay_out_instances(plain(mesh), layout.roots)
-    where = (places.frame, places.top, places.instances)
-    before = _seen(library)
+    triangle = np.empty(n, np.int32)
+    instance_layout = lay_out_instances(plain(mesh), layout.roots)
+    instance_tables = (instance_layout.frame, instance_layout.top, instance_layout.instances)
+    counters_before = _read_counters(library)
     hits = 0
     for origin in job.origins:
         tables = (
@@ -78,18 +78,29 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
         )
         rays = (np.array(origin), ctypes.c_int(0), directions)  # one origin for all
         limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
-        _run(library, "cast_table", n, *tables, *where, *rays, *limits, distance, place, place)
-        hits += int((place >= 0).sum())
-    seen = (_seen(library) - before) / job.rays
-    return {**dict(zip(KINDS, seen.tolist(), strict=True)), "hit_share": hits / job.rays}
+        _run(
+            library,
+            "cast_table",
+            n,
+            *tables,
+            *instance_tables,
+            *rays,
+            *limits,
+            distance,
+            triangle,
+            triangle,
+        )
+        hits += int((triangle >= 0).sum())
+    per_ray = (_read_counters(library) - counters_before) / job.rays
+    return {**dict(zip(KINDS, per_ray.tolist(), strict=True)), "hit_share": hits / job.rays}
 
 
-def _seen(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
+def _read_counters(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
     return np.array(library.what_was_seen()[: len(KINDS)])
 
 
 def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None:
-    """Launch a kernel, see tests/raybeam/host/launch.h."""
+    """Launch a kernel; tests/raybeam/host/launch.h defines its interface."""
     assert getattr(library, f"parameters_{name}")() == len(arguments)
     values = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -97,12 +108,14 @@ def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None
 
 
 def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
-    """Both trees on one job."""
+    """Measure all trees on a job."""
     mesh = local_mesh(job.vertices, job.faces)
     row: dict[str, Any] = {"scene": job.name, "triangles": len(mesh.corners), "rays": job.rays}
-    for name, left in TREES.items():
+    for name, cluster_limits in TREES.items():
         start = time.process_time()
-        layout = lay_out((mesh,)) if left is None else _laid_out(mesh, left)
+        layout = (
+            lay_out((mesh,)) if cluster_limits is None else _lay_out_limited(mesh, cluster_limits)
+        )
         row[name] = {
             "build_s": time.process_time() - start,
             "tree_nodes": len(layout.nodes),
@@ -111,14 +124,17 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     return row
 
 
-def _laid_out(mesh: LocalMesh, left: tuple[int, int]) -> Layout:
-    """Lay out a mesh with so many clusters left to the sweep."""
-    with patch.object(ploc, "_MAX_CLUSTERS", left[0]), patch.object(ploc, "_MIN_CLUSTERS", left[1]):
+def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout:
+    """Lay out a mesh with limits on the clusters left to the sweep."""
+    with (
+        patch.object(ploc, "_MAX_CLUSTERS", cluster_limits[0]),
+        patch.object(ploc, "_MIN_CLUSTERS", cluster_limits[1]),
+    ):
         return lay_out((mesh,))
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print one scene's counts, as a line of a table."""
+    """Print the counts of a scene as a row of the table."""
     cells = [row["scene"], f"{row['triangles']:,}"]
     cells += [" / ".join(f"{row[name][kind]:.2f}" for name in TREES) for kind in KINDS]
     cells.append(f"{row['ours']['nodes'] / row['sweep']['nodes']:.2f}")
@@ -127,7 +143,7 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 2 without a compiler."""
+    """Run from the command line; return 2 without a compiler."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy scenes, few rays")
     parser.add_argument("--scene", action="append", help="only this one; may be given again")
@@ -146,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"of each: {' / '.join(TREES)}")
     print("| scene | triangles | nodes | triangle tests | decisions | nodes, ratio | seconds |")
     with tempfile.TemporaryDirectory() as folder:
-        library = compiled(Path(folder))
+        library = compile_kernels(Path(folder))
         for name, make in makers.items():
             if not chosen.scene or name in chosen.scene:
                 rows.append(measure(library, make()))

@@ -11,8 +11,8 @@ from poolpart import Partition
 from poolpart.deploy import start_partitions
 
 
-def where(number: int) -> str:
-    """Name of the worker that runs this."""
+def worker_name(number: int) -> str:
+    """Return the name of the worker that runs the task."""
     return str(get_worker().name)
 
 
@@ -22,8 +22,9 @@ if __name__ == "__main__":
         partitions = {"GPU": {"adapt": [0, 2], "idle_s": 2}, "IO": {"adapt": [0, 2], "slots": 4}}
         start_partitions(cluster, partitions)
         with Client(cluster) as client:
-            gpu, io = Partition("GPU", client), Partition("IO", client)
+            gpu = Partition("GPU", client)
+            io = Partition("IO", client)
             print("workers:", len(gpu), len(io))
-            names = set(gpu.map(where, range(200)))
+            names = set(gpu.map(worker_name, range(200)))
             print("200 tasks of GPU ran on", *sorted({name.partition("-")[0] for name in names}))
             print("workers of IO:", len(io))

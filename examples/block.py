@@ -22,10 +22,17 @@ from lidarscenes.procedural.plants import SPECIES, tree
 
 Array = NDArray[np.float64]
 
-EAST, NORTH = 691_000.0, 5_334_000.0  # middle of the block, EPSG:25832
-HALF, CORNER, WIDTH = 100.0, 14.0, 8.0  # of the street around the block, metres
+# Middle of the block, EPSG:25832.
+EAST = 691_000.0
+NORTH = 5_334_000.0
+# Of the street around the block, metres.
+HALF = 100.0
+CORNER = 14.0
+WIDTH = 8.0
 LIFT = 0.04  # of the street above the hills
-TREES, CARS, SECONDS = 500, 100, 12
+TREES = 500
+CARS = 100
+SECONDS = 12
 STREET_AT = 0.5  # of the file's steps, seconds
 
 
@@ -34,18 +41,20 @@ def height(x: Array, y: Array) -> Array:
     return np.asarray(512 + 1.6 * np.sin(x / 47) + 1.1 * np.cos(y / 39))
 
 
-def ring(way: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
+def ring(distance_m: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
     """Points on the street's middle line, counter-clockwise: x, y, and the direction of travel."""
-    straight, arc = 2 * (HALF - CORNER), np.pi / 2 * CORNER
-    side, rest = np.divmod(way % (4 * (straight + arc)), straight + arc)
-    turn = np.clip((rest - straight) / CORNER, 0, np.pi / 2)
-    along = np.minimum(rest, straight) - straight / 2
-    x = along + (CORNER + aside) * np.sin(turn)
-    y = -HALF + CORNER - (CORNER + aside) * np.cos(turn)
+    straight = 2 * (HALF - CORNER)
+    arc = np.pi / 2 * CORNER
+    side, along_side = np.divmod(distance_m % (4 * (straight + arc)), straight + arc)
+    arc_angle = np.clip((along_side - straight) / CORNER, 0, np.pi / 2)
+    straight_m = np.minimum(along_side, straight) - straight / 2
+    x = straight_m + (CORNER + aside) * np.sin(arc_angle)
+    y = -HALF + CORNER - (CORNER + aside) * np.cos(arc_angle)
     # Each side is the first one, turned.
     angle = side * np.pi / 2
-    c, s = np.cos(angle), np.sin(angle)
-    return c * x - s * y, s * x + c * y, angle + turn
+    c = np.cos(angle)
+    s = np.sin(angle)
+    return c * x - s * y, s * x + c * y, angle + arc_angle
 
 
 LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
@@ -53,18 +62,18 @@ LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
 
 def raster(path: Path) -> None:
     """Write the hills, 200 x 200 pixels of 2 m."""
-    at = np.arange(-199.0, 200, 2)
-    heights = height(at[None, :], at[::-1, None])
-    place = from_origin(EAST - 200, NORTH + 200, 2, 2)
+    coordinates = np.arange(-199.0, 200, 2)
+    heights = height(coordinates[None, :], coordinates[::-1, None])
+    transform = from_origin(EAST - 200, NORTH + 200, 2, 2)
     with rasterio.open(
         path, "w", driver="GTiff", width=200, height=200, count=1, dtype="float32",
-        crs="EPSG:25832", transform=place, compress="deflate", predictor=3,
+        crs="EPSG:25832", transform=transform, compress="deflate", predictor=3,
     ) as file:  # fmt: skip
         file.write(heights.astype("float32"), 1)
 
 
 def traffic(path: Path) -> None:
-    """Write floating car data, as SUMO does: two lanes against each other, without accidents."""
+    """Write floating car data, as SUMO does: two opposite lanes, without accidents."""
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
     cars = np.arange(CARS)
     ahead = cars % 2 == 0
@@ -105,7 +114,7 @@ def crossing_image() -> Image.Image:
 
 
 def facade_image() -> Image.Image:
-    """Paint a window and the wall around it, 3 x 3 m."""
+    """Paint a window and its wall, 3 x 3 m."""
     rng = np.random.default_rng(2)
     image = (
         np.array([176, 128, 100]) + rng.choice([-14, 0, 10], (150, 150, 1), p=[0.15, 0.7, 0.15])
@@ -141,7 +150,7 @@ class Block:
         return mesh.GetPrim()
 
     def colour(self, prim: Usd.Prim, colours: list[tuple[float, ...]]) -> None:
-        """Give a mesh one colour, or one for each polygon, in linear light."""
+        """Colour a mesh, or each of its polygons, in linear light."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
             UsdGeom.Tokens.uniform if len(colours) > 1 else UsdGeom.Tokens.constant
         )
@@ -177,99 +186,118 @@ class Block:
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
     def strip(self, name: str, begin: float, end: float, step: float, lift: float) -> Usd.Prim:
-        """Add a piece of the street; u counts 12 m along it."""
-        along, aside = np.meshgrid(
+        """Add a piece of the street; u counts 12 m along the street."""
+        distance_m, aside = np.meshgrid(
             np.arange(begin, end + step / 2, step), np.linspace(-WIDTH / 2, WIDTH / 2, 5),
             indexing="ij",
         )  # fmt: skip
-        x, y, _ = ring(along, -aside)
+        x, y, _ = ring(distance_m, -aside)
         points = np.stack([x, y, height(x, y) + lift], axis=-1).reshape(-1, 3)
-        at = np.arange(along.size).reshape(along.shape)
-        corners = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], axis=-1)
+        indices = np.arange(distance_m.size).reshape(distance_m.shape)
+        corners = np.stack(
+            [indices[:-1, :-1], indices[1:, :-1], indices[1:, 1:], indices[:-1, 1:]], axis=-1
+        )
         length = 12.0 if name == "Street" else end - begin
-        uv = np.stack([(along - begin) / length, aside / WIDTH + 0.5], axis=-1).reshape(-1, 2)
+        uv = np.stack([(distance_m - begin) / length, aside / WIDTH + 0.5], axis=-1).reshape(-1, 2)
         return self.mesh(name, points, corners.reshape(-1, 4), uv)
 
 
-def building(low: Array, size: Array) -> tuple[Array, Array, Array]:
+def building(corner: Array, size: Array) -> tuple[Array, Array, Array]:
     """Walls of a house with a window every 3 m, and a flat roof without: points, corners, uv."""
     x, y, z = size
     outline = np.array([[0, 0], [x, 0], [x, y], [0, y], [0, 0]])
-    points, corners, uv = [], [], []
+    points = []
+    corners = []
+    uv = []
     for side in range(4):
-        a, b = outline[side], outline[side + 1]
-        wide = round(float(np.linalg.norm(b - a)) / 3)
+        a = outline[side]
+        b = outline[side + 1]
+        windows = round(float(np.linalg.norm(b - a)) / 3)
         first = len(points)
         points += [(*a, -4), (*b, -4), (*b, z), (*a, z)]
-        uv += [(0, -4 / 3), (wide, -4 / 3), (wide, z / 3), (0, z / 3)]
+        uv += [(0, -4 / 3), (windows, -4 / 3), (windows, z / 3), (0, z / 3)]
         corners.append(np.arange(first, first + 4))
     first = len(points)
     points += [(*p, z) for p in outline[:4]]
     uv += [(0.02, 0.98)] * 4
     corners.append(np.arange(first, first + 4))
-    return np.array(points, np.float64) + low, np.array(corners), np.array(uv)
+    return np.array(points, np.float64) + corner, np.array(corners), np.array(uv)
 
 
 def block(path: Path) -> None:
     """Write the city block, its origin in the middle of the street's square."""
-    made = Block(path)
-    made.texture(made.strip("Street", 0, LENGTH, 1.0, LIFT), street_image(), "block-street.png")
+    stage = Block(path)
+    stage.texture(stage.strip("Street", 0, LENGTH, 1.0, LIFT), street_image(), "block-street.png")
     for number in range(4):
         begin = number * LENGTH / 4 + 20
-        crossing = made.strip(f"Crossing_{number + 1}", begin, begin + 4, 1.0, 2 * LIFT)
-        made.texture(crossing, crossing_image(), "block-crossing.png")
+        crossing = stage.strip(f"Crossing_{number + 1}", begin, begin + 4, 1.0, 2 * LIFT)
+        stage.texture(crossing, crossing_image(), "block-crossing.png")
     rng = np.random.default_rng(3)
-    taken = []
+    occupied = []
     for number, (x, y) in enumerate((x, y) for x in (-84, -40, 4, 56) for y in (-84, -48, 16, 60)):
         size = np.array([*(3 * rng.integers(5, 9, 2)), 3 * rng.integers(3, 7)], np.float64)
-        low = np.array([x, y, float(height(np.array(x), np.array(y)))])
-        points, corners, uv = building(low, size)
-        house = made.mesh(f"House_{number + 1}", points, corners, uv)
-        made.texture(house, facade_image(), "block-facade.png")
-        taken.append((x - 4, y - 4, x + size[0] + 4, y + size[1] + 4))
-    for number, (turn, aside) in enumerate([(0, 16), (90, 20), (180, 18), (270, 22)]):
+        corner = np.array([x, y, float(height(np.array(x), np.array(y)))])
+        points, corners, uv = building(corner, size)
+        house = stage.mesh(f"House_{number + 1}", points, corners, uv)
+        stage.texture(house, facade_image(), "block-facade.png")
+        occupied.append((x - 4, y - 4, x + size[0] + 4, y + size[1] + 4))
+    for number, (yaw_deg, aside) in enumerate([(0, 16), (90, 20), (180, 18), (270, 22)]):
         # Beyond the street.
         points, corners, uv = building(np.zeros(3), np.array([90, 12, 9 + 3 * number]))
-        angle = np.radians(turn)
-        x, y = points[:, 0] - 45, points[:, 1] - HALF - aside - 12
-        points[:, 0], points[:, 1] = (
-            np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y,
-        )  # fmt: skip
+        angle = np.radians(yaw_deg)
+        x = points[:, 0] - 45
+        y = points[:, 1] - HALF - aside - 12
+        points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
+        points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
         points[:, 2] += 512
-        house = made.mesh(f"Row_{number + 1}", points, corners, uv)
-        made.texture(house, facade_image(), "block-facade.png")
-    trees(made, rng, taken)
-    made.stage.GetRootLayer().Export(str(path))
+        house = stage.mesh(f"Row_{number + 1}", points, corners, uv)
+        stage.texture(house, facade_image(), "block-facade.png")
+    trees(stage, rng, occupied)
+    stage.stage.GetRootLayer().Export(str(path))
 
 
-def trees(made: Block, rng: np.random.Generator, taken: list[tuple[float, ...]]) -> None:
+def trees(stage: Block, rng: np.random.Generator, occupied: list[tuple[float, ...]]) -> None:
     """Add an avenue along both sides of the street, and a park between the houses."""
-    shape = tree(next(one for one in SPECIES if one.name == "Maple"), seed=1)
-    trees = UsdGeom.PointInstancer.Define(made.stage, "/Block/Trees")
-    maple = made.mesh("Trees/Maple", shape.vertices, shape.faces)
-    leaves = len(shape.faces) - 13 * 10 * 40
-    brown, green = (0.10, 0.06, 0.04), (0.09, 0.22, 0.04)
-    made.colour(maple, [brown] * leaves + [green] * (len(shape.faces) - leaves))
-    along = np.arange(0, LENGTH, LENGTH / 80)
-    avenue = [ring(along, side)[:2] for side in (WIDTH / 2 + 3.5, -WIDTH / 2 - 3.5)]
-    x, y = (np.concatenate(axis) for axis in zip(*avenue, strict=True))
-    places = list(zip(x.tolist(), y.tolist(), strict=True))
-    while len(places) < TREES:
+    instancer = UsdGeom.PointInstancer.Define(stage.stage, "/Block/Trees")
+    maple = maple_tree(stage)
+    x, y = np.array(tree_positions(rng, occupied)).T
+    points = np.column_stack([x, y, height(x, y)]).astype(np.float32)
+    instancer.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(points))
+    instancer.CreateProtoIndicesAttr([0] * TREES)
+    half_yaws = rng.uniform(0, np.pi, TREES).tolist()
+    instancer.CreateOrientationsAttr([Gf.Quath(np.cos(t), 0, 0, np.sin(t)) for t in half_yaws])
+    sizes = rng.uniform(0.6, 1.1, TREES).tolist()
+    instancer.CreateScalesAttr([Gf.Vec3f(size, size, size) for size in sizes])
+    instancer.CreatePrototypesRel().SetTargets([maple.GetPath()])
+
+
+def maple_tree(stage: Block) -> Usd.Prim:
+    """Add the mesh of a maple, with brown wood and green leaves."""
+    shape = tree(next(species for species in SPECIES if species.name == "Maple"), seed=1)
+    maple = stage.mesh("Trees/Maple", shape.vertices, shape.faces)
+    wood = len(shape.faces) - 13 * 10 * 40
+    brown = (0.10, 0.06, 0.04)
+    green = (0.09, 0.22, 0.04)
+    stage.colour(maple, [brown] * wood + [green] * (len(shape.faces) - wood))
+    return maple
+
+
+def tree_positions(
+    rng: np.random.Generator, occupied: list[tuple[float, ...]]
+) -> list[tuple[float, float]]:
+    """Return x and y of all trees: the avenue, then random free positions."""
+    distance_m = np.arange(0, LENGTH, LENGTH / 80)
+    avenue = [ring(distance_m, side)[:2] for side in (WIDTH / 2 + 3.5, -WIDTH / 2 - 3.5)]
+    avenue_x, avenue_y = (np.concatenate(axis) for axis in zip(*avenue, strict=True))
+    positions = list(zip(avenue_x.tolist(), avenue_y.tolist(), strict=True))
+    while len(positions) < TREES:
         x, y = rng.uniform(-195, 195, 2).tolist()
         inside = max(abs(x), abs(y)) < HALF - 14
         outside = max(abs(x), abs(y)) > HALF + 45
-        free = not any(a < x < c and b < y < d for a, b, c, d in taken)
-        if (outside or (inside and free and abs(y) < 14)) and len(places) < TREES:
-            places.append((x, y))
-    x, y = np.array(places).T
-    points = np.column_stack([x, y, height(x, y)]).astype(np.float32)
-    trees.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(points))
-    trees.CreateProtoIndicesAttr([0] * TREES)
-    turns = rng.uniform(0, np.pi, TREES)
-    trees.CreateOrientationsAttr([Gf.Quath(np.cos(t), 0, 0, np.sin(t)) for t in turns.tolist()])
-    sizes = rng.uniform(0.6, 1.1, TREES).tolist()
-    trees.CreateScalesAttr([Gf.Vec3f(size, size, size) for size in sizes])
-    trees.CreatePrototypesRel().SetTargets([maple.GetPath()])
+        free = not any(a < x < c and b < y < d for a, b, c, d in occupied)
+        if (outside or (inside and free and abs(y) < 14)) and len(positions) < TREES:
+            positions.append((x, y))
+    return positions
 
 
 if __name__ == "__main__":

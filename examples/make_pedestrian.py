@@ -13,10 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-SPEED_M_S, CYCLE_S, KEYS = 1.4, 1.05, 36
-STANCE, LEG, ANKLE_M = 0.62, 0.43, 0.08  # share of the cycle, length of thigh and shank, height
-HEEL, BALL = -0.05, 0.13  # of a foot, ahead of its ankle
-STRIKE_M, HIP_M = 0.27, 0.90  # where heels strike, ahead of the hips, and the height of the hips
+SPEED_M_S = 1.4
+CYCLE_S = 1.05
+KEYS = 36  # of the animation
+STANCE = 0.62  # share of the cycle
+LEG = 0.43  # length of thigh and shank, metres
+ANKLE_M = 0.08  # height
+# Of a foot, ahead of its ankle, metres.
+HEEL = -0.05
+BALL = 0.13
+STRIKE_M = 0.27  # where heels strike, ahead of the hips
+HIP_M = 0.90  # height of the hips
 LIFT_M = 0.08  # by which a foot in the air is lifted
 # Joints: name, parent, place in the figure as it is modelled. L is at positive y.
 JOINTS = [("hips", None, (0, 0, 0.94)), ("spine", "hips", (0, 0, 1.08)),
@@ -37,8 +44,10 @@ class Figure:
     """Vertices, triangles, and up to two joints of each vertex with their weights."""
 
     def __init__(self) -> None:
-        self.points, self.faces = [], []
-        self.joints, self.weights = [], []
+        self.points = []
+        self.faces = []
+        self.joints = []
+        self.weights = []
 
     def tube(self, rings, held, across=16, along=2) -> None:
         """Add a closed tube through rings: middle x, y, z and two half axes.
@@ -46,13 +55,14 @@ class Figure:
         `held` gives two joints and the weight of the second by the coordinate `along`, the axis
         that the ellipses are at right angles to.
         """
-        first, angles = len(self.points), 2 * np.pi * np.arange(across) / across
-        one, other = [axis for axis in range(3) if axis != along]
+        first = len(self.points)
+        angles = 2 * np.pi * np.arange(across) / across
+        first_axis, second_axis = [axis for axis in range(3) if axis != along]
         for *middle, a, b in rings:
             for angle in angles:
                 point = np.array(middle, float)
-                point[one] += a * np.cos(angle)
-                point[other] += b * np.sin(angle)
+                point[first_axis] += a * np.cos(angle)
+                point[second_axis] += b * np.sin(angle)
                 self._add(point, held(point[along]))
         tips = [len(self.points), len(self.points) + 1]
         for *middle, _, _ in (rings[0], rings[-1]):
@@ -65,25 +75,26 @@ class Figure:
                 self.faces += quads if turned else [q[::-1] for q in quads]
         last = first + (len(rings) - 1) * across
         for k in range(across):
-            a, b = k, (k + 1) % across
-            ends = [(tips[0], first + b, first + a), (tips[1], last + a, last + b)]
-            self.faces += ends if turned else [e[::-1] for e in ends]
+            a = k
+            b = (k + 1) % across
+            caps = [(tips[0], first + b, first + a), (tips[1], last + a, last + b)]
+            self.faces += caps if turned else [e[::-1] for e in caps]
 
     def _add(self, point, held) -> None:
-        one, other, share = held
+        joint, next_joint, share = held
         self.points.append(point)
-        self.joints.append([NAMES.index(one), NAMES.index(other), 0, 0])
+        self.joints.append([NAMES.index(joint), NAMES.index(next_joint), 0, 0])
         self.weights.append([1 - share, share, 0, 0])
 
 
 def blend(*stops):
-    """Give joints by a coordinate that falls: (name, from here on the next one, over so far)."""
+    """Return a function that gives joints by a falling coordinate; stops are (name, end, reach)."""
 
-    def held(at):
-        for (one, below, reach), (other, *_) in pairwise(stops):
-            share = np.clip((below + reach - at) / (2 * reach), 0, 1)
+    def held(coordinate):
+        for (joint, below, reach), (next_joint, *_) in pairwise(stops):
+            share = np.clip((below + reach - coordinate) / (2 * reach), 0, 1)
             if share < 1:
-                return one, other, float(share)
+                return joint, next_joint, float(share)
         return stops[-1][0], stops[-1][0], 0.0
 
     return held
@@ -91,7 +102,7 @@ def blend(*stops):
 
 def figure() -> Figure:
     """Model the body, standing."""
-    made = Figure()
+    person = Figure()
     torso = [
         (0.84, 0.07, 0.10),
         (0.88, 0.105, 0.15),
@@ -107,11 +118,11 @@ def figure() -> Figure:
         (1.54, 0.052, 0.052),
     ]
     body = blend(("head", 1.5, 0.03), ("spine", 1.05, 0.08), ("hips", 0, 1))
-    made.tube([(0, 0, z, a, b) for z, a, b in torso], body)
+    person.tube([(0, 0, z, a, b) for z, a, b in torso], body)
     tilt = np.radians(np.linspace(-85, 85, 11))
     skull = [(0.02, 0, 1.635 + 0.115 * np.sin(t), 0.098 * np.cos(t), 0.076 * np.cos(t))
              for t in tilt]  # fmt: skip
-    made.tube(skull, lambda z: ("head", "head", 0.0))
+    person.tube(skull, lambda z: ("head", "head", 0.0))
     legs = [
         (0.95, 0.09, 0.078),
         (0.88, 0.092, 0.085),
@@ -146,144 +157,177 @@ def figure() -> Figure:
     for side, y in (("L", 1), ("R", -1)):
         leg = blend(("hips", 0.93, 0.06), (f"thigh{side}", 0.51, 0.06),
                     (f"shank{side}", 0.09, 0.03), (f"foot{side}", 0, 1))  # fmt: skip
-        made.tube([(0, 0.09 * y, z, a, b) for z, a, b in legs], leg, 14)
-        made.tube([(x, 0.095 * y, z, a, b) for x, z, a, b in foot],
+        person.tube([(0, 0.09 * y, z, a, b) for z, a, b in legs], leg, 14)
+        person.tube([(x, 0.095 * y, z, a, b) for x, z, a, b in foot],
                   lambda x, own=side: (f"foot{own}", f"toes{own}", np.clip((x - 0.1) / 0.06, 0, 1)),
                   12, along=0)  # fmt: skip
         arm = blend(("spine", 1.44, 0.03), (f"arm{side}", 1.13, 0.05), (f"forearm{side}", 0, 1))
-        made.tube([(0, w * y, z, a, b) for z, w, a, b in arms], arm, 12)
-    return made
+        person.tube([(0, w * y, z, a, b) for z, w, a, b in arms], arm, 12)
+    return person
 
 
-def turn(angle, axis=1):
-    """Quaternions x, y, z, w of turns about an axis."""
-    out = np.zeros((*np.shape(angle), 4))
-    out[..., axis], out[..., 3] = np.sin(np.asarray(angle) / 2), np.cos(np.asarray(angle) / 2)
-    return out
+def rotations(angle, axis=1):
+    """Return quaternions x, y, z, w of rotations about an axis."""
+    quaternions = np.zeros((*np.shape(angle), 4))
+    quaternions[..., axis], quaternions[..., 3] = (
+        np.sin(np.asarray(angle) / 2),
+        np.cos(np.asarray(angle) / 2),
+    )
+    return quaternions
 
 
 def times(p, q):
-    """Products of quaternions."""
+    """Return products of quaternions."""
     (a, b, c, d), (e, f, g, h) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
     return np.stack([d * e + a * h + b * g - c * f, d * f - a * g + b * h + c * e,
                      d * g + a * f - b * e + c * h, d * h - a * e - b * f - c * g], -1)  # fmt: skip
 
 
 def ankle(phase):
-    """Place of an ankle, ahead of the hips and above the ground, and pitch, toes up, of its foot.
+    """Return ahead and up of an ankle from hips and ground, and pitch, toes up, of its foot.
 
     The phase is 0 where the heel strikes.
     """
     phase = np.asarray(phase) % 1
 
     def standing(phase):
-        gone = SPEED_M_S * CYCLE_S * phase
+        travelled = SPEED_M_S * CYCLE_S * phase
         up = np.radians(20) * np.clip(1 - phase / 0.1, 0, 1)
         rises = np.clip((phase - 0.32) / (STANCE - 0.32), 0, 1)
         down = np.radians(60) * rises**1.6
-        pitch, about = up - down, np.where(phase < 0.2, HEEL, BALL)
-        x = STRIKE_M - HEEL + about - gone - (about * np.cos(pitch) + ANKLE_M * np.sin(pitch))
-        return np.stack([x, ANKLE_M * np.cos(pitch) - about * np.sin(pitch), pitch])
+        pitch = up - down
+        pivot = np.where(phase < 0.2, HEEL, BALL)
+        x = STRIKE_M - HEEL + pivot - travelled - (pivot * np.cos(pitch) + ANKLE_M * np.sin(pitch))
+        return np.stack([x, ANKLE_M * np.cos(pitch) - pivot * np.sin(pitch), pitch])
 
     # In the air: on a cubic from where and how the foot leaves to where and how it strikes.
-    step, air = 1e-4, 1 - STANCE
+    step = 1e-4
+    air = 1 - STANCE
     u = np.clip((phase - STANCE) / air, 0, 1)
-    leaves, strikes = standing(STANCE), standing(0.0)
-    out = (leaves - standing(STANCE - step)) / step * air
-    into = (standing(step) - strikes) / step * air
-    out[1:], into[1:] = 0, 0
+    leaves = standing(STANCE)
+    strikes = standing(0.0)
+    leaving_slope = (leaves - standing(STANCE - step)) / step * air
+    striking_slope = (standing(step) - strikes) / step * air
+    leaving_slope[1:] = 0
+    striking_slope[1:] = 0
     one, other = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3), (u**3 - 2 * u**2 + u, u**3 - u**2)
     path = [
         one[0] * p + one[1] * q + other[0] * v + other[1] * w
-        for p, v, q, w in zip(leaves, out, strikes, into, strict=True)
+        for p, v, q, w in zip(leaves, leaving_slope, strikes, striking_slope, strict=True)
     ]
     path[1] = path[1] + LIFT_M * np.sin(np.pi * u) ** 2
     return np.where(phase < STANCE, standing(phase), path)
 
 
 def walk(phase):
-    """Rotations of joints, and the place of the hips, at phases (k,): {joint: (k, 4 or 3)}."""
+    """Return rotations of joints, and positions of the hips, at phases (k,): {joint: (k, …)}."""
     cycle = 2 * np.pi * phase
     swing = np.cos(cycle)  # of the left leg, ahead
     yaw = np.radians(6) * -swing  # turns the left hip ahead
     height = HIP_M + 0.018 * np.cos(2 * (cycle - 2 * np.pi * 0.32))
     sway = 0.02 * np.sin(cycle)
-    moved = {"hips": turn(yaw, 2), "spine": times(turn(-2 * yaw, 2), turn(np.radians(3) + 0 * yaw)),
-             "head": turn(yaw, 2)}  # fmt: skip
+    lean = rotations(np.radians(3) + 0 * yaw)
+    moved = {
+        "hips": rotations(yaw, 2),
+        "spine": times(rotations(-2 * yaw, 2), lean),
+        "head": rotations(yaw, 2),
+    }
     moved["translation"] = np.stack([0 * phase, sway, height + 0.94 - ANKLE_M - 2 * LEG], axis=-1)
     for side, late, y in (("L", 0.0, 1), ("R", 0.5, -1)):
         x, z, pitch = ankle(phase - late)
         x = x + np.sin(yaw) * 0.09 * y
-        far = np.minimum(np.hypot(x, height - z), 1.999 * LEG)
-        bent = np.arccos(far / (2 * LEG))
+        reach = np.minimum(np.hypot(x, height - z), 1.999 * LEG)
+        bent = np.arccos(reach / (2 * LEG))
         ahead = np.arctan2(x, height - z) + bent
-        moved[f"thigh{side}"] = times(turn(-yaw, 2), turn(-ahead))
-        moved[f"shank{side}"] = turn(2 * bent)
-        moved[f"foot{side}"] = turn(ahead - 2 * bent - pitch)
+        moved[f"thigh{side}"] = times(rotations(-yaw, 2), rotations(-ahead))
+        moved[f"shank{side}"] = rotations(2 * bent)
+        moved[f"foot{side}"] = rotations(ahead - 2 * bent - pitch)
         flying = np.clip(((phase - late) % 1 - STANCE) / 0.25, 0, 1)
-        moved[f"toes{side}"] = turn(np.minimum(pitch, 0) * (1 - flying))  # flat on the ground
+        moved[f"toes{side}"] = rotations(np.minimum(pitch, 0) * (1 - flying))  # flat on the ground
         forth = -swing if side == "L" else swing
-        moved[f"arm{side}"] = turn(-np.radians(24) * forth + np.radians(2))
-        moved[f"forearm{side}"] = turn(-np.radians(18 + 12 * forth))
+        moved[f"arm{side}"] = rotations(-np.radians(24) * forth + np.radians(2))
+        moved[f"forearm{side}"] = rotations(-np.radians(18 + 12 * forth))
     return moved
 
 
-def glb(made: Figure) -> bytes:
-    """Pack figure, skin and animation into a file."""
-    views, accessors, body = [], [], b""
+class Buffer:
+    """Binary chunk of a glTF file, with the views and accessors of the stored arrays."""
 
-    def stored(array, kind, **more) -> int:
-        nonlocal body
+    def __init__(self) -> None:
+        self.views = []
+        self.accessors = []
+        self.data = b""
+
+    def store(self, array, kind, **extra) -> int:
+        """Append an array; return the index of its accessor."""
         array = np.ascontiguousarray(array)
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
-        body += array.tobytes() + bytes(-array.nbytes % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
+        self.views.append(view)
+        self.data += array.tobytes() + bytes(-array.nbytes % 4)
         part = {"f": 5126, "B": 5121, "H": 5123}[array.dtype.char]
         count = array.size // {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[kind]
-        accessors.append({"bufferView": len(views) - 1, "componentType": part, "type": kind,
-                          "count": count, **more})  # fmt: skip
-        return len(accessors) - 1
+        self.accessors.append({"bufferView": len(self.views) - 1, "componentType": part,
+                               "type": kind, "count": count, **extra})  # fmt: skip
+        return len(self.accessors) - 1
 
-    places = {name: np.array(place, float) for name, _, place in JOINTS}
-    bound = np.tile(np.eye(4, dtype="f"), (len(JOINTS), 1, 1))
-    bound[:, 3, :3] = [-place for place in places.values()]
-    points = np.array(made.points, "f")
-    limits = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-    attributes = {
-        "POSITION": stored(points, "VEC3", **limits),
-        "JOINTS_0": stored(np.array(made.joints, "B"), "VEC4"),
-        "WEIGHTS_0": stored(np.array(made.weights, "f"), "VEC4"),
-    }
-    faces = stored(np.array(made.faces, "H"), "SCALAR")
-    inverse = stored(bound, "MAT4")
+
+def skeleton() -> list[dict]:
+    """Return the nodes: the root, the body and the joints."""
+    positions = {name: np.array(position, float) for name, _, position in JOINTS}
     nodes = [{"name": "Pedestrian", "children": [1, 2], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]},
              {"name": "Body", "mesh": 0, "skin": 0}]  # fmt: skip
-    for name, parent, place in JOINTS:
-        start = 0.0 if parent is None else places[parent]
+    for name, parent, position in JOINTS:
+        start = 0.0 if parent is None else positions[parent]
         children = [2 + k for k, (_, above, _) in enumerate(JOINTS) if above == name]
-        nodes.append({"name": name, "translation": (np.array(place) - start).tolist()}
+        nodes.append({"name": name, "translation": (np.array(position) - start).tolist()}
                      | ({"children": children} if children else {}))  # fmt: skip
+    return nodes
+
+
+def walk_animation(buffer: Buffer) -> dict:
+    """Store the keys of a cycle; return the animation."""
     phase = np.linspace(0, 1, KEYS + 1)
-    when = np.array(CYCLE_S * phase, "f")
-    keys = stored(when, "SCALAR", min=[0.0], max=[float(when[-1])])
-    samplers, channels = [], []
+    times = np.array(CYCLE_S * phase, "f")
+    keys = buffer.store(times, "SCALAR", min=[0.0], max=[float(times[-1])])
+    samplers = []
+    channels = []
     for name, values in walk(phase).items():
         kind, path = ("VEC3", name) if name == "translation" else ("VEC4", "rotation")
         node = 2 + NAMES.index("hips" if name == "translation" else name)
-        samplers.append({"input": keys, "output": stored(np.array(values, "f"), kind)})
+        samplers.append({"input": keys, "output": buffer.store(np.array(values, "f"), kind)})
         target = {"node": node, "path": path}
         channels.append({"sampler": len(samplers) - 1, "target": target})
+    return {"name": "Walk", "samplers": samplers, "channels": channels}
+
+
+def glb(person: Figure) -> bytes:
+    """Pack figure, skin and animation into a file."""
+    buffer = Buffer()
+    bound = np.tile(np.eye(4, dtype="f"), (len(JOINTS), 1, 1))
+    bound[:, 3, :3] = [-np.array(position, float) for _, _, position in JOINTS]
+    points = np.array(person.points, "f")
+    limits = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    attributes = {
+        "POSITION": buffer.store(points, "VEC3", **limits),
+        "JOINTS_0": buffer.store(np.array(person.joints, "B"), "VEC4"),
+        "WEIGHTS_0": buffer.store(np.array(person.weights, "f"), "VEC4"),
+    }
+    faces = buffer.store(np.array(person.faces, "H"), "SCALAR")
+    inverse = buffer.store(bound, "MAT4")
+    animation = walk_animation(buffer)
     header = {
         "asset": {"version": "2.0", "generator": "lidarpool"},
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes,
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": skeleton(),
         "meshes": [{"name": "Body", "primitives": [{"attributes": attributes, "indices": faces}]}],
         "skins": [{"joints": list(range(2, 2 + len(JOINTS))), "inverseBindMatrices": inverse}],
-        "animations": [{"name": "Walk", "samplers": samplers, "channels": channels}],
-        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(body)}],
+        "animations": [animation],
+        "accessors": buffer.accessors, "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
     }  # fmt: skip
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+    chunks += struct.pack("<I4s", len(buffer.data), b"BIN\0") + buffer.data
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 

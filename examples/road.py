@@ -11,8 +11,12 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-LENGTH_M, WIDTH_M, PIXEL_M = 48.0, 9.6, 0.05
-ASPHALT, WHITE, YELLOW = (88, 88, 90), (236, 236, 230), (222, 176, 40)
+LENGTH_M = 48.0
+WIDTH_M = 9.6
+PIXEL_M = 0.05
+ASPHALT = (88, 88, 90)
+WHITE = (236, 236, 230)
+YELLOW = (222, 176, 40)
 TURN = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])  # from Z-up to Y-up
 
 
@@ -29,16 +33,19 @@ def markings() -> Image.Image:
     return Image.fromarray(image)
 
 
-def slab(low: tuple[float, ...], high: tuple[float, ...], colour: list[float]) -> trimesh.Trimesh:
-    """Make a box of one colour, linear light."""
-    box = trimesh.creation.box(bounds=[low, high])
+def slab(
+    lower: tuple[float, ...], upper: tuple[float, ...], colour: list[float]
+) -> trimesh.Trimesh:
+    """Make a box of a colour, linear light."""
+    box = trimesh.creation.box(bounds=[lower, upper])
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*colour, 1.0]))
     return box
 
 
 def road() -> trimesh.Scene:
     """Make the road, with a pavement on each side and a parked van."""
-    x, y = LENGTH_M / 2, WIDTH_M / 2
+    x = LENGTH_M / 2
+    y = WIDTH_M / 2
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
     visual = TextureVisuals(
         [[0, 0], [1, 0], [1, 1], [0, 1]], PBRMaterial(baseColorTexture=markings())

@@ -13,7 +13,9 @@ import numpy as np
 from lidarpool import Pose, Scanner, Scene, load_sensor
 from lidarsim.sensor.trajectory import matrices
 
-FRAME, RATE_HZ, STEP = "lidar", 10, 22
+FRAME = "lidar"
+RATE_HZ = 10
+STEP = 22  # bytes of a point
 # Name, NumPy's type, ROS's type, and place in the 22 bytes of a point.
 FIELDS = (
     ("x", "<f4", 7, 0),
@@ -37,7 +39,8 @@ def message_of(cloud, begin_ns, header, kinds):
     points = np.zeros(len(cloud), np.dtype(row))
     for axis, values in zip("xyz", cloud.positions.T, strict=True):
         points[axis] = values
-    points["intensity"], points["ring"] = cloud.intensity, cloud.channel
+    points["intensity"] = cloud.intensity
+    points["ring"] = cloud.channel
     points["time"] = (cloud.time - begin_ns) / 1e9
     fields = [
         kinds.PointField(name=name, offset=offset, datatype=kind, count=1)
@@ -64,16 +67,21 @@ def main():
             path = self.declare_parameter("scene", "").value
             model = self.declare_parameter("sensor", "velodyne/vlp16").value
             self.scanner = scanner_of(Scene.load(path) if path else Scene.seed(), model)
-            self.pose, self.number = Pose((0, 0, 1)), 0
-            kind, profile = sensor_msgs.msg.PointCloud2, qos_profile_sensor_data
+            self.pose = Pose((0, 0, 1))
+            self.number = 0
+            kind = sensor_msgs.msg.PointCloud2
+            profile = qos_profile_sensor_data
             self.publisher = self.create_publisher(kind, "points", profile)
             self.create_subscription(PoseStamped, "pose", self.on_pose, 1)
             self.create_timer(1 / RATE_HZ, self.on_timer)
 
         def on_pose(self, message):
-            at, turn = message.pose.position, message.pose.orientation
-            [rotation] = matrices(np.array([[turn.x, turn.y, turn.z, turn.w]]))
-            self.pose = Pose.from_rotation([at.x, at.y, at.z], rotation)
+            position = message.pose.position
+            orientation = message.pose.orientation
+            [rotation] = matrices(
+                np.array([[orientation.x, orientation.y, orientation.z, orientation.w]])
+            )
+            self.pose = Pose.from_rotation([position.x, position.y, position.z], rotation)
 
         def on_timer(self):
             header = Header(stamp=self.get_clock().now().to_msg(), frame_id=FRAME)

@@ -10,7 +10,8 @@ from distributed import Client, get_client
 from poolpart import Pipe, Pool, n_workers, per_gpu, rest
 from poolpart.fetch import fetch_available
 
-SIZE, WINDOW = 30 * 40 * 3, 8  # bytes of a thumbnail; thumbnails under way
+SIZE = 30 * 40 * 3  # bytes of a thumbnail
+WINDOW = 8  # thumbnails under way
 
 
 def decode(number):  # noise: put your own functions in place of these
@@ -26,30 +27,34 @@ def write(keys, written, path):
         written.put([file.truncate(file.tell() // SIZE * SIZE) // SIZE, "again"])
         for number, key in keys:
             if number == file.tell() // SIZE:  # else it is on its way again
-                found = fetch_available(get_client(), [key])  # none if its worker has died
-                file.write(b"".join(found.values()))
-                written.put([file.tell() // SIZE, "" if found else "again"])
+                thumbnails = fetch_available(get_client(), [key])  # none if its worker has died
+                file.write(b"".join(thumbnails.values()))
+                written.put([file.tell() // SIZE, "" if thumbnails else "again"])
 
 
 def run(client, path, total=24):
     rules = {"WRITER": n_workers(1), "GPU": per_gpu(1), "CPU": rest()}
     writer, gpu, cpu = Pool.from_client(client).divide(rules).values()
-    pipes = [Pipe(f"{way}-{client.id}", 2 * WINDOW, client) for way in ("keys", "written")]
-    futures, done, sent = {}, 0, 0  # {number: future of a thumbnail that is not written yet}
+    pipes = [
+        Pipe(f"{direction}-{client.id}", 2 * WINDOW, client) for direction in ("keys", "written")
+    ]
+    futures = {}  # {number: future of a thumbnail that is not written yet}
+    written_count = 0
+    sent = 0
     with pipes[0] as keys, pipes[1] as written:
         task = writer.submit(write, keys, written, path)
-        while done < total and not task.done():
-            for number in range(done + len(futures), min(done + WINDOW, total)):
+        while written_count < total and not task.done():
+            for number in range(written_count + len(futures), min(written_count + WINDOW, total)):
                 futures[number] = gpu.submit(shrink, cpu.submit(decode, number))
             while sent in futures and futures[sent].done():
                 if error := futures[sent].exception():
                     keys.fail(f"picture {sent}: {error}")
                 keys.put([sent, futures[sent].key])
                 sent += 1
-            for count, again in written.poll():
-                futures = {number: one for number, one in futures.items() if number >= count}
-                done = max(done, count)
-                sent = max(done, 0 if again else sent)
+            for count, resend in written.poll():
+                futures = {number: future for number, future in futures.items() if number >= count}
+                written_count = max(written_count, count)
+                sent = max(written_count, 0 if resend else sent)
             time.sleep(0.005)
         keys.close()
         task.result()

@@ -29,7 +29,7 @@ from poolpart import Partition
 from poolpart.deploy import start_partitions
 
 NAMES = ("GPU", "IO")
-MOST = {"GPU": 4, "IO": 3}
+MAX_WORKERS = {"GPU": 4, "IO": 3}
 IDLE_S = 8
 LOOK_S = 0.25
 # (when, partition, tasks, seconds of each)
@@ -42,7 +42,7 @@ Sample = dict[str, Any]  # "t" and, for each partition, jobs that wait and run, 
 
 
 def look(began: float, queue: Slurm, parts: Sequence[Partition]) -> Sample:
-    """Look at the queue and at the scheduler."""
+    """Return a sample of the queue and the scheduler."""
     lines = queue.ask("squeue", "--noheader", "--format=%j %T").split("\n")
     sample: Sample = {"t": time.monotonic() - began}
     for part in parts:
@@ -58,7 +58,7 @@ def look(began: float, queue: Slurm, parts: Sequence[Partition]) -> Sample:
 
 
 def record(folder: Path) -> list[Sample]:
-    """Run the work on a Slurm, and look at it all the time."""
+    """Run the work on a Slurm cluster; return regular samples of queue and scheduler."""
     import dask_jobqueue
 
     samples: list[Sample] = []
@@ -75,87 +75,94 @@ def record(folder: Path) -> list[Sample]:
             worker_extra_args=["--host", LOOPBACK, "--no-dashboard"],
         ) as cluster:
             common = {"idle_s": IDLE_S}
-            gpu = {"adapt": [0, MOST["GPU"]], "job_extra_directives": ["--gres=gpu:1"]}
-            jobs = {"GPU": gpu, "IO": {"adapt": [1, MOST["IO"]]}}
-            named = {name: own | common | {"job_name": name} for name, own in jobs.items()}
-            start_partitions(cluster, named)
+            gpu = {"adapt": [0, MAX_WORKERS["GPU"]], "job_extra_directives": ["--gres=gpu:1"]}
+            jobs = {"GPU": gpu, "IO": {"adapt": [1, MAX_WORKERS["IO"]]}}
+            partitions = {
+                name: partition_options | common | {"job_name": name}
+                for name, partition_options in jobs.items()
+            }
+            start_partitions(cluster, partitions)
             with Client(cluster) as client:
                 parts = {name: Partition(name, client) for name in NAMES}
                 while not len(parts["IO"]):
                     time.sleep(0.1)
                 began = time.monotonic()
-                over = threading.Event()
+                finished = threading.Event()
 
                 def watch() -> None:
-                    while not over.wait(LOOK_S):
+                    while not finished.wait(LOOK_S):
                         samples.append(look(began, queue, [*parts.values()]))
 
                 watching = threading.Thread(target=watch)
                 watching.start()
                 futures: dict[str, list[Any]] = {name: [] for name in NAMES}
-                steps = [(when, "work", work) for when, *work in WORK]
+                steps = [(start_s, "work", work) for start_s, *work in WORK]
                 steps += [(LOSS_S, "loss", []), (END_S, "end", [])]
-                for when, what, work in sorted(steps):
-                    while (left := began + when - time.monotonic()) > 0:
+                for start_s, kind, work in sorted(steps):
+                    while (remaining_s := began + start_s - time.monotonic()) > 0:
                         # Results that are held would keep their workers.
-                        for held in futures.values():
-                            held[:] = [future for future in held if not future.done()]
-                        time.sleep(min(left, 0.1))
-                    if what == "work":
+                        for unfinished in futures.values():
+                            unfinished[:] = [future for future in unfinished if not future.done()]
+                        time.sleep(min(remaining_s, 0.1))
+                    if kind == "work":
                         name, count, seconds = work
                         futures[name] += [
                             parts[name].submit(time.sleep, seconds) for _ in range(count)
                         ]
-                    elif what == "loss":
+                    elif kind == "loss":
                         lines = queue.ask("squeue", "--noheader", "--format=%i %j %T")
-                        ours = [line.split()[0] for line in lines.splitlines() if "IO RUN" in line]
-                        queue.ask("scancel", "--signal=KILL", ours[-1])
-                over.set()
+                        io_jobs = [
+                            line.split()[0] for line in lines.splitlines() if "IO RUN" in line
+                        ]
+                        queue.ask("scancel", "--signal=KILL", io_jobs[-1])
+                finished.set()
                 watching.join()
-                wait([future for held in futures.values() for future in held])
+                wait([future for unfinished in futures.values() for future in unfinished])
     return samples
 
 
 def draw(samples: Sequence[Sample]) -> Page:
-    """Draw tasks, jobs and slots, one above the other."""
+    """Draw tasks, jobs and slots in three charts over the same time."""
     page = Page((1600, 1240))
     unit = page.unit
     times = [sample["t"] for sample in samples]
     colours = dict(zip(NAMES, theme.OBJECT_COLOURS, strict=False))
-    ends = {"xlim": (0, END_S)}
+    limits = {"xlim": (0, END_S)}
     heights = (0.25, 0.26, 0.22)
     bottoms = (0.625, 0.335, 0.085)
-    tasks = page.chart((0.085, bottoms[0], 0.70, heights[0]), **ends)
+    tasks = page.chart((0.085, bottoms[0], 0.70, heights[0]), **limits)
     for name in NAMES:
         counts = [sample[name]["tasks"] for sample in samples]
         tasks.step(times, counts, where="post", color=colours[name], lw=1.6 * unit)
         tasks.fill_between(times, counts, step="post", color=colours[name], alpha=0.12, lw=0)
-        for when, which, count, _ in WORK:
-            if which == name:
-                _say(page, tasks, f"{count} tasks of {name}", (when, count), colours[name])
+        for start_s, partition, count, _ in WORK:
+            if partition == name:
+                _annotate(page, tasks, f"{count} tasks of {name}", (start_s, count), colours[name])
     tasks.set_ylabel("tasks to do")
     tasks.set_ylim(0, 1.22 * max(count for _, _, count, _ in WORK))
     for name, bottom, height in zip(NAMES, bottoms[1:], heights[1:], strict=True):
-        axes = page.chart((0.085, bottom, 0.70, height), **ends)
+        axes = page.chart((0.085, bottom, 0.70, height), **limits)
         running, waiting, slots, busy = (
             [sample[name][key] for sample in samples]
             for key in ("running", "waiting", "slots", "busy")
         )
-        both = [a + b for a, b in zip(running, waiting, strict=True)]
-        axes.fill_between(times, running, both, step="post", color=theme.UNSEEN, lw=0)
+        jobs = [a + b for a, b in zip(running, waiting, strict=True)]
+        axes.fill_between(times, running, jobs, step="post", color=theme.UNSEEN, lw=0)
         axes.fill_between(times, running, step="post", color=colours[name], alpha=0.28, lw=0)
         axes.fill_between(times, busy, step="post", color=colours[name], alpha=0.75, lw=0)
         axes.step(times, slots, where="post", color=theme.INK, lw=1.3 * unit)
         axes.set_ylabel(f"{name}: jobs, slots")
-        axes.set_ylim(0, MOST[name] + 0.45)
+        axes.set_ylim(0, MAX_WORKERS[name] + 0.45)
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
         if name == "IO":
             axes.set_xlabel("seconds")
-            _say(page, axes, "a job is killed", (LOSS_S, MOST[name]), theme.SENSOR, mark=True)
+            _annotate(
+                page, axes, "a job is killed", (LOSS_S, MAX_WORKERS[name]), theme.SENSOR, mark=True
+            )
         else:
             axes.tick_params(labelbottom=False)
             first = next((s["t"] for s in samples if s[name]["waiting"]), 0.0)
-            _say(page, axes, "there are two GPUs", (first, 3.2), theme.INK)
+            _annotate(page, axes, "there are two GPUs", (first, 3.2), theme.INK)
     tasks.tick_params(labelbottom=False)
     page.key(
         [
@@ -169,7 +176,8 @@ def draw(samples: Sequence[Sample]) -> Page:
     )
     page.title(
         "Partitions that grow with their work, on Slurm",
-        f"GPU: adapt [0, {MOST['GPU']}], two GPUs in the cluster · IO: adapt [1, {MOST['IO']}] · "
+        f"GPU: adapt [0, {MAX_WORKERS['GPU']}], two GPUs in the cluster · "
+        f"IO: adapt [1, {MAX_WORKERS['IO']}] · "
         f"jobs that are not needed for {IDLE_S} s end",
     )
     return page
@@ -180,20 +188,25 @@ def _square(colour: str, alpha: float, label: str, unit: float) -> Line2D:
     return Line2D([], [], ls="", color=colour, label=label, **mark)
 
 
-def _say(
-    page: Page, axes: Any, words: str, place: tuple[float, float], colour: str, mark: bool = False
+def _annotate(
+    page: Page,
+    axes: Any,
+    words: str,
+    position: tuple[float, float],
+    colour: str,
+    mark: bool = False,
 ) -> None:
     unit = page.unit
     if mark:
-        axes.axvline(place[0], color=colour, lw=0.9 * unit, ls=(0, (3, 2)))
+        axes.axvline(position[0], color=colour, lw=0.9 * unit, ls=(0, (3, 2)))
     axes.annotate(
-        words, place, xytext=(5 * unit, 5 * unit), textcoords="offset points", family=FONT,
+        words, position, xytext=(5 * unit, 5 * unit), textcoords="offset points", family=FONT,
         fontsize=6.8 * unit, color=colour, va="bottom",
     )  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Record and draw, or draw what was recorded."""
+    """Record and draw samples, or draw recorded samples."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("picture", type=Path)
     parser.add_argument("--samples", type=Path, help="file for what is recorded; drawn if there")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.realism import TURN_S, cases
+from benchmarks.realism import REVOLUTION_S, cases
 from PIL import Image
 
 from lidarscenes.procedural.city import city
@@ -32,13 +32,13 @@ TARGET = np.array([4.0, 4.0, 0.0])
 RAISED = 12.0  # metres above the ground with the last colour
 
 
-def cast(sweeps: int, triangles: int, sent: Connection) -> None:
-    """Send the points of sweep after sweep, after one that is only there to compile."""
+def cast(sweeps: int, triangles: int, connection: Connection) -> None:
+    """Cast a sweep to compile, then send the points of `sweeps` sweeps."""
     sweep = cases(city(triangles), "embree", (100,), "ouster/os1-64")["real"]
-    sent.send(len(sweep(0)))
-    sent.recv()
+    connection.send(len(sweep(0)))
+    connection.recv()
     for number in range(sweeps):
-        sent.send_bytes(sweep(number).positions.astype(np.float32).tobytes())
+        connection.send_bytes(sweep(number).positions.astype(np.float32).tobytes())
 
 
 def frame(camera: Camera, points: Any) -> Image.Image:
@@ -66,26 +66,29 @@ def main(arguments: list[str] | None = None) -> int:
     axes = np.concatenate([right, np.cross(right, ahead), ahead])
     camera = Camera(EYE, axes, 600.0, np.array(SIZE) / 2, SIZE)
     context = get_context("spawn")
-    here, there = context.Pipe()
+    parent_end, child_end = context.Pipe()
     caster = context.Process(
-        target=cast, args=(options.sweeps, options.triangles, there), daemon=True
+        target=cast, args=(options.sweeps, options.triangles, child_end), daemon=True
     )
     caster.start()
-    here.recv()
+    parent_end.recv()
     start = time.perf_counter()
     frames = []
-    here.send("go")
+    parent_end.send("go")
     for _ in range(options.sweeps):
-        points = np.frombuffer(here.recv_bytes(), np.float32).reshape(-1, 3)
+        points = np.frombuffer(parent_end.recv_bytes(), np.float32).reshape(-1, 3)
         frames.append(frame(camera, points.astype(np.float64)))
     cast_s = time.perf_counter() - start
     caster.join()
-    kept = {"save_all": True, "duration": round(1e3 * TURN_S), "loop": 0}
-    frames[0].save(memory := io.BytesIO(), "webp", append_images=frames[1:], method=0, **kept)
+    options_of_webp = {"save_all": True, "duration": round(1e3 * REVOLUTION_S), "loop": 0}
+    frames[0].save(
+        memory := io.BytesIO(), "webp", append_images=frames[1:], method=0, **options_of_webp
+    )
     options.film.write_bytes(memory.getvalue())
     took = time.perf_counter() - start
     print(
-        f"{options.sweeps * TURN_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,", end=" "
+        f"{options.sweeps * REVOLUTION_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,",
+        end=" ",
     )
     print(f"written after {took:.1f} s")
     return 0

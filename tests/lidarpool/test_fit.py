@@ -326,7 +326,7 @@ def test_rings_that_meet_surfaces_steeply_have_no_bias(recording):
 
 def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     """Things beside the walls of this hall tilt the planes that are found."""
-    truth, fitted = trial(30, where="hall")
+    truth, fitted = trial(30, place_name="hall")
     held = [
         estimate["low"] <= truth[name] <= estimate["high"]
         for name, estimate in fitted.items()
@@ -339,7 +339,7 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
     """Two recordings of a place each; fidelity.md has 40."""
     for number in (PLACES.index(where), PLACES.index(where) + 4):
-        truth, fitted = trial(number, where=where)
+        truth, fitted = trial(number, place_name=where)
         assert "dropout" in fitted
         for name, true in truth.items():
             if name in fitted:
@@ -350,7 +350,7 @@ def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
 def test_where_only_the_ground_is_smooth_noise_is_not_determined():
     noise = Noise(range_m=0.02, range_per_m=0.0005, angle_deg=0.1, dropout=0.02, seed=3)
     scene, at = place("forest", 3)
-    figures = fit(recorded(noise, scene=scene, at=at, columns=600))
+    figures = fit(recorded(noise, scene=scene, position=at, columns=600))
     assert not {"range_m", "range_per_m", "angle_deg"} & set(figures.figures["figures"])
     assert "hardly a smooth surface is met at less than 45°" in repr(figures)
     assert figures.figures["figures"]["dropout"]["value"] == pytest.approx(0.02, rel=0.3)

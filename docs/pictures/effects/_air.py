@@ -29,30 +29,30 @@ TURNS = 20
 Real = NDArray[np.float64]
 
 
-def on(survey: Survey, **weather: Any) -> Survey:
+def in_weather(survey: Survey, **weather: Any) -> Survey:
     """Return the survey in this weather, with a sensor that detects 10 % at 90 m."""
     return replace(survey, noise=NOISE, **weather)
 
 
 def points(scene: Scene, survey: Survey) -> dict[str, Real]:
     """Positions, range, intensity and cause of its points."""
-    found = list(Rig(scene, survey).cast(0, survey.scan_count))
+    batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     columns = {
-        "cause": [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in found],
-        "range": [b.found.distance for b in found],
-        "intensity": [b.intensity for b in found],
-        "x": [b.positions[:, 0] for b in found],
-        "y": [b.positions[:, 1] for b in found],
+        "cause": [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in batches],
+        "range": [b.found.distance for b in batches],
+        "intensity": [b.intensity for b in batches],
+        "x": [b.positions[:, 0] for b in batches],
+        "y": [b.positions[:, 1] for b in batches],
     }
     return {name: np.concatenate(values) for name, values in columns.items()}
 
 
-def page(title: str, weather: dict[str, Any], around_m: float) -> tuple[Figure, Any]:
+def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, Any]:
     """Draw the street from above without and with the weather; return an empty third plot."""
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
     scene = city(20_000)
-    survey = on(survey_without())
+    survey = in_weather(survey_without())
     for axes, options, words in ((clear, {}, "clear air"), (wet, weather, title)):
         cloud = points(scene, replace(survey, **options))
         air = cloud["cause"] == 1
@@ -62,7 +62,7 @@ def page(title: str, weather: dict[str, Any], around_m: float) -> tuple[Figure, 
             axes.plot(
                 cloud["x"][which], cloud["y"][which], ".", ms=ms, mew=0, color=colour, label=name
             )
-        axes.set(xlim=(-around_m, around_m), ylim=(-around_m, around_m), aspect="equal")
+        axes.set(xlim=(-reach_m, reach_m), ylim=(-reach_m, reach_m), aspect="equal")
         axes.set(xlabel="x (m)", ylabel="y (m)")
         axes.set_title(words, fontsize=11, color=INK)
         axes.legend(loc="upper right", fontsize=8, markerscale=8, framealpha=0.9)
@@ -81,11 +81,13 @@ def sky() -> Scene:
 def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     """Plot numbers of returns against range, of pulses into the open sky, and the closed form."""
     separate = Returns("all", pulse_ns=0)
-    turns = replace(on(survey_without()), steps=TURNS * 36, returns=separate, **weather)
-    cloud = points(sky(), turns)
-    edges = np.linspace(turns.sensor.min_range_m, farthest_m, 41)
+    survey = replace(in_weather(survey_without()), steps=TURNS * 36, returns=separate, **weather)
+    cloud = points(sky(), survey)
+    edges = np.linspace(survey.sensor.min_range_m, farthest_m, 41)
     axes.hist(cloud["range"], edges, color=AIR, alpha=0.55, label="simulated")
-    air, (kind,), noise = turns.air(0), turns.particles, turns.noise
+    air = survey.air(0)
+    (kind,) = survey.particles
+    noise = survey.noise
     middle = np.linspace(edges[0], farthest_m, 400)
     size = np.linspace(0, kind.largest, 1500)[1:]
     # Of the light, at most as much as one that fills the beam.
@@ -98,17 +100,17 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     density = kind.number * np.exp(-kind.slope * size) * (size[1] - size[0])
     rate = math.pi / 4 * air.width(middle) ** 2 * (detected * density).sum(axis=1)
     bin_m = edges[1] - edges[0]
-    axes.plot(middle, rate * turns.ray_count * bin_m, color=CURVE, lw=1.6, label="closed form")
+    axes.plot(middle, rate * survey.ray_count * bin_m, color=CURVE, lw=1.6, label="closed form")
     axes.set(xlim=(0, farthest_m), xlabel="range (m)")
     axes.set_ylabel(f"returns in {100 * bin_m:.0f} cm of range")
-    whole = f"{len(cloud['range']):,} returns of {turns.ray_count:,} pulses into the sky"
-    axes.set_title(whole, fontsize=11, color=INK)
+    title = f"{len(cloud['range']):,} returns of {survey.ray_count:,} pulses into the sky"
+    axes.set_title(title, fontsize=11, color=INK)
     axes.legend(fontsize=9, framealpha=0.9)
 
 
 def energies(axes: Any, weather: dict[str, Any]) -> None:
     """Plot energies against range, and the closed forms of surfaces and of the air."""
-    survey = replace(on(survey_without()), **weather)
+    survey = replace(in_weather(survey_without()), **weather)
     cloud = points(city(20_000), survey)
     air = cloud["cause"] == 1
     for which, colour, label in ((~air, SURFACE, "surfaces"), (air, AIR, "air")):
@@ -120,8 +122,8 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     alpha = survey.extinction(survey.sensor)
     white = 0.5 * (10 / distance) ** 2
     axes.plot(distance, white, color=CURVE, lw=1, ls=":", label="surface of 50 %, clear air")
-    here = white * np.exp(-2 * alpha * distance)
-    axes.plot(distance, here, color=CURVE, lw=1.4, label="surface of 50 %, here")
+    attenuated = white * np.exp(-2 * alpha * distance)
+    axes.plot(distance, attenuated, color=CURVE, lw=1.4, label="surface of 50 %, here")
     scatters = survey.backscatter_at(survey.sensor.optics.wavelength_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
     from_air = survey.air(0).cloud(scatters, distance - half / 2, distance + half / 2)
@@ -140,6 +142,6 @@ def save(figure: Figure, path: Path) -> None:
 
     from PIL import Image
 
-    whole = io.BytesIO()
-    figure.savefig(whole, format="png")
-    Image.open(whole).convert("RGB").quantize(64).save(path, optimize=True)
+    png = io.BytesIO()
+    figure.savefig(png, format="png")
+    Image.open(png).convert("RGB").quantize(64).save(path, optimize=True)

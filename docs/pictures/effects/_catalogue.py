@@ -16,13 +16,13 @@ from lidarpool import Survey
 class Effect(Protocol):
     """A module of an effect.
 
-    A module may also have `of(scene)`, which returns the scene with what moves, with and without
-    the effect.
+    A module may also have `with_actors(scene)`, which returns the scene with moving objects, for
+    runs with and without the effect.
     """
 
     DRAWS: str  # file name of the picture
 
-    def on(self, survey: Survey) -> Survey:
+    def with_effect(self, survey: Survey) -> Survey:
         """Return the survey with the effect."""
 
     def picture(self, path: Path) -> None:
@@ -30,7 +30,7 @@ class Effect(Protocol):
 
 
 def load_effects(only: Sequence[str] = ()) -> dict[str, Effect]:
-    """Import the modules of the named effects, by default of all; return them by name."""
+    """Import the modules of the named effects, by default all effects; return modules by name."""
     names = [module.name for module in pkgutil.iter_modules(effects.__path__)]
     return {
         name: cast(Effect, import_module(f"{effects.__name__}.{name}"))

@@ -27,20 +27,20 @@ def wall(
 def room(x: float, y: float, z: float = 6.0) -> list[SceneMesh]:
     """Return the four walls of a room around the origin."""
     corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
-    made = []
-    for number, (one, other) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
-        low = np.array([[*one, -z], [*other, -z], [*other, z], [*one, z]])
-        made.append(SceneMesh(f"W{number}", low, np.array([[0, 1, 2], [0, 2, 3]])))
-    return made
+    walls = []
+    for number, (start, stop) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
+        vertices = np.array([[*start, -z], [*stop, -z], [*stop, z], [*start, z]])
+        walls.append(SceneMesh(f"W{number}", vertices, np.array([[0, 1, 2], [0, 2, 3]])))
+    return walls
 
 
-def ahead(rays: int, max_range_m: float = 1e4) -> Sensor:
-    """Return a sensor that fires so many beams along x at once."""
+def fixed_beams(rays: int, max_range_m: float = 1e4) -> Sensor:
+    """Return a sensor that fires `rays` beams along x at once."""
     return Sensor(Beams(np.zeros(rays)), Spin(1, 360), 0.0, max_range_m)
 
 
-def turning(firings: int, rate_hz: float = 10.0, clockwise: bool = False) -> Sensor:
-    """Return a sensor with one wide beam that turns about z."""
+def spinning_beam(firings: int, rate_hz: float = 10.0, clockwise: bool = False) -> Sensor:
+    """Return a sensor with a wide beam that rotates about z."""
     optics = Optics(divergence_mrad=1000 * WIDE_RAD)
     head = Spin(firings, 360, rate_hz, clockwise)
     return Sensor(Beams(np.zeros(1)), head, 0.5, 150.0, optics=optics)
@@ -48,10 +48,10 @@ def turning(firings: int, rate_hz: float = 10.0, clockwise: bool = False) -> Sen
 
 def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
     """Causes and positions of all points of a survey."""
-    found = list(Rig(scene, survey).cast(0, survey.scan_count))
-    causes = [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in found]
-    places = np.concatenate([b.positions for b in found])
-    return {"cause": np.concatenate(causes), **dict(zip("xyz", places.T, strict=True))}
+    batches = list(Rig(scene, survey).cast(0, survey.scan_count))
+    causes = [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in batches]
+    positions = np.concatenate([b.positions for b in batches])
+    return {"cause": np.concatenate(causes), **dict(zip("xyz", positions.T, strict=True))}
 
 
 def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
@@ -64,8 +64,10 @@ def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
     }
 
 
-def shot(meshes: list[SceneMesh], sensor: Sensor, noise: Noise, **options: Any) -> dict[str, Any]:
-    """Cast one scan of a sensor at the origin."""
+def cast_scan(
+    meshes: list[SceneMesh], sensor: Sensor, noise: Noise, **options: Any
+) -> dict[str, Any]:
+    """Cast a scan of a sensor at the origin; return its columns."""
     common = {"columns": ("ray", "range", "intensity", "cause"), "keep_every": 1}
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, noise=noise, **{**common, **options})
     return points(meshes, survey)

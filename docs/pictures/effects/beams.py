@@ -26,7 +26,7 @@ SENSOR = Sensor(Beams(np.zeros(1)), Spin(1, 360))
 EVEN, ROUND, WIDE = OBJECT_COLOURS[:3]
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with 19 sub-rays in a Gaussian, oval beam that is wide at its start."""
     beam = Returns(
         subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
@@ -41,18 +41,18 @@ def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMe
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
-    """Where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
+    """Return where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig._pulses[0].emitter.divided(rig.pattern(0, 0, 1))
     starts, directions = pattern_rays(beams, np.arange(len(beams)), (0, 0, 0))
     hits = rig._caster.caster.cast(starts, directions)
-    ends = starts + hits.distance[:, None] * directions
-    return np.asarray(ends[:, 1:])
+    points = starts + hits.distance[:, None] * directions
+    return np.asarray(points[:, 1:])
 
 
 def share(returns: Returns, edge_m: float) -> float:
-    """Share of a pulse's light on a wall at 50 m that ends at an edge, in front of another."""
+    """Return the share of a pulse's light on a wall at 50 m with an edge, before a wall at 60 m."""
     meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
     survey = Survey(
         SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectance", "range"]
@@ -64,7 +64,7 @@ def share(returns: Returns, edge_m: float) -> float:
 
 
 def picture(path: Path) -> None:
-    """Draw it."""
+    """Draw footprints, light on an edge, and width against range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
     kinds = (
@@ -75,9 +75,11 @@ def picture(path: Path) -> None:
          Returns(subrays=217, divergence_mrad=OVAL, beam_profile="gaussian")),
     )  # fmt: skip
     for number, (label, colour, returns) in enumerate(kinds):
-        places = 100 * footprint(returns, 50.0)
+        positions_cm = 100 * footprint(returns, 50.0)
         middle = 22.0 * (1 - number)
-        prints.plot(places[:, 0], middle + places[:, 1], ".", ms=3.5, mew=0, color=colour)
+        prints.plot(
+            positions_cm[:, 0], middle + positions_cm[:, 1], ".", ms=3.5, mew=0, color=colour
+        )
         tall = 7.5 if returns.divergence_mrad == OVAL else 15.0
         prints.add_patch(Ellipse((0, middle), 15.0, tall, fill=False, ec=INK, lw=0.8))
         prints.text(12, middle, label, va="center", fontsize=8, color=colour)
@@ -97,9 +99,11 @@ def picture(path: Path) -> None:
                 "all", count, 3.0, beam_profile="even" if name == "even" else "gaussian",
                 pulse_ns=1,
             )  # fmt: skip
-            some = offsets[::4]
-            found = [share(beam, 0.075 * x) for x in some]
-            edges.plot(some, found, mark, ms=4, mfc="none", color=colour, label=f"{count} sub-rays")
+            sampled = offsets[::4]
+            simulated = [share(beam, 0.075 * x) for x in sampled]
+            edges.plot(
+                sampled, simulated, mark, ms=4, mfc="none", color=colour, label=f"{count} sub-rays"
+            )
     edges.set(xlabel="edge, in radii of the beam at 1/e²", ylabel="share of the light on the wall")
     edges.set_title("A beam on an edge", fontsize=11, color=INK)
     edges.legend(fontsize=7.5, frameon=False, loc="upper left")
@@ -108,8 +112,8 @@ def picture(path: Path) -> None:
     beam = Returns(
         subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
     )
-    made = Beam.from_divergences(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
-    assert made.starts is not None
+    gaussian_beam = Beam.from_divergences(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
+    assert gaussian_beam.starts is not None
     for axis, (label, colour) in enumerate((("across", ROUND), ("up", WIDE))):
         waist = EXIT_M / 2
         half = OVAL[axis] / 2000
@@ -117,9 +121,9 @@ def picture(path: Path) -> None:
             ranges, 2e3 * np.hypot(waist, half * ranges), color=colour, lw=1.2,
             label=f"{label}: 2 √(w0² + (θR/2)²)",
         )  # fmt: skip
-        some = ranges[::6]
-        found = [4e3 * footprint(beam, distance)[:, axis].std() for distance in some]
-        widths.loglog(some, found, "o", ms=4, mfc="none", color=colour, label="simulated")
+        sampled = ranges[::6]
+        simulated = [4e3 * footprint(beam, distance)[:, axis].std() for distance in sampled]
+        widths.loglog(sampled, simulated, "o", ms=4, mfc="none", color=colour, label="simulated")
         widths.loglog(ranges, 2e3 * half * ranges, color=colour, lw=0.8, ls=":")
     widths.set(xlabel="range (m)", ylabel="width at 1/e² (mm)", ylim=(5, 400))
     widths.set_title("3.0 × 1.5 mrad, 12.5 mm at its start", fontsize=11, color=INK)

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, shot, wall
+from docs.pictures.effects._receiver import BLUE, cast_scan, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Sensor, Spin, Survey
@@ -18,15 +18,15 @@ SIGNS = [Material("S*", reflectance=1.0, retro=True), Material("*", reflectance=
 STEP_DEG = 0.1
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on, in a street where five lamp posts are retro-reflectors."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with stray light, in a street with five retro-reflecting lamp posts."""
     posts = [f"lamp-{number}" for number in range(1, 6)]
     materials = [Material(posts, reflectance=1.0, retro=True), Material("*", reflectance=0.3)]
     return replace(survey, noise=NOISE, materials=materials)
 
 
 def picture(path: Path) -> None:
-    """Draw a sign with and without stray light, and the share of rays that receive some."""
+    """Draw a sign with and without stray light, and the share of rays that receive stray light."""
     across = np.arange(-4, 4.01, STEP_DEG)
     up = np.arange(-3, 3.01, STEP_DEG)
     grid = np.meshgrid(np.radians(up), np.radians(across), indexing="ij")
@@ -40,9 +40,9 @@ def picture(path: Path) -> None:
         (views[0], replace(NOISE, stray_light=0), "without"),
         (views[1], NOISE, "with blooming"),
     ):
-        found = shot(meshes, sensor, noise, materials=SIGNS)
+        points = cast_scan(meshes, sensor, noise, materials=SIGNS)
         image = np.full(len(beams.elevation), np.nan)
-        image[found["ray"]] = found["range"]
+        image[points["ray"]] = points["range"]
         shown = axes.imshow(
             image.reshape(len(up), -1),
             origin="lower",
@@ -56,12 +56,12 @@ def picture(path: Path) -> None:
     figure.colorbar(shown, ax=views[1], label="m", shrink=0.8)
     # A sign far smaller than the angles, and nothing behind it.
     small = wall("S", 25.0, (-0.01, 0.01), (-0.01, 0.01))
-    found = shot([small, wall("B", -9)], sensor, NOISE, materials=SIGNS)
+    points = cast_scan([small, wall("B", -9)], sensor, NOISE, materials=SIGNS)
     lit = np.zeros(len(beams.elevation), bool)
-    lit[found["ray"][found["cause"] == 4]] = True
-    off = np.degrees(np.hypot(beams.elevation, beams.azimuth))
+    lit[points["ray"][points["cause"] == 4]] = True
+    angles_deg = np.degrees(np.hypot(beams.elevation, beams.azimuth))
     edges = np.arange(0.1, 2.51, 0.1)
-    rays, hits = (np.histogram(some, edges)[0] for some in (off, off[lit]))
+    rays, hits = (np.histogram(angles, edges)[0] for angles in (angles_deg, angles_deg[lit]))
     middle = (edges[1:] + edges[:-1]) / 2
     share = hits / rays
     error = np.sqrt(np.maximum(share * (1 - share), 0.25 / rays) / rays)

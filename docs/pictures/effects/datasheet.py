@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Survey
@@ -23,8 +23,8 @@ SHOWN = {
 RAYS = 2000
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on: noise and 7 sub-rays."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with the data sheet's noise and 7 sub-rays."""
     sheet = read_model("ouster/os1-64").datasheet()
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 
@@ -37,10 +37,12 @@ def picture(path: Path) -> None:
     for name, colour in SHOWN.items():
         stated = read_model(name).performance.detection
         noise = read_model(name).datasheet().noise
-        places = np.linspace(0.4, 1.5, 23) * stated.range_m
-        made = [len(shot([wall("W", x)], ahead(RAYS), noise, materials=dark)["range"])
-                for x in places]  # fmt: skip
-        shares.plot(places, 100 * np.array(made) / RAYS, "-", lw=1.2, color=colour)
+        ranges_m = np.linspace(0.4, 1.5, 23) * stated.range_m
+        scans = [
+            cast_scan([wall("W", x)], fixed_beams(RAYS), noise, materials=dark) for x in ranges_m
+        ]
+        detected = [len(scan["range"]) for scan in scans]
+        shares.plot(ranges_m, 100 * np.array(detected) / RAYS, "-", lw=1.2, color=colour)
         share = 100 * stated.probability
         label = f"{name}: {stated.range_m:g} m, {share:g} %"
         shares.plot(stated.range_m, share, "o", ms=7, color=colour, label=label)
@@ -56,14 +58,16 @@ def picture(path: Path) -> None:
         (0.1, GREY, (20, 180), [(70, 2), (120, 4)]),
         (0.8, BLUE, (40, 450), [(220, 2), (380, 4)]),
     ):
-        places = np.geomspace(*limits, 14)
-        found = [
-            shot([wall("W", x)], ahead(RAYS), noise, materials=[Material("*", reflectance)])
-            for x in places
+        ranges_m = np.geomspace(*limits, 14)
+        scans = [
+            cast_scan(
+                [wall("W", x)], fixed_beams(RAYS), noise, materials=[Material("*", reflectance)]
+            )
+            for x in ranges_m
         ]
-        spread = [100 * one["range"].std() for one in found]
+        spread = [100 * scan["range"].std() for scan in scans]
         label = f"{100 * reflectance:g} % reflectance"
-        sigmas.plot(places, spread, "-", lw=1.2, color=colour, label=f"simulated, {label}")
+        sigmas.plot(ranges_m, spread, "-", lw=1.2, color=colour, label=f"simulated, {label}")
         x, y = zip(*stated_at, strict=True)
         sigmas.plot(x, y, "v", ms=8, color=colour, label=f"stated (less than), {label}")
     sigmas.set(xscale="log", xlabel="range of a wall, m", ylabel="standard deviation of ranges, cm")

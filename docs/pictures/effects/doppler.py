@@ -25,13 +25,13 @@ HEIGHT = 1.9
 REACH = 36.0
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with radial velocities; its sensor drives."""
-    way = Track([0, 1], [[0, 0, HEIGHT], [SPEED, 0, HEIGHT]])
+    drive = Track([0, 1], [[0, 0, HEIGHT], [SPEED, 0, HEIGHT]])
     return replace(
         survey,
         poses=(),
-        trajectory=way,
+        trajectory=drive,
         columns=(*survey.columns, "radial_velocity"),
         noise=replace(survey.noise, velocity_m_s=NOISE),
     )
@@ -42,14 +42,14 @@ def picture(path: Path) -> None:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-    ways = [
-        Track([-1, 2], [at - t * np.array(v) for t in (1, -2)])
-        for (at, speed, yaw) in OTHERS
+    trajectories = [
+        Track([-1, 2], [start - t * np.array(v) for t in (1, -2)])
+        for (start, speed, yaw) in OTHERS
         for v in [speed * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw)), 0])]
     ]
     cars = [
-        Actor(car(MODELS[k % len(MODELS)]), replace(way, start_s=0.0, duration_s=2.0))
-        for k, way in enumerate(ways)
+        Actor(car(MODELS[k % len(MODELS)]), replace(trajectory, start_s=0.0, duration_s=2.0))
+        for k, trajectory in enumerate(trajectories)
     ]
     scene = city(60_000)
     standing = len(scene.names)
@@ -59,81 +59,83 @@ def picture(path: Path) -> None:
         steps=36,
         noise=Noise(velocity_m_s=NOISE),
     )
-    (found,) = Rig(scene.with_actors(cars), survey).cast(0, 36)
-    positions = found.positions
-    velocity = found.radial_velocity
-    moving = found.object >= standing
-    azimuth = np.radians(found.azimuth)
+    (batch,) = Rig(scene.with_actors(cars), survey).cast(0, 36)
+    positions = batch.positions
+    velocity = batch.radial_velocity
+    moving = batch.object >= standing
+    azimuth = np.radians(batch.azimuth)
     azimuth = np.degrees((azimuth + np.pi) % (2 * np.pi) - np.pi)
     figure = Figure(figsize=(10.4, 5.0), dpi=90, layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.12, 1))
+    map_axes, chart = figure.subplots(1, 2, width_ratios=(1.12, 1))
     colours = ListedColormap(DIVERGING)
     order = np.argsort(moving, kind="stable")  # cars on top
-    near = order[np.abs(positions[order, :2]).max(axis=1) < REACH]
+    in_view = order[np.abs(positions[order, :2]).max(axis=1) < REACH]
     scale = {"cmap": colours, "vmin": -20, "vmax": 20, "linewidths": 0}
     sizes = np.where(moving, 5.0, 1.2)
-    points = left.scatter(*positions[near, :2].T, c=velocity[near], s=sizes[near], **scale)
-    left.set_facecolor(DARK)
-    left.annotate(
+    points = map_axes.scatter(
+        *positions[in_view, :2].T, c=velocity[in_view], s=sizes[in_view], **scale
+    )
+    map_axes.set_facecolor(DARK)
+    map_axes.annotate(
         "",
         (-9 + SPEED, -3),
         (-9, -3),
         arrowprops={"arrowstyle": "-|>", "color": "#ffd23f", "lw": 2},
     )
-    left.text(
+    map_axes.text(
         -9, -4.6, f"sensor, {SPEED:.0f} m/s", color="#ffd23f", ha="center", va="top", fontsize=8,
         bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
     )  # fmt: skip
-    for (_, speed, yaw), way in zip(OTHERS, ways, strict=True):
-        x, y, _ = way.pose(0, 1e9).position
+    for (_, speed, yaw), trajectory in zip(OTHERS, trajectories, strict=True):
+        x, y, _ = trajectory.pose(0, 1e9).position
         dx, dy = np.round([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))], 6)
-        left.annotate(
+        map_axes.annotate(
             "",
             (x + dx * (2.5 + 0.5 * speed), y + dy * (2.5 + 0.5 * speed)),
             (x + 2.5 * dx, y + 2.5 * dy),
             arrowprops={"arrowstyle": "-|>", "color": "white", "lw": 1.2},
         )
         side = 3.4 if dy == 0 and y > 0 else -3.4
-        where = (x + 3.5, y) if dy else (x, y + side)
-        left.text(
-            *where, f"{speed:.0f} m/s", color="white", ha="left" if dy else "center", va="center",
-            fontsize=8, bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
+        label_position = (x + 3.5, y) if dy else (x, y + side)
+        map_axes.text(
+            *label_position, f"{speed:.0f} m/s", color="white", ha="left" if dy else "center",
+            va="center", fontsize=8, bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
         )  # fmt: skip
-    left.set(
+    map_axes.set(
         xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", xlabel="x, m", ylabel="y, m"
     )
     figure.colorbar(
-        points, ax=left, label="radial velocity, m/s: blue comes nearer", location="bottom",
+        points, ax=map_axes, label="radial velocity, m/s: blue comes nearer", location="bottom",
         shrink=0.85, pad=0.02, aspect=40,
     )  # fmt: skip
-    level = np.cos(np.radians(found.elevation))
-    shown = np.flatnonzero((np.abs(found.elevation) < 6) & ~moving)[::3]
-    right.scatter(azimuth[shown], velocity[shown], s=1, color=theme.MUTED, linewidths=0)
+    level = np.cos(np.radians(batch.elevation))
+    shown = np.flatnonzero((np.abs(batch.elevation) < 6) & ~moving)[::3]
+    chart.scatter(azimuth[shown], velocity[shown], s=1, color=theme.MUTED, linewidths=0)
     for k, (_, speed, _) in enumerate(OTHERS):
-        own = found.object == standing + k
+        of_car = batch.object == standing + k
         colour = theme.OBJECT_COLOURS[(1, 2, 6)[k]]
-        right.scatter(azimuth[own], velocity[own], s=5, color=colour, linewidths=0)
-        if own.any():
-            at = azimuth[own].mean(), velocity[own].mean()
-            right.annotate(
-                f"car, {speed:.0f} m/s", at, (6, 8), textcoords="offset points", fontsize=8,
+        chart.scatter(azimuth[of_car], velocity[of_car], s=5, color=colour, linewidths=0)
+        if of_car.any():
+            middle = azimuth[of_car].mean(), velocity[of_car].mean()
+            chart.annotate(
+                f"car, {speed:.0f} m/s", middle, (6, 8), textcoords="offset points", fontsize=8,
                 color=colour,
             )  # fmt: skip
     angle = np.linspace(-180, 180, 361)
-    right.plot(
+    chart.plot(
         angle, -SPEED * np.cos(np.radians(angle)), "--", color=theme.SENSOR, lw=1.2,
         label="$-v\\,\\cos\\,$azimuth: what stands still",
     )  # fmt: skip
-    rest = velocity[~moving] + SPEED * np.cos(np.radians(azimuth[~moving])) * level[~moving]
-    right.set(
+    residual = velocity[~moving] + SPEED * np.cos(np.radians(azimuth[~moving])) * level[~moving]
+    chart.set(
         xlim=(-180, 180), xticks=range(-180, 181, 60), xlabel="azimuth, degrees",
         ylabel="radial velocity, m/s",
     )  # fmt: skip
-    right.set_title(
-        f"less than 6° above or below; about the curve of what stands: {rest.std():.3f} m/s",
+    chart.set_title(
+        f"less than 6° above or below; about the curve of what stands: {residual.std():.3f} m/s",
         fontsize=8.5,
     )
-    left.set_title("one turn of an OS1-64, seen from above", fontsize=8.5)
-    right.grid(color=theme.LINE, lw=0.5)
-    right.legend(loc="lower left", fontsize=8, frameon=False)
+    map_axes.set_title("one turn of an OS1-64, seen from above", fontsize=8.5)
+    chart.grid(color=theme.LINE, lw=0.5)
+    chart.legend(loc="lower left", fontsize=8, frameon=False)
     figure.savefig(path)

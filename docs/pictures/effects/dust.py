@@ -12,13 +12,13 @@ DRAWS = "effect-dust.png"
 WEATHER = {"dust_mg_m3": 100.0}
 
 
-def on(survey: Survey) -> Survey:
-    """Return the survey in it."""
-    return _air.on(survey, **WEATHER)
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey in dust."""
+    return _air.in_weather(survey, **WEATHER)
 
 
 def picture(path: Path) -> None:
-    """Draw a street in it, and the energies against range."""
+    """Draw a street in dust, and the energies against range."""
     figure, right = _air.page("100 mg/m³ of dust", WEATHER, 25.0)
     _air.energies(right, WEATHER)
     _air.save(figure, path)

@@ -6,7 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, points, room, shot, wall
+from docs.pictures.effects._receiver import (
+    BLUE,
+    GREY,
+    RED,
+    cast_scan,
+    fixed_beams,
+    points,
+    room,
+    wall,
+)
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Returns, Survey, load_sensor
@@ -19,8 +28,8 @@ RAYS = 60_000
 LIGHT_M_S = 299_792_458.0
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with false alarms."""
     return replace(survey, noise=NOISE)
 
 
@@ -30,9 +39,9 @@ def picture(path: Path) -> None:
     above, lies = figure.subplots(1, 2, width_ratios=[1, 1.15])
     sensor = load_sensor("velodyne/vlp16", max_range_m=100)
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=36, noise=NOISE, columns=["cause"])
-    found = points(room(30, 18, 3), survey)
-    x, y = (survey.precision_m * found[axis] for axis in ("x", "y"))
-    alarm = found["cause"] == 2
+    columns = points(room(30, 18, 3), survey)
+    x, y = (survey.precision_m * columns[axis] for axis in ("x", "y"))
+    alarm = columns["cause"] == 2
     above.plot(x[~alarm], y[~alarm], ".", ms=1, color=GREY, label="walls")
     above.plot(x[alarm], y[alarm], ".", ms=4, color=RED, label=f"{alarm.sum()} false alarms")
     above.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(-100, 100), ylim=(-100, 100))
@@ -43,14 +52,14 @@ def picture(path: Path) -> None:
     middle = (edges[1:] + edges[:-1]) / 2
     step = edges[1]
     for mode, colour, label in (("all", BLUE, "all returns"), ("first", RED, "first returns")):
-        seen = shot(
+        returns = cast_scan(
             [wall("W", WALL_M)],
-            ahead(RAYS, GATE_M),
+            fixed_beams(RAYS, GATE_M),
             replace(NOISE, false_alarm_hz=2e5),
             returns=Returns(mode),  # type: ignore[arg-type]
             materials=[Material("*", 0.8)],
         )
-        counts = np.histogram(seen["range"][seen["cause"] == 2], edges)[0]
+        counts = np.histogram(returns["range"][returns["cause"] == 2], edges)[0]
         lies.errorbar(middle, counts, counts**0.5, fmt="o", ms=3, lw=0.8, color=colour, label=label)
         rate = 10 * mean
         expected = RAYS * rate * step * np.ones(len(middle))

@@ -23,37 +23,37 @@ SPEED_M_S = 5.0
 SECONDS = 4.0
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with all that changes points of single sweeps."""
     return replace(survey, faults=[DIRT, DEAD, LOST, Fault("time_jump", by_s=-0.5)])
 
 
 def image(survey: Survey) -> np.ndarray:
-    """Intensities of a turn, channels by firings; NaN without a return."""
+    """Return intensities of a revolution, channels by firings; NaN without a return."""
     first = survey.scan(0).firings[0]
     stop = survey.scan(survey.scan_count - 1).firings[1]
-    out = np.full((survey.sensor.channels, stop - first), np.nan)
-    for found in Rig(city(20_000), survey).cast(0, survey.scan_count):
-        out[found.channel, found.firing - first] = found.intensity
-    return out
+    intensities = np.full((survey.sensor.channels, stop - first), np.nan)
+    for batch in Rig(city(20_000), survey).cast(0, survey.scan_count):
+        intensities[batch.channel, batch.firing - first] = batch.intensity
+    return intensities
 
 
 def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps in seconds and ranges of a beam ahead, of a carrier that drives towards a wall."""
+    """Return stamps, seconds, and ranges of a forward beam on a carrier that nears a wall."""
     sensor = Sensor.grid(10, 1, 1, step_deg=360, horizontal_fov_deg=1)
     track = Track([0, SECONDS], [(0, 0, 0), (SPEED_M_S * SECONDS, 0, 0)])
     survey = Survey(sensor, trajectory=track, columns=["time"], faults=faults)
-    found = [*Rig(Scene.from_meshes([wall("W", 30)]), survey).cast(0, survey.scan_count)]
+    batches = [*Rig(Scene.from_meshes([wall("W", 30)]), survey).cast(0, survey.scan_count)]
     return (
-        np.concatenate([one.time for one in found]) / 1e9,
-        np.concatenate([one.range for one in found]),
+        np.concatenate([batch.time for batch in batches]) / 1e9,
+        np.concatenate([batch.range for batch in batches]),
     )
 
 
 def picture(path: Path) -> None:
     """Draw what faults do to images and to ranges over time."""
     figure = Figure((11, 5.2), layout="constrained", dpi=100)
-    left, right = figure.subfigures(1, 2, width_ratios=[1.7, 1])
+    images, charts = figure.subfigures(1, 2, width_ratios=[1.7, 1])
     bare = survey_without()
     shown = {
         "without faults": (),
@@ -61,7 +61,9 @@ def picture(path: Path) -> None:
         "dead channels 20, 21 and 40": [DEAD],
         "10 % of the packets of 16 firings are lost": [LOST],
     }
-    for axes, (title, faults) in zip(left.subplots(4, 1, sharex=True), shown.items(), strict=True):
+    for axes, (title, faults) in zip(
+        images.subplots(4, 1, sharex=True), shown.items(), strict=True
+    ):
         values = image(replace(bare, faults=faults))
         axes.imshow(
             np.log10(values), cmap="viridis", vmin=-2.5, vmax=0.5, aspect="auto", origin="lower",
@@ -71,7 +73,7 @@ def picture(path: Path) -> None:
         axes.set_yticks([0, 32, 63])
         axes.tick_params(labelsize=7)
     axes.set_xlabel("firing of a turn", fontsize=8)
-    (axes,) = right.subplots(1, 1, squeeze=False)[0]
+    (axes,) = charts.subplots(1, 1, squeeze=False)[0]
     frozen = Fault("frozen", 1, 2)
     for faults, colour, words in (
         ((), GREY, "without faults"),

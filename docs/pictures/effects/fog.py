@@ -12,13 +12,13 @@ DRAWS = "effect-fog.png"
 WEATHER = {"visibility_km": 0.05, "fog_lidar_ratio_sr": 65.0}
 
 
-def on(survey: Survey) -> Survey:
-    """Return the survey in it."""
-    return _air.on(survey, **WEATHER)
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey in fog."""
+    return _air.in_weather(survey, **WEATHER)
 
 
 def picture(path: Path) -> None:
-    """Draw a street in it, and the energies against range."""
+    """Draw a street in fog, and the energies against range."""
     figure, right = _air.page("fog, 50 m of visibility", WEATHER, 25.0)
     _air.energies(right, WEATHER)
     _air.save(figure, path)

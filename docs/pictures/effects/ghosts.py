@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud, shot
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, cloud
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
@@ -18,8 +18,8 @@ PAINT = 0.04
 DIRT = 0.1
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on, in a street whose cars and buildings mirror a little."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with cars and buildings that mirror weakly."""
     materials = [
         Material(["car-*", "building-*"], reflectance=0.3, specular_reflectance=PAINT),
         Material("*", reflectance=0.3),
@@ -27,10 +27,10 @@ def on(survey: Survey) -> Survey:
     return replace(survey, materials=materials)
 
 
-def upright(name: str, one: tuple[float, float], other: tuple[float, float]) -> SceneMesh:
-    """Return a wall between two places, 3 m below the sensor and 3 m above."""
-    low, high = ([[*place, z] for place in (one, other)] for z in (-3.0, 3.0))
-    return SceneMesh(name, np.array([*low, *high]), np.array([[0, 1, 3], [0, 3, 2]]))
+def upright(name: str, start: tuple[float, float], stop: tuple[float, float]) -> SceneMesh:
+    """Return a wall between two positions, 3 m below the sensor and 3 m above."""
+    lower, upper = ([[*position, z] for position in (start, stop)] for z in (-3.0, 3.0))
+    return SceneMesh(name, np.array([*lower, *upper]), np.array([[0, 1, 3], [0, 3, 2]]))
 
 
 def picture(path: Path) -> None:
@@ -38,8 +38,8 @@ def picture(path: Path) -> None:
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     car, van = (
-        replace(box(name, size), vertices=box(name, size).vertices + place)
-        for name, size, place in (("Car", (4.4, 1.8, 3), (4.0, -3.5, -1.5)),
+        replace(box(name, size), vertices=box(name, size).vertices + offset)
+        for name, size, offset in (("Car", (4.4, 1.8, 3), (4.0, -3.5, -1.5)),
                                   ("Van", (2.0, 2.0, 3), (-4.5, 3.5, -1.5)))
     )  # fmt: skip
     meshes = [
@@ -52,38 +52,42 @@ def picture(path: Path) -> None:
         turning, poses=[(0, 0, 0)], steps=1, materials=[glass, Material("*", 0.5)],
         returns=Returns("all"), columns=("cause",), keep_every=1, precision_m=0.001,
     )  # fmt: skip
-    found = cloud(Scene.from_meshes(meshes), survey)
-    ghost = found["cause"] == 5
+    columns = cloud(Scene.from_meshes(meshes), survey)
+    ghost = columns["cause"] == 5
     for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
         name = f"{label}: {which.sum():,}"
-        above.plot(found["y"][which], -found["x"][which], ".", ms=3, color=colour, label=name)
+        above.plot(columns["y"][which], -columns["x"][which], ".", ms=3, color=colour, label=name)
     above.plot(0, 0, ">", color=BLUE, ms=8, label="sensor")
     labels = {
         (6.6, 8.3): "window", (11.3, 7): "shop", (-5.7, 6.5): "street", (-4.2, -5): "car",
         (2.6, 5.7): "van", (11.7, 3.9): "its ghost", (18, -5): "its ghost",
         (16.4, 6.2): "ghost of the street",
     }  # fmt: skip
-    for place, name in labels.items():
-        above.annotate(name, place, fontsize=8)
+    for offset, name in labels.items():
+        above.annotate(name, offset, fontsize=8)
     above.set(aspect="equal", xlim=(-7, 22), ylim=(-9, 9.5), xlabel="ahead (m)", ylabel="left (m)")
     above.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=1.5)
     above.set_title("a shop window from above, all returns", fontsize=10)
     degrees = np.arange(8, 88, 4)
     for angle in np.radians(degrees):
-        off = np.array([-np.cos(2 * angle), np.sin(2 * angle)])
-        side = 0.3 * np.array([-off[1], off[0]])
-        off = np.array([10, 0]) + 6 * off
+        mirrored_direction = np.array([-np.cos(2 * angle), np.sin(2 * angle)])
+        side = 0.3 * np.array([-mirrored_direction[1], mirrored_direction[0]])
+        mirrored_direction = np.array([10, 0]) + 6 * mirrored_direction
         edge = 3 * np.array([np.sin(angle), np.cos(angle)])
         glazing = upright("Window", (10 + edge[0], edge[1]), (10 - edge[0], -edge[1]))
-        beside = upright("Beside", tuple(off + side), tuple(off - side))
+        beside = upright(
+            "Beside", tuple(mirrored_direction + side), tuple(mirrored_direction - side)
+        )
         room = [glazing, beside, upright("Behind", (40, 1), (40, -1))]
-        one = shot(
+        scan = cast_scan(
             room, Sensor(Beams(np.zeros(1)), Spin(1, 360), 0), Noise(), returns=Returns("all"),
             materials=[glass, Material("*", 1.0)], columns=("object", "reflectance"),
         )  # fmt: skip
         for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
-            own = one["reflectance"][one["object"] == number]
-            right.plot([np.degrees(angle)] * len(own), own, "o", ms=4, color=colour)
+            reflectances = scan["reflectance"][scan["object"] == number]
+            right.plot(
+                [np.degrees(angle)] * len(reflectances), reflectances, "o", ms=4, color=colour
+            )
     angle = np.radians(np.linspace(0, 89, 300))
     mirrored = (1 - DIRT) * fresnel(np.cos(angle))
     right.plot(np.degrees(angle), DIRT * np.cos(angle), color=GREY, label="dirt: ρ cos θ")

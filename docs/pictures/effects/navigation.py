@@ -29,8 +29,8 @@ GNSS = Gnss(
 )  # fmt: skip
 
 
-def on(survey: Survey) -> Survey:
-    """Return the survey with instruments, which cost stage 2 nothing."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with instruments; stage 2 takes as long as without."""
     return replace(survey, navigation=Navigation(imu=IMU, gnss=GNSS))
 
 
@@ -59,10 +59,10 @@ def outage(axes: Any, still: SimpleNamespace) -> None:
     imu = Imu(accelerometer_bias=0.01, accelerometer_noise_density=0.02)
     gnss = Gnss(rate_hz=10, outages=[(10, 25)])
     for seed in range(40):
-        given = Navigation(imu=imu, gnss=gnss, seed=seed)
-        run = SimpleNamespace(**vars(still) | {"navigation": given, "duration_ns": 35e9})
-        (found,) = fixes(run)
-        axes.plot(found.times_ns / 1e9, found.positions[:, 0], color=theme.SENSOR, lw=0.5)
+        navigation = Navigation(imu=imu, gnss=gnss, seed=seed)
+        run = SimpleNamespace(**vars(still) | {"navigation": navigation, "duration_ns": 35e9})
+        (block,) = fixes(run)
+        axes.plot(block.times_ns / 1e9, block.positions[:, 0], color=theme.SENSOR, lw=0.5)
     t = np.clip(np.linspace(0, 35, 701) - 10, 0, 15)
     sigma = np.hypot(0.01 * t**2 / 2, 0.02 * np.sqrt(t**3 / 3))
     sigma *= np.exp(-np.clip(np.linspace(0, 35, 701) - 25, 0, None))
@@ -87,39 +87,39 @@ def picture(path: Path) -> None:
     rates = np.concatenate([block.rates for block in imu_samples(still)])
     sizes = np.unique(np.geomspace(1, len(rates) / 9, 40).astype(int))
     tau = sizes / IMU.rate_hz
-    found, clusters = np.array([allan(rates, size) for size in sizes.tolist()]).T
+    deviations, clusters = np.array([allan(rates, size) for size in sizes.tolist()]).T
     figure = Figure(figsize=(13.4, 4.3), dpi=90, layout="constrained")
-    left, right, last = figure.subplots(1, 3, width_ratios=[1.2, 1.1, 1])
-    outage(last, still)
+    gyroscopes, positions, outages = figure.subplots(1, 3, width_ratios=[1.2, 1.1, 1])
+    outage(outages, still)
     to_hour = np.degrees(1) * 3600
-    known = parts(tau)
-    total = np.sqrt(sum(one**2 for one in known.values()))
-    for (name, one), colour in zip(known.items(), theme.OBJECT_COLOURS, strict=False):
-        left.loglog(tau, one * to_hour, "--", color=colour, lw=1, label=name)
-    left.loglog(tau, total * to_hour, color=theme.INK, lw=1.2, label="closed form, all three")
-    room = found / np.sqrt(2 * np.maximum(clusters - 3, 1)) * to_hour
-    left.errorbar(
-        tau, found * to_hour, room, fmt="o", ms=3.2, color=theme.SENSOR, lw=0.9,
+    closed_forms = parts(tau)
+    total = np.sqrt(sum(form**2 for form in closed_forms.values()))
+    for (name, form), colour in zip(closed_forms.items(), theme.OBJECT_COLOURS, strict=False):
+        gyroscopes.loglog(tau, form * to_hour, "--", color=colour, lw=1, label=name)
+    gyroscopes.loglog(tau, total * to_hour, color=theme.INK, lw=1.2, label="closed form, all three")
+    one_sigma = deviations / np.sqrt(2 * np.maximum(clusters - 3, 1)) * to_hour
+    gyroscopes.errorbar(
+        tau, deviations * to_hour, one_sigma, fmt="o", ms=3.2, color=theme.SENSOR, lw=0.9,
         label=f"simulated, {HOURS} h at {IMU.rate_hz:.0f} Hz, 3 axes, 1 σ",
     )  # fmt: skip
-    left.set(
+    gyroscopes.set(
         xlabel="averaging time τ, s", ylabel="Allan deviation of angular velocity, °/h",
         ylim=(total.min() * to_hour / 6, None),
     )  # fmt: skip
-    left.set_title("gyroscopes of a carrier that stands", fontsize=9)
-    where = np.concatenate([block.positions for block in fixes(still)])
-    hours = np.arange(len(where)) / GNSS.rate_hz / 3600
+    gyroscopes.set_title("gyroscopes of a carrier that stands", fontsize=9)
+    position_errors = np.concatenate([block.positions for block in fixes(still)])
+    hours = np.arange(len(position_errors)) / GNSS.rate_hz / 3600
     colours = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
     for axis, (name, colour) in enumerate(colours.items()):
-        right.plot(hours, where[:, axis], color=colour, lw=0.5, label=name)
+        positions.plot(hours, position_errors[:, axis], color=colour, lw=0.5, label=name)
     for sign in (-1, 1):
-        right.axhline(sign * GNSS.drift_vertical_m, color="#ee7733", lw=0.8, ls=":")
-        right.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")
-    right.set(xlabel="time, h", ylabel="error of position, m", xlim=(0, HOURS))
-    right.set_title("GNSS of the same carrier; dotted: one σ of the drift", fontsize=9)
-    for axes in (left, right, last):
+        positions.axhline(sign * GNSS.drift_vertical_m, color="#ee7733", lw=0.8, ls=":")
+        positions.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")
+    positions.set(xlabel="time, h", ylabel="error of position, m", xlim=(0, HOURS))
+    positions.set_title("GNSS of the same carrier; dotted: one σ of the drift", fontsize=9)
+    for axes in (gyroscopes, positions, outages):
         axes.grid(color=theme.LINE, lw=0.5)
-    left.legend(fontsize=7.5, frameon=False, loc="upper right")
-    for line in right.legend(fontsize=7.5, frameon=False, loc="lower right").get_lines():
+    gyroscopes.legend(fontsize=7.5, frameon=False, loc="upper right")
+    for line in positions.legend(fontsize=7.5, frameon=False, loc="lower right").get_lines():
         line.set_linewidth(2)
     figure.savefig(path)

@@ -12,13 +12,13 @@ DRAWS = "effect-rain.png"
 WEATHER = {"rain_mm_h": 50.0}
 
 
-def on(survey: Survey) -> Survey:
-    """Return the survey in it."""
-    return _air.on(survey, **WEATHER)
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey in rain."""
+    return _air.in_weather(survey, **WEATHER)
 
 
 def picture(path: Path) -> None:
-    """Draw a street in it, and the numbers of returns against range."""
+    """Draw a street in rain, and the numbers of returns against range."""
     figure, right = _air.page("50 mm/h of rain", WEATHER, 12.0)
     _air.counts(right, WEATHER, 6.0)
     _air.save(figure, path)

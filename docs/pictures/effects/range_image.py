@@ -32,13 +32,13 @@ MATERIALS = (
 NOISE = Noise(detection_range_m=45, dropout=0.01)
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with the columns that range images need."""
     return replace(survey, columns=(*survey.columns, "ray", "range"))
 
 
 def image_of(scene: Scene, survey: Survey) -> dict[str, np.ndarray]:
-    """Return the range image of the first sweep, as its file has it."""
+    """Return the channels of the range image of the first sweep."""
     rig = Rig(scene, survey)
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
@@ -51,7 +51,7 @@ def picture(path: Path) -> None:
     """Draw a turn of an OS1-128 without and with a threshold of detection."""
     scene = city(200_000, trees=60, cars=60)
     sensor = load_sensor("ouster/os1-128", max_range_m=170)
-    survey = on(Survey(sensor, poses=[(45, 1, 2)], steps=36, materials=MATERIALS))
+    survey = with_effect(Survey(sensor, poses=[(45, 1, 2)], steps=36, materials=MATERIALS))
     clear = image_of(scene, survey)
     noisy = image_of(scene, replace(survey, noise=NOISE))
 
@@ -68,7 +68,8 @@ def picture(path: Path) -> None:
     for number, (image, title) in enumerate(shown):
         axes = figure.add_axes((0.062, 0.56 - 0.44 * number, 0.835, 0.33))
         ranges, without = (
-            np.take_along_axis(one["range"], order, axis=1)[::-1] for one in (image, clear)
+            np.take_along_axis(channels["range"], order, axis=1)[::-1]
+            for channels in (image, clear)
         )
         hits = np.isfinite(without)
         lost = hits & np.isnan(ranges)

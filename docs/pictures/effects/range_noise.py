@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Survey
@@ -18,8 +18,8 @@ WALK = Noise(0.01, detection_range_m=100, walk_m=0.02)
 RAYS = 4000
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with noise of ranges and range walk."""
     return replace(survey, noise=replace(NOISE, walk_m=0.02))
 
 
@@ -32,23 +32,24 @@ def picture(path: Path) -> None:
     }
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     scatter, walk = figure.subplots(1, 2)
-    for name, (material, colour, places) in kinds.items():
+    for name, (material, colour, ranges_m) in kinds.items():
         energies = []
         sigmas = []
         shifts = []
-        for place in places:
-            made = [wall("W", place)]
-            found = shot(made, ahead(RAYS), NOISE, materials=[material])
-            energies.append(np.median(found["intensity"]) / NOISE.threshold)
-            sigmas.append(found["range"].std())
+        for range_m in ranges_m:
+            target = [wall("W", range_m)]
+            columns = cast_scan(target, fixed_beams(RAYS), NOISE, materials=[material])
+            energies.append(np.median(columns["intensity"]) / NOISE.threshold)
+            sigmas.append(columns["range"].std())
             shifts.append(
-                shot(made, ahead(RAYS), WALK, materials=[material])["range"].mean() - place
+                cast_scan(target, fixed_beams(RAYS), WALK, materials=[material])["range"].mean()
+                - range_m
             )
         scatter.plot(energies, 100 * np.array(sigmas), "o", ms=5, color=colour, label=name)
         walk.plot(energies, 100 * np.array(shifts), "o", ms=5, color=colour)
     ratio = np.geomspace(0.8, 1e6, 200)
-    both = np.hypot(NOISE.range_m, NOISE.range_at_threshold_m / ratio)
-    scatter.plot(ratio, 100 * both, "k-", lw=1, zorder=0, label="σ = 1 cm ⊕ 10 cm · T / E")
+    total_sigma = np.hypot(NOISE.range_m, NOISE.range_at_threshold_m / ratio)
+    scatter.plot(ratio, 100 * total_sigma, "k-", lw=1, zorder=0, label="σ = 1 cm ⊕ 10 cm · T / E")
     scatter.plot([1, 1e6], [1, 1], "k:", lw=1, zorder=0, label="without (σ = 1 cm)")
     scatter.set(xscale="log", yscale="log", ylabel="standard deviation of ranges, cm")
     scatter.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])

@@ -29,18 +29,20 @@ SCANNER = Sensor(Beams(np.abs(NADIRS) - np.pi / 2, np.where(NADIRS < 0, np.pi, 0
 Real = NDArray[np.float64]
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with cars of glass."""
     glass = Material("car-*", transparent="pass", refractive_index=1.5)
     return replace(survey, materials=[glass, Material("*")])
 
 
-def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> SceneMesh:
+def box(
+    name: str, lower: tuple[float, float, float], upper: tuple[float, float, float]
+) -> SceneMesh:
     """Make a box whose triangles face outwards."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     squares = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
     faces = [[a, b, c] for a, b, c, _ in squares] + [[a, c, d] for a, _, c, d in squares]
-    return SceneMesh(name, np.array(low) + corners * np.subtract(high, low), np.array(faces))
+    return SceneMesh(name, np.array(lower) + corners * np.subtract(upper, lower), np.array(faces))
 
 
 def pool() -> list[SceneMesh]:
@@ -56,20 +58,20 @@ def pool() -> list[SceneMesh]:
 
 
 def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Real]:
-    """Places x and z of points, their beams' angles and energies."""
+    """Return x and z of points, and angles and energies of their beams."""
     survey = Survey(
         SCANNER, poses=[(0, 0, HEIGHT)], steps=1, columns=["intensity", "ray"],
         materials=[water, Material("*", FLOOR)],
     )  # fmt: skip
     (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
-    found = batch  # a survey with water is cast by the host
-    ray = found.found.ray  # type: ignore[union-attr]
-    places = found.positions  # type: ignore[union-attr]
-    return places[:, 0], places[:, 2], NADIRS[ray], found.intensity  # type: ignore[union-attr]
+    points = batch  # a survey with water is cast by the host
+    ray = points.found.ray  # type: ignore[union-attr]
+    positions = points.positions  # type: ignore[union-attr]
+    return positions[:, 0], positions[:, 2], NADIRS[ray], points.intensity  # type: ignore[union-attr]
 
 
 def picture(path: Path) -> None:
-    """Draw it."""
+    """Draw a section of the pool, and energies of its floor."""
     straight = Material("Water", transparent="pass")
     wet = Material("Water", transparent="pass", refractive_index=INDEX, attenuation_per_m=LOSS)
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
@@ -86,11 +88,14 @@ def picture(path: Path) -> None:
     within = np.arcsin(np.sin(angles) / INDEX)
     air = HEIGHT / np.cos(angles)
     water = DEPTH / np.cos(within)
-    seen = air + INDEX * water
+    apparent_range = air + INDEX * water
     for side in (-1, 1):
-        some = np.abs(HEIGHT * np.tan(angles) + DEPTH * np.tan(within)) < (5 if side < 0 else 2)
+        visible_side = np.abs(HEIGHT * np.tan(angles) + DEPTH * np.tan(within)) < (
+            5 if side < 0 else 2
+        )
         section.plot(
-            side * (seen * np.sin(angles))[some], (HEIGHT - seen * np.cos(angles))[some],
+            side * (apparent_range * np.sin(angles))[visible_side],
+            (HEIGHT - apparent_range * np.cos(angles))[visible_side],
             color=INK, lw=1, zorder=6, label="floor by Snell's law" if side > 0 else None,
         )  # fmt: skip
     for nadir in np.radians([-20, -40]):
@@ -98,9 +103,9 @@ def picture(path: Path) -> None:
         top = HEIGHT * np.tan(nadir)
         foot = HEIGHT * np.tan(nadir) + DEPTH * np.tan(down)
         section.plot([0, top, foot], [HEIGHT, 0, -DEPTH], color=OBJECT_COLOURS[1], lw=1, zorder=3)
-        far = HEIGHT / np.cos(nadir) + INDEX * DEPTH / np.cos(down)
-        ends = [top, far * np.sin(nadir)], [0, HEIGHT - far * np.cos(nadir)]
-        section.plot(*ends, color=OBJECT_COLOURS[1], lw=1, ls=":", zorder=6)
+        apparent_m = HEIGHT / np.cos(nadir) + INDEX * DEPTH / np.cos(down)
+        line = [top, apparent_m * np.sin(nadir)], [0, HEIGHT - apparent_m * np.cos(nadir)]
+        section.plot(*line, color=OBJECT_COLOURS[1], lw=1, ls=":", zorder=6)
     section.plot(0, HEIGHT, "^", color=INK, ms=8, zorder=7)
     section.text(0.25, HEIGHT, "sensor", va="center", fontsize=8, color=INK)
     section.set(xlim=(-7.5, 7.5), ylim=(-3.4, 3.4), xlabel="x (m)", ylabel="z (m)", aspect="equal")
@@ -119,9 +124,9 @@ def picture(path: Path) -> None:
     exact = FLOOR * np.cos(within) * passes**2 * np.exp(-2 * LOSS * water) * 100 / area
     for material, colour, name in ((straight, MUTED, "without"), (wet, RED, "with")):
         _, _, nadir, energy = cast(plain, material)
-        some = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
+        shown = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
         energies.plot(
-            np.degrees(nadir[some]), energy[some], "o", ms=4, mfc="none", color=colour,
+            np.degrees(nadir[shown]), energy[shown], "o", ms=4, mfc="none", color=colour,
             label=f"simulated, {name} refraction",
         )  # fmt: skip
     energies.plot(np.degrees(angles), exact, color=INK, lw=1, label="Snell, Fresnel, Beer–Lambert")

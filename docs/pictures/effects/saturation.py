@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
+from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -27,48 +27,48 @@ MATERIALS = {
 COLUMNS = ("range", "intensity", "amplitude", "pulse_width", "object")
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with saturation."""
     return replace(survey, noise=NOISE)
 
 
-def _wave(place: float, noise: Noise) -> tuple[NDArray, NDArray]:
-    """Range and height of samples of the waveform of a white wall."""
+def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
+    """Return range and signal of the samples of a white wall's waveform."""
     survey = Survey(
-        ahead(1), poses=[(0, 0, 0)], steps=1, materials=MATERIALS["W"], noise=noise,
+        fixed_beams(1), poses=[(0, 0, 0)], steps=1, materials=MATERIALS["W"], noise=noise,
         columns=COLUMNS, returns=Returns(waveform="peaks", sample_ns=0.25), waveform_samples=160,
     )  # fmt: skip
-    part = columns_of(list(Rig(Scene.from_meshes([wall("W", place)]), survey, "numpy").cast(0, 1)))
+    part = columns_of(list(Rig(Scene.from_meshes([wall("W", wall_m)]), survey, "numpy").cast(0, 1)))
     table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
     waves = part.cloud(table, survey.precision_m, np.zeros(3)).waveforms
     return waves.times_ns[0] * LIGHT_M_NS / 2, waves.samples[0]
 
 
-def _told_apart(name: str, place: float) -> tuple[float, float]:
-    """Signal over saturation of a plate before a wall, and how far behind it that is seen."""
+def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
+    """Return a plate's signal over saturation, and the least separable distance to a wall."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
-    near = 0.1
-    far = 10.0
-    while far - near > 0.005:
-        behind = (near + far) / 2
-        meshes = [wall(name, place, y=(-50, 0.0)), wall("Wall", place + behind)]
-        found = shot(meshes, ahead(1), NOISE, **options)
-        near, far = (near, behind) if len(found["range"]) == 2 else (behind, far)
-    return found["intensity"][0] / NOISE.full, far
+    lower_m = 0.1
+    upper_m = 10.0
+    while upper_m - lower_m > 0.005:
+        behind = (lower_m + upper_m) / 2
+        meshes = [wall(name, plate_m, y=(-50, 0.0)), wall("Wall", plate_m + behind)]
+        columns = cast_scan(meshes, fixed_beams(1), NOISE, **options)
+        lower_m, upper_m = (lower_m, behind) if len(columns["range"]) == 2 else (behind, upper_m)
+    return columns["intensity"][0] / NOISE.full, upper_m
 
 
 def picture(path: Path) -> None:
     """Draw a clipped pulse; widths and ranges, and what is told apart, on closed forms."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
-    pulse, wide, apart = figure.subplots(1, 3)
+    pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")
-    for place, colour in ((8.0, RED), (31.6, BLUE), (50.0, GREY)):
-        where, high = _wave(place, NOISE)
-        label = f"white wall at {place:g} m"
-        pulse.plot(where - place, high / NOISE.full, color=colour, lw=1.5, label=label)
-        where, high = _wave(place, replace(NOISE, saturation=None))
-        pulse.plot(where - place, high / NOISE.full, color=colour, lw=0.8, ls="--")
+    for wall_m, colour in ((8.0, RED), (31.6, BLUE), (50.0, GREY)):
+        range_m, signal = _waveform(wall_m, NOISE)
+        label = f"white wall at {wall_m:g} m"
+        pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=1.5, label=label)
+        range_m, signal = _waveform(wall_m, replace(NOISE, saturation=None))
+        pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=0.8, ls="--")
     pulse.set(ylim=(-0.1, 2.2), xlim=(-1.5, 1.5), xlabel="range − true range, m",
               ylabel="signal / saturation")  # fmt: skip
     pulse.legend(frameon=False, fontsize=8, loc="upper right")
@@ -77,26 +77,30 @@ def picture(path: Path) -> None:
     ratio = np.geomspace(0.1, 1e5, 200)
     closed = PULSE_NS * np.sqrt(1 + np.log2(np.maximum(ratio, 1)))
     kinds = ("W", BLUE, np.geomspace(1, 90, 9)), ("Sign", RED, np.geomspace(3, 90, 6))
-    shift = wide.twinx()
-    for name, colour, places in kinds:
-        for place in places:
-            given = {"materials": MATERIALS[name], "columns": COLUMNS}
-            found = shot([wall(name, place)], ahead(1), NOISE, **given)
-            over = found["intensity"] / NOISE.full
-            wide.plot(over, found["pulse_width"], "o", ms=5, color=colour)
+    shift = widths.twinx()
+    for name, colour, ranges_m in kinds:
+        for wall_m in ranges_m:
+            options = {"materials": MATERIALS[name], "columns": COLUMNS}
+            columns = cast_scan([wall(name, wall_m)], fixed_beams(1), NOISE, **options)
+            over_saturation = columns["intensity"] / NOISE.full
+            widths.plot(over_saturation, columns["pulse_width"], "o", ms=5, color=colour)
             waves = Returns(waveform="peaks")
-            found = shot([wall(name, place)], ahead(1), NOISE, returns=waves, **given)
-            shift.plot(over, found["range"] - place, "s", ms=4, mfc="none", color=colour)
-    wide.plot(ratio, closed, "k-", lw=1, zorder=0)
+            columns = cast_scan(
+                [wall(name, wall_m)], fixed_beams(1), NOISE, returns=waves, **options
+            )
+            shift.plot(
+                over_saturation, columns["range"] - wall_m, "s", ms=4, mfc="none", color=colour
+            )
+    widths.plot(ratio, closed, "k-", lw=1, zorder=0)
     shift.plot(ratio, -LIGHT_M_NS / 4 * (closed - PULSE_NS), "k--", lw=1, zorder=0)
-    wide.set(xscale="log", ylim=(0, 25), ylabel="pulse width, ns (filled)")
+    widths.set(xscale="log", ylim=(0, 25), ylabel="pulse width, ns (filled)")
     shift.set(ylim=(-1.5, 1.0), ylabel="range − true range in waveforms, m (open)")
-    wide.set_title("5 ns pulses on walls and signs", fontsize=10)
+    widths.set_title("5 ns pulses on walls and signs", fontsize=10)
 
-    found_at = [(_told_apart(name, place), colour) for name, colour, places in kinds
-                for place in places[3:]]  # fmt: skip
-    for (over, behind), colour in found_at:
-        apart.plot(over, behind, "o", ms=5, color=colour)
+    separable = [(_separable_distance(name, wall_m), colour) for name, colour, ranges_m in kinds
+                for wall_m in ranges_m[3:]]  # fmt: skip
+    for (over_saturation, behind), colour in separable:
+        apart.plot(over_saturation, behind, "o", ms=5, color=colour)
     apart.plot(ratio, LIGHT_M_NS / 4 * (closed + PULSE_NS), "k-", lw=1, zorder=0,
                label="wall not clipped")  # fmt: skip
     apart.plot(
@@ -105,8 +109,8 @@ def picture(path: Path) -> None:
     apart.set(xscale="log", ylim=(0, 4), ylabel="least distance behind the plate, m")
     apart.legend(frameon=False, fontsize=8, loc="upper left")
     apart.set_title("a wall told apart behind a plate", fontsize=10)
-    for axes in (wide, apart):
+    for axes in (widths, apart):
         axes.set_xlabel("signal / saturation")
-    for axes in (pulse, wide, apart):
+    for axes in (pulse, widths, apart):
         axes.grid(alpha=0.25)
     figure.savefig(path)

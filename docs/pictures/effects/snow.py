@@ -12,13 +12,13 @@ DRAWS = "effect-snow.png"
 WEATHER = {"snow_mm_h": 1.0}
 
 
-def on(survey: Survey) -> Survey:
-    """Return the survey in it."""
-    return _air.on(survey, **WEATHER)
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey in snow."""
+    return _air.in_weather(survey, **WEATHER)
 
 
 def picture(path: Path) -> None:
-    """Draw a street in it, and the numbers of returns against range."""
+    """Draw a street in snow, and the numbers of returns against range."""
     figure, right = _air.page("1 mm/h of snow", WEATHER, 20.0)
     _air.counts(right, WEATHER, 16.0)
     _air.save(figure, path)

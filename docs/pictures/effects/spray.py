@@ -34,20 +34,22 @@ SPEED = 25.0
 SPRAY = 6
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey with spray and wet ground."""
     return replace(survey, noise=NOISE, **WEATHER)
 
 
-def of(scene: Scene) -> Scene:
-    """Add two lorries to a street, which drive at 90 km/h."""
+def with_actors(scene: Scene) -> Scene:
+    """Return the scene with two lorries that drive at 90 km/h."""
     return scene.with_actors([lorry("Near", (-20, 3.5)), lorry("Far", (-10, -3.5))])
 
 
-def lorry(name: str, place: tuple[float, float], height: float = 0.0) -> Actor:
+def lorry(name: str, start: tuple[float, float], height: float = 0.0) -> Actor:
     """Make a lorry that drives along x."""
-    way = Track([0, 2], [[*place, height], [place[0] + 2 * SPEED, place[1], height]], beyond="hold")
-    return Actor(box(name, (9, 2.5, 3)), way)
+    drive = Track(
+        [0, 2], [[*start, height], [start[0] + 2 * SPEED, start[1], height]], beyond="hold"
+    )
+    return Actor(box(name, (9, 2.5, 3)), drive)
 
 
 def picture(path: Path) -> None:
@@ -59,12 +61,12 @@ def picture(path: Path) -> None:
     scene = Scene.from_meshes([road]).with_actors([lorry("Lorry", (8, -3.5))])
     sensor = load_sensor("ouster/os1-128", max_range_m=120)
     survey = Survey(sensor, poses=[(-8, 0, 1.9)], steps=36, keep_every=1, precision_m=0.001)
-    found = cloud(scene, replace(survey, noise=NOISE, **WEATHER))
-    wet = found["cause"] == SPRAY
+    columns = cloud(scene, replace(survey, noise=NOISE, **WEATHER))
+    wet = columns["cause"] == SPRAY
     for name, axis in (("above", "y"), ("aside", "z")):
         for which, colour, label in ((~wet, GREY, "surfaces"), (wet, RED, "spray")):
             views[name].plot(
-                found["x"][which], found[axis][which], ".", ms=2.5, mew=0, color=colour,
+                columns["x"][which], columns[axis][which], ".", ms=2.5, mew=0, color=colour,
                 label=f"{label}: {which.sum():,}",
             )  # fmt: skip
         views[name].plot(-8, 0 if axis == "y" else 1.9, "^", color=BLUE, ms=7)
@@ -82,7 +84,7 @@ def picture(path: Path) -> None:
                    optics=Optics(divergence_mrad=3.0))  # fmt: skip
     rear = replace(scene, actors=(lorry("Lorry", (4.5, 8), -1.5),))
     for x in behind:
-        one = Survey(
+        across = Survey(
             ahead,
             poses=[(-x, 0, 0)],
             steps=1,
@@ -91,18 +93,24 @@ def picture(path: Path) -> None:
             returns=Returns("all", pulse_ns=0),
             **WEATHER,
         )
-        shares.append((cloud(rear, one)["cause"] == SPRAY).sum() / count)
+        shares.append((cloud(rear, across)["cause"] == SPRAY).sum() / count)
     axes = views["right"]
     axes.plot(behind, shares, "o", ms=4, color=BLUE, label="simulated")
     kind = spray(20.0)
-    air = one.air(0)
+    air = across.air(0)
     span = np.linspace(8 - 1.25, 8 + 1.25, 200)
-    most = float(np.trapezoid(air.rate(kind, NOISE.threshold, span), span))
-    along = np.linspace(0, 28, 1000)
-    age = np.ceil(along / (SPEED / 10)) / 10
-    curve = most * np.exp(-age / 0.4) * (age <= 1.3)
-    axes.plot(along, curve, color=GREY, label="Poisson's mean, boxes of 0.1 s")
-    axes.plot(along, most * np.exp(-along / SPEED / 0.4), ":", color=GREY, label="exp(−x / 10 m)")
+    full_rate = float(np.trapezoid(air.rate(kind, NOISE.threshold, span), span))
+    distance_m = np.linspace(0, 28, 1000)
+    age = np.ceil(distance_m / (SPEED / 10)) / 10
+    curve = full_rate * np.exp(-age / 0.4) * (age <= 1.3)
+    axes.plot(distance_m, curve, color=GREY, label="Poisson's mean, boxes of 0.1 s")
+    axes.plot(
+        distance_m,
+        full_rate * np.exp(-distance_m / SPEED / 0.4),
+        ":",
+        color=GREY,
+        label="exp(−x / 10 m)",
+    )
     axes.set(xlabel="behind the lorry (m)", ylabel="returns of a beam across", xlim=(0, 28))
     axes.set_title("a beam from 8 m beside it", fontsize=10)
     axes.legend(fontsize=8, frameon=False)

@@ -30,23 +30,23 @@ RAYS = 50_000
 Real = NDArray[np.float64]
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with leaves in the crowns of all trees."""
     leaves = Material("tree-*", 0.5, leaf_area_density=0.8)
     return replace(survey, materials=[leaves, Material("*")])
 
 
 def cast(
-    meshes: list[SceneMesh], sensor: Sensor, at: Any, materials: list[Material], seed: int = 0
+    meshes: list[SceneMesh], sensor: Sensor, position: Any, materials: list[Material], seed: int = 0
 ) -> Any:
     """Cast a scan."""
-    survey = Survey(sensor, poses=[at], steps=1, materials=materials, noise=Noise(seed=seed))
+    survey = Survey(sensor, poses=[position], steps=1, materials=materials, noise=Noise(seed=seed))
     (batch,) = Rig(Scene.from_meshes(meshes), survey).cast(0, 1)
     return batch
 
 
 def tree() -> list[SceneMesh]:
-    """Make a crown, a trunk in it, and the ground."""
+    """Make a crown, its trunk, and the ground."""
     crown = trimesh.creation.icosphere(4, 1.0)
     shaped = np.asarray(crown.vertices) * (2.4, 2.4, 3.0) + (0, 0, 5.5)
     trunk = trimesh.creation.cylinder(0.2, 7.0, sections=16)
@@ -61,14 +61,14 @@ def section(axes: Any, leaves: Material, title: str) -> None:
     """Draw a slice of a tree from the side; the sensor is 9 m to the left."""
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
     scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
-    place = scan.positions
+    positions = scan.positions
     which = scan.object
-    slice_ = (np.abs(place[:, 1]) < 0.6) & (place[:, 0] < 9)
+    slice_ = (np.abs(positions[:, 1]) < 0.6) & (positions[:, 0] < 9)
     for number, colour in ((2, MUTED), (0, GREEN), (1, BROWN)):
-        some = slice_ & (which == number)
-        axes.plot(place[some, 0], place[some, 2], ".", ms=1.8, mew=0, color=colour)
-    around = np.linspace(0, 2 * math.pi, 100)
-    axes.plot(2.4 * np.cos(around), 5.5 + 3 * np.sin(around), color=INK, lw=0.6)
+        shown = slice_ & (which == number)
+        axes.plot(positions[shown, 0], positions[shown, 2], ".", ms=1.8, mew=0, color=colour)
+    angle = np.linspace(0, 2 * math.pi, 100)
+    axes.plot(2.4 * np.cos(angle), 5.5 + 3 * np.sin(angle), color=INK, lw=0.6)
     axes.plot(-9, 2, "^", color=INK, ms=6)
     axes.set(xlim=(-9.8, 9), ylim=(-0.6, 9), aspect="equal", ylabel="z (m)")
     axes.set_title(title, fontsize=10, color=INK)
@@ -89,7 +89,7 @@ def canopy(kind: str, zenith_deg: float) -> Real:
 
 
 def picture(path: Path) -> None:
-    """Draw it."""
+    """Draw sections of a tree, gap fractions and depths of returns."""
     figure = Figure((13.5, 5.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.05, 1, 1])
     above = figure.add_subplot(grid[0, 0])
@@ -108,8 +108,8 @@ def picture(path: Path) -> None:
         tau = projection(kind, cosine) * DENSITY * HIGH / cosine
         shade = OBJECT_COLOURS[colour]
         gaps.plot(zeniths, np.exp(-tau), color=shade, lw=1.2, label=f"{kind}: exp(−G·LAI / cos θ)")
-        found = [np.isnan(canopy(kind, tilt)).mean() for tilt in tilts]
-        gaps.plot(tilts, found, "o", ms=4.5, mfc="none", color=shade, label="simulated")
+        simulated = [np.isnan(canopy(kind, tilt)).mean() for tilt in tilts]
+        gaps.plot(tilts, simulated, "o", ms=4.5, mfc="none", color=shade, label="simulated")
         depth = canopy(kind, 40.0)
         slope = projection(kind, np.array([math.cos(math.radians(40))]))[0]
         slope *= DENSITY * HIGH / math.cos(math.radians(40))

@@ -22,7 +22,7 @@ RATE_HZ = 25
 DARK = "#3a3f47"
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with radial velocities, in which walking shows."""
     return replace(survey, columns=(*survey.columns, "radial_velocity"))
 
@@ -35,39 +35,41 @@ def picture(path: Path) -> None:
     mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=SPEED))
-    way = Track([0, SECONDS + 1], [[AWAY, 0, 0], [AWAY - SPEED * (SECONDS + 1), 0, 0]])
+    walk = Track([0, SECONDS + 1], [[AWAY, 0, 0], [AWAY - SPEED * (SECONDS + 1), 0, 0]])
     floor = box("Floor", (60, 60, 0.1))
     scene = Scene.from_meshes([replace(floor, vertices=floor.vertices - [0, 0, 0.1])])
-    scene = scene.with_actors([Actor(mesh, way)])
+    scene = scene.with_actors([Actor(mesh, walk)])
     sensor = Sensor.grid(1800, 64, vertical_fov_deg=24, horizontal_fov_deg=14, rate_hz=RATE_HZ)
     columns = ["radial_velocity", "object", "time"]
     scanner = Scanner(scene, sensor, columns=columns, precision_m=1e-3)
     sweeps = []
     for number in range(int(SECONDS * RATE_HZ)):
-        found = scanner.sweep((0, 0, 1), number=number)
-        own = found["object"] == 1
-        columns_of = (found["time"][own] / 1e9, found["radial_velocity"][own])
-        sweeps.append((found.positions[own], *columns_of))
+        cloud = scanner.sweep((0, 0, 1), number=number)
+        of_person = cloud["object"] == 1
+        columns_of = (cloud["time"][of_person] / 1e9, cloud["radial_velocity"][of_person])
+        sweeps.append((cloud.positions[of_person], *columns_of))
     figure = Figure(figsize=(10.4, 4.2), dpi=90, layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
+    moments, chart = figure.subplots(1, 2, width_ratios=(1.3, 1))
     scale = {"cmap": ListedColormap(DIVERGING), "vmin": -5, "vmax": 5, "linewidths": 0}
     for k, number in enumerate((5, 11, 18, 24)):
-        where, _, velocity = sweeps[number]
-        ahead = where[:, 0] - (AWAY - SPEED * number / RATE_HZ)
-        points = left.scatter(1.5 * k + ahead, where[:, 2], c=velocity, s=3, **scale)
-        left.text(1.5 * k, -0.16, f"{number / RATE_HZ:.2f} s", color="white", ha="center", size=8)
-    left.set_facecolor(DARK)
-    left.set(
+        positions, _, velocity = sweeps[number]
+        ahead = positions[:, 0] - (AWAY - SPEED * number / RATE_HZ)
+        points = moments.scatter(1.5 * k + ahead, positions[:, 2], c=velocity, s=3, **scale)
+        moments.text(
+            1.5 * k, -0.16, f"{number / RATE_HZ:.2f} s", color="white", ha="center", size=8
+        )
+    moments.set_facecolor(DARK)
+    moments.set(
         aspect="equal", xlabel="m; the sensor is on the left", ylabel="z, m", ylim=(-0.25, 1.9)
     )
     label = "radial velocity, m/s: blue comes nearer"
-    figure.colorbar(points, ax=left, label=label, location="bottom", shrink=0.85, aspect=40)
-    places, seconds, velocities = map(np.concatenate, zip(*sweeps, strict=True))
+    figure.colorbar(points, ax=moments, label=label, location="bottom", shrink=0.85, aspect=40)
+    all_positions, seconds, velocities = map(np.concatenate, zip(*sweeps, strict=True))
     light = {"s": 0.6, "cmap": "viridis", "linewidths": 0}
-    shown = right.scatter(seconds, velocities, c=places[:, 2], **light)
-    right.axhline(-SPEED, color="black", lw=0.8, ls="--")
-    right.set(xlabel="time, s", ylabel="radial velocity, m/s", xlim=(0, SECONDS))
-    figure.colorbar(shown, ax=right, label="height, m", location="bottom", shrink=0.85, aspect=40)
-    left.set_title("one person in four sweeps, from aside", fontsize=8.5)
-    right.set_title(f"all points; dashed: the person's own {SPEED} m/s", fontsize=8.5)
+    shown = chart.scatter(seconds, velocities, c=all_positions[:, 2], **light)
+    chart.axhline(-SPEED, color="black", lw=0.8, ls="--")
+    chart.set(xlabel="time, s", ylabel="radial velocity, m/s", xlim=(0, SECONDS))
+    figure.colorbar(shown, ax=chart, label="height, m", location="bottom", shrink=0.85, aspect=40)
+    moments.set_title("one person in four sweeps, from aside", fontsize=8.5)
+    chart.set_title(f"all points; dashed: the person's own {SPEED} m/s", fontsize=8.5)
     figure.savefig(path)

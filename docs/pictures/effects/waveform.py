@@ -30,23 +30,25 @@ _LANES = {
 }
 
 
-def on(survey: Survey) -> Survey:
+def with_effect(survey: Survey) -> Survey:
     """Return the survey with a Gaussian decomposition of beams of 19 sub-rays."""
     returns = Returns("all", subrays=19, waveform="gaussian")
     return replace(survey, returns=returns)
 
 
-def _seen(scene: Scene, at: tuple[float, float], samples: int = 0, **returns: Any) -> Cloud:
-    """Points of one pulse that looks straight down."""
+def _pulse_points(
+    scene: Scene, position: tuple[float, float], samples: int = 0, **returns: Any
+) -> Cloud:
+    """Return the points of a pulse that looks straight down."""
     sensor = Sensor(Beams(np.zeros(1)), Spin(1, 360), optics=Optics(divergence_mrad=2.5))
-    given = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
+    options = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
     survey = Survey(
         sensor,
-        poses=[Pose((*at, _HEIGHT_M), pitch_deg=90)],
+        poses=[Pose((*position, _HEIGHT_M), pitch_deg=90)],
         steps=1,
         columns=_COLUMNS,
         materials=[Material("*", 0.4)],
-        returns=Returns(**given),
+        returns=Returns(**options),
         precision_m=1e-3,
         waveform_samples=samples,
     )
@@ -60,11 +62,13 @@ def _flat(name: str, height: float, x: tuple[float, float]) -> SceneMesh:
     return SceneMesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, float]) -> None:
-    """Draw the waveform of a pulse over height, its parts, and what is found."""
-    hits = _seen(scene, at, pulse_ns=0.001)
-    found = {name: _seen(scene, at, 160, waveform=name) for name in _LANES}
-    waves = found["gaussian"].waveforms
+def _panel(
+    axes: Any, scene: Scene, position: tuple[float, float], span: tuple[float, float]
+) -> None:
+    """Draw the waveform of a pulse over height, its parts, and the returns of receivers."""
+    hits = _pulse_points(scene, position, pulse_ns=0.001)
+    clouds = {name: _pulse_points(scene, position, 160, waveform=name) for name in _LANES}
+    waves = clouds["gaussian"].waveforms
     heights = _HEIGHT_M - waves.times_ns[0] * LIGHT_M_NS / 2
     top = waves.samples[0].max()
     axes.vlines(
@@ -73,22 +77,28 @@ def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, 
     )  # fmt: skip
     axes.plot(heights, waves.samples[0] / top, ".", color="black", ms=4, zorder=4, label="samples")
     fine = np.linspace(*span, 800)
-    finer = _seen(scene, at, 1600, waveform="peaks", sample_ns=0.1).waveforms
+    finer = _pulse_points(scene, position, 1600, waveform="peaks", sample_ns=0.1).waveforms
     axes.plot(
         _HEIGHT_M - finer.times_ns[0] * LIGHT_M_NS / 2, finer.samples[0] / top, color="black", lw=1,
         label="waveform",
     )  # fmt: skip
-    parts = found["gaussian"]
+    parts = clouds["gaussian"]
     for row in range(len(parts)):
-        wide = parts["pulse_width"][row] / FWHM * LIGHT_M_NS / 2
+        sigma_m = parts["pulse_width"][row] / FWHM * LIGHT_M_NS / 2
         middle = _HEIGHT_M - parts["range"][row]
-        bell = parts["amplitude"][row] / top * np.exp(-0.5 * ((fine - middle) / wide) ** 2)
+        bell = parts["amplitude"][row] / top * np.exp(-0.5 * ((fine - middle) / sigma_m) ** 2)
         label = "fitted Gaussians" if row == 0 else None
         axes.plot(fine, bell, color=_LANES["gaussian"][1], lw=1, ls="--", label=label)
     for lane, (name, (_, colour, marker)) in enumerate(_LANES.items()):
-        where = _HEIGHT_M - found[name]["range"]
+        heights_of_returns = _HEIGHT_M - clouds[name]["range"]
         axes.axhline(-0.10 - 0.11 * lane, color="#dddddd", lw=0.8, zorder=0)
-        axes.plot(where, np.full(len(where), -0.10 - 0.11 * lane), marker, color=colour, ms=6)
+        axes.plot(
+            heights_of_returns,
+            np.full(len(heights_of_returns), -0.10 - 0.11 * lane),
+            marker,
+            color=colour,
+            ms=6,
+        )
     axes.set(xlim=span[::-1], ylim=(-0.42, 1.08), xlabel="height above ground, m")
     axes.set_yticks([0, 0.25, 0.5, 0.75, 1])
     axes.spines[["top", "right"]].set_visible(False)
@@ -96,25 +106,25 @@ def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, 
 
 def picture(path: Path) -> None:
     """Draw the picture."""
-    figure, (left, right) = plt.subplots(
+    figure, (edge_axes, tree_axes) = plt.subplots(
         1, 2, figsize=(10, 4.2), layout="constrained", width_ratios=(1, 1.5), sharey=True
     )
     step = Scene.from_meshes([_flat("Terrace", 0.0, (-9, 9)), _flat("Roof", 0.68, (-9, 0.03))])
-    _panel(left, step, (0.0, 0.0), (-1.2, 2.0))
-    left.set_title("edge of a roof, 0.68 m above a terrace", fontsize=10)
-    left.set_ylabel("received power, of the highest sample")
+    _panel(edge_axes, step, (0.0, 0.0), (-1.2, 2.0))
+    edge_axes.set_title("edge of a roof, 0.68 m above a terrace", fontsize=10)
+    edge_axes.set_ylabel("received power, of the highest sample")
     oak = tree(SPECIES[0])
     wood = Scene.from_meshes([_flat("Ground", 0.0, (-20, 20)), oak])
-    _panel(right, wood, (2.8, 2.0), (-1.5, 14.5))
-    right.set_title("an oak", fontsize=10)
-    for axes in (left, right):
+    _panel(tree_axes, wood, (2.8, 2.0), (-1.5, 14.5))
+    tree_axes.set_title("an oak", fontsize=10)
+    for axes in (edge_axes, tree_axes):
         for lane, (label, colour, _) in enumerate(_LANES.values()):
-            place = axes.get_xlim()[0]
+            left_limit = axes.get_xlim()[0]
             axes.annotate(
-                label, (place, -0.10 - 0.11 * lane), color=colour, fontsize=8, va="bottom",
+                label, (left_limit, -0.10 - 0.11 * lane), color=colour, fontsize=8, va="bottom",
                 xytext=(2, 1), textcoords="offset points",
             )  # fmt: skip
-    right.legend(fontsize=8, frameon=False)
+    tree_axes.legend(fontsize=8, frameon=False)
     figure.suptitle(
         "One pulse of 5 ns (FWHM) from 300 m, 0.75 m wide on the ground, and its returns",
         fontsize=11,

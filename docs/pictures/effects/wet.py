@@ -16,13 +16,13 @@ DRAWS = "effect-wet.png"
 ROAD = 0.2
 
 
-def on(survey: Survey) -> Survey:
-    """Switch it on."""
+def with_effect(survey: Survey) -> Survey:
+    """Return the survey on wet ground."""
     return replace(survey, wet=1.0)
 
 
 def picture(path: Path) -> None:
-    """Draw a road from the side, dry and wet, and what returns against the angle."""
+    """Draw a road from the side, dry and wet, and reflectance against the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["dry", "right"], ["wet", "right"]], width_ratios=[1.5, 1])
     corners = np.array([[-90, -90, -2], [90, -90, -2], [90, 90, -2], [-90, 90, -2.0]])
@@ -38,11 +38,11 @@ def picture(path: Path) -> None:
         precision_m=0.001,
     )  # fmt: skip
     for name, share in (("dry", 0.0), ("wet", 1.0)):
-        found = cloud(scene, replace(survey, wet=share))
+        columns = cloud(scene, replace(survey, wet=share))
         axes = views[name]
-        x = found["x"]
-        z = found["z"] + 2
-        ghost = found["cause"] == 5
+        x = columns["x"]
+        z = columns["z"] + 2
+        ghost = columns["cause"] == 5
         for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
             shown = f"{label}: {which.sum():,}"
             axes.plot(x[which], z[which], ".", ms=3, mew=0, color=colour, label=shown)
@@ -50,9 +50,9 @@ def picture(path: Path) -> None:
         axes.set(xlim=(-1, 34), ylim=(-6, 6), xlabel="x (m)", ylabel="z (m)", title=name)
         axes.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=4)
         if name == "wet":
-            once = points([road], replace(survey, wet=share))
-            steep = 90 + once["elevation"][:: len(x) // 400]
-            shown = once["reflectance"][:: len(x) // 400]
+            road_columns = points([road], replace(survey, wet=share))
+            steep = 90 + road_columns["elevation"][:: len(x) // 400]
+            shown = road_columns["reflectance"][:: len(x) // 400]
             views["right"].plot(steep, shown, "o", ms=4, color=BLUE)
     angle = np.radians(np.linspace(0, 89.5, 400))
     dry = ROAD * np.cos(angle)
