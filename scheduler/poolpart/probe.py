@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 # may be another) and with CUDA_VISIBLE_DEVICES applied. In a process of its own: cuInit
 # would fix the visible devices of the worker for good. Version 2 tells the instances of a
 # divided (MIG) device apart; drivers before CUDA 11.4 have only the first.
-_DRIVER = "libcuda.so.1"
+CUDA_DRIVER = "libcuda.so.1"
 _LIST_GPUS = """
 import ctypes, sys
 cuda = ctypes.CDLL(sys.argv[1])
@@ -34,10 +34,10 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 @cache  # it takes up to a second; an error is not kept
 def _listing() -> tuple[str, ...]:
     try:
-        ctypes.CDLL(_DRIVER)
+        ctypes.CDLL(CUDA_DRIVER)
     except OSError:
         return ()
-    command = [sys.executable, "-c", _LIST_GPUS, _DRIVER]
+    command = [sys.executable, "-c", _LIST_GPUS, CUDA_DRIVER]
     process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     return tuple(process.stdout.split())
 

@@ -207,7 +207,7 @@ def test_memory_is_at_most_what_a_control_group_allows(monkeypatch, tmp_path):
     (tmp_path / "memory.max").write_text(f"{limit}\n")
     (tmp_path / "memory").mkdir()
     (tmp_path / "memory/memory.limit_in_bytes").write_text(f"{limit}\n")
-    monkeypatch.setattr(allowance, "_CONTROL_GROUPS", tmp_path)
+    monkeypatch.setattr(allowance, "CONTROL_GROUPS", tmp_path)
     assert allowance.memory.__wrapped__() == limit
     for name in ("memory.max", "memory/memory.limit_in_bytes"):
         (tmp_path / name).write_text("max\n")

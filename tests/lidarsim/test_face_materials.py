@@ -484,7 +484,7 @@ def test_only_the_faces_of_sheeting_bloom():
 
 
 def test_a_device_leaves_what_faces_are_made_of_to_numpy(source_backend, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, source_backend))
+    monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
     scene = Scene.from_meshes([front(), level("Ground")])
     options = replace(survey(), columns=("class", "material", "intensity", "reflectance", "range"))
     got, want = (

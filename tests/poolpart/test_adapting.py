@@ -298,7 +298,7 @@ def note(number, partition):
 @pytest.mark.slow
 def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypatch):
     """Idle workers go at once, while tasks come one by one."""
-    monkeypatch.setattr(poolpart.deploy.clusters, "_ADAPT_EVERY_S", 0.01)
+    monkeypatch.setattr(poolpart.deploy.clusters, "ADAPT_EVERY_S", 0.01)
     ran.clear()
     partitions = {name: adaptive(0, 2) | {"idle_s": 0.0} for name in ("A", "B")}
     with cluster_of(partitions) as client:

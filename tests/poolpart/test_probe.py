@@ -31,7 +31,7 @@ def fake_driver(tmp_path, monkeypatch):
         defines = [f"-DBODY={body}", f"-DUUID={uuid}", f"-DERROR={error}"]
         command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]
         subprocess.run(command, check=True)
-        monkeypatch.setattr(probe, "_DRIVER", str(library))
+        monkeypatch.setattr(probe, "CUDA_DRIVER", str(library))
         probe._listing.cache_clear()
 
     yield install
