@@ -87,7 +87,7 @@ def timed(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 def watched(cupy: Any, rig: Rig) -> Iterator[Split]:
     """Take the times of kernels and of copies of columns."""
     split = Split(cupy)
-    engine = rig._caster.caster._engine
+    engine = rig.scene_caster.caster.engine
     run = engine._run  # type: ignore[attr-defined]
     kernel = lidarsim.simulator.device._kernel
     send = Outbox.send
@@ -127,7 +127,7 @@ def columns(here: Here) -> Rows:
         row = timed(rig, rays, 3 * sizes.seconds)
         row["bus_share"] = row["mpoints_s"] * row["bytes_a_point"] / 1e3 / bus
         yield name, row
-    engine: Any = rig._caster.caster._engine
+    engine: Any = rig.scene_caster.caster.engine
     for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
         with patch.object(engine, "chunk", chunk):
             yield f"chunks of {chunk:,} rays", timed(rig, sizes.batch, sizes.seconds)

@@ -64,7 +64,7 @@ def name_of(triangles: int) -> str:
 
 def rates(here: Here, caster: RayCaster, scan: Scan) -> dict[str, Any]:
     """Time a scan: the cast alone, closing up, and all until hits are on the host."""
-    engine: Any = caster._engine
+    engine: Any = caster.engine
     parts = list(engine._chunks(scan))
     found = [engine._cast("cast_pattern", n, rays) for _, n, rays in parts]
     hits = sum(int((place >= 0).sum()) for _, place, _ in found)
@@ -100,7 +100,7 @@ def built(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
     start = time.perf_counter()
     caster = RayCaster(*mesh, backend="cuda")
     took = time.perf_counter() - start  # type: ignore[attr-defined]
-    tables = caster._engine._meshes
+    tables = caster.engine._meshes
     size = sum(table.nbytes for table in tables) / caster.face_count
     return caster, {"triangles": caster.face_count, "seconds": took, "bytes_a_triangle": size}
 
@@ -120,7 +120,7 @@ def kernels(here: Here) -> Rows:
             rates(here, caster, check_scan(Pattern(directions), MIDDLE)),
         )
         yield f"{name}, brute force", brute_force(here, caster, shuffled)
-    engine: Any = caster._engine
+    engine: Any = caster.engine
     for kernel in ("cast_pattern", "pack", "make_rays"):
         made = engine._module.get_function(kernel)
         yield kernel, {"registers": made.num_regs, "local_bytes": made.local_size_bytes}
@@ -129,7 +129,7 @@ def kernels(here: Here) -> Rows:
 def brute_force(here: Here, caster: RayCaster, directions: Float) -> dict[str, float]:
     """Rate of every ray against every triangle, on so many rays that it takes a moment."""
     cupy = here.cupy
-    engine = caster._engine
+    engine = caster.engine
     triangles = engine._meshes[1]  # type: ignore[attr-defined]
     n = int(np.clip(4e10 / caster.face_count, 1024, len(directions)))
     part = cupy.asarray(np.ascontiguousarray(directions[:n]))
@@ -229,7 +229,7 @@ def _different(casters: list[RayCaster], sample: Float, origin: Float) -> dict[s
     pattern = Pattern(sample, 0.01 * sample)
     moving = check_scan(pattern, spots, turns, rays_per_pose=1, motion=motion, tally=True)
     for name, scan in {"scan": check_scan(pattern, origin, turn), "moving scan": moving}.items():
-        got, want = (caster._engine.scan(scan) for caster in casters)
+        got, want = (caster.engine.scan(scan) for caster in casters)
         same = np.array_equal(got.ray, want.ray)
         wrong = (got.distance != want.distance) | (got.triangle != want.triangle) if same else [1]
         out[f"different {name}"] = int(np.sum(wrong))

@@ -59,7 +59,7 @@ def mujoco(here: Here, where: str = "cuda:0") -> Rows:
     job = {"vertices": vertices, "faces": faces, "origins": origins, "directions": rays}
     theirs = mujoco_lidar_caster(job, "warp", where)
     ours = RayCaster(vertices, faces, backend="cuda")
-    casts = {"MuJoCo-LiDAR": theirs, "raybeam": lambda: int(ours._engine.scan(scan).hits.sum())}
+    casts = {"MuJoCo-LiDAR": theirs, "raybeam": lambda: int(ours.engine.scan(scan).hits.sum())}
     for name, cast in casts.items():
         hits = cast()
         took = wall_milliseconds(here, cast)

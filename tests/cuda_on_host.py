@@ -204,7 +204,7 @@ class SourceBackend(CudaBackend):
         return ""
 
     @staticmethod
-    def _library():
+    def load_cupy():
         return HOST
 
 

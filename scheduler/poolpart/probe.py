@@ -32,7 +32,11 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 
 @cache  # it takes up to a second; an error is not kept
-def _listing() -> tuple[str, ...]:
+def list_gpus() -> tuple[str, ...]:
+    """Return the UUIDs of the CUDA devices of this process, by ordinal; empty without a driver.
+
+    CalledProcessError or TimeoutExpired if the driver fails.
+    """
     try:
         ctypes.CDLL(CUDA_DRIVER)
     except OSError:
@@ -48,7 +52,7 @@ def visible_gpus() -> tuple[str, ...]:
     A driver that fails counts as none, with a warning in the log.
     """
     try:
-        return _listing()
+        return list_gpus()
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         logger.warning(
             "No GPU is used, because listing them failed: %s %s", error, error.stderr or ""

@@ -329,6 +329,7 @@ class Run:
         assert (
             not self.driver.dispatcher.batches and not self.workers.casts and self.workers.released
         )
+        # Announced jobs show nowhere else: one left behind would only slow later ones down.
         assert not self.workers.jobs and not self.driver._announced
 
     def at(self, place, number=None):

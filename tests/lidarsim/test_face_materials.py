@@ -532,7 +532,7 @@ def test_copies_have_their_class_on_all_materials(house):
         ],
     }
     built = build(Scenario.from_data(data, source=house.parent / "a.yaml"))
-    table = Rig(built.scene, built.survey, "numpy")._surfaces.materials
+    table = Rig(built.scene, built.survey, "numpy").surfaces.materials
     kinds = built.scene.surface_kinds
     found = {
         (kinds.names[owner], material): (int(table.semantic_class[k]), table.reflectance[k])

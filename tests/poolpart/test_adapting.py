@@ -179,7 +179,7 @@ def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_unti
         task.cancel()
         # The scheduler has decided, and the queue has not been told.
         adaptation = scheduler.plugins[poolpart.adapting.NAME]
-        adaptation._cancelled.add("GPU-0")
+        adaptation._cancelled.add("GPU-0")  # private: the moment is too short to meet otherwise
         task = gpu.submit(worker_name)
         client.sync(queue.begin, number)
         wait_until(lambda: not scheduler.workers)

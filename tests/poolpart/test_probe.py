@@ -32,10 +32,10 @@ def fake_driver(tmp_path, monkeypatch):
         command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]
         subprocess.run(command, check=True)
         monkeypatch.setattr(probe, "CUDA_DRIVER", str(library))
-        probe._listing.cache_clear()
+        probe.list_gpus.cache_clear()
 
     yield install
-    probe._listing.cache_clear()
+    probe.list_gpus.cache_clear()
 
 
 def said(caplog):

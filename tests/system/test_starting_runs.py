@@ -92,7 +92,7 @@ def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client,
     """Its answer cannot be had for longer than Dask's own calls wait for one."""
     stopped: list[int] = []
     ready: list[str] = []  # the first has the scene, so that it need not ask the second for it
-    take = CastingWorkers._take
+    take = CastingWorkers._take  # private: the step after an answer, at which the fault must strike
 
     def stop_and_take(workers: CastingWorkers, address: str, *answer: object) -> None:
         ready.append(address)

@@ -30,8 +30,8 @@ from ..rules import check_count, check_name
 logger = logging.getLogger(__name__)
 
 _NAME = "poolpart"  # of what looks after the jobs of a cluster
-ADAPT_EVERY_S = 1.0
-LOOK_EVERY_S = 5.0  # for workers that are gone
+ADAPT_EVERY_S = 1.0  # seconds between two adaptations of the partitions to their tasks
+LOOK_EVERY_S = 5.0  # seconds between two looks for workers that are gone
 INFORMATION = " - INFO - "  # in lines of Dask's logs that are no complaints
 _DEATH_S = 60  # a worker that finds no scheduler for so long ends, as those of dask-jobqueue do
 

@@ -39,7 +39,7 @@ class PulseCaster:
     def __init__(
         self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
-        self._setup = setup = setup_of(scene, survey, number)
+        self.setup = setup = setup_of(scene, survey, number)
         self._caster = caster
         self._surfaces = surfaces
         self.emitter = Emitter(setup)
@@ -83,8 +83,8 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first, poses, firings, self.emitter)
 
         all_beams = batch(0, rays)
-        if self._setup.has_several_returns:
-            unit = poses.rays_per_pose or self._setup.sensor.channels
+        if self.setup.has_several_returns:
+            unit = poses.rays_per_pose or self.setup.sensor.channels
             size = max(1, CHUNK_RAYS // (len(self.emitter) * unit)) * unit
             chunk_starts = range(0, rays, size)
             chunks = [self._pulses(batch(k, min(k + size, rays))) for k in chunk_starts]
@@ -103,7 +103,7 @@ class PulseCaster:
         The counts and the numbers of the other returns are as if the removed ones were undetected.
         """
         returns = scanned.returns
-        sensor = self._setup.sensor
+        sensor = self.setup.sensor
         if returns.reported is returns.distance or returns.reported is None:  # without noise
             return scanned
         in_range = returns.reported >= sensor.min_range_m
@@ -142,7 +142,7 @@ class PulseCaster:
         Energies are computed only for kept returns, and only if steps turn beams; else they follow
         from the reported directions.
         """
-        setup = self._setup
+        setup = self.setup
         poses = batch.poses
         for step in self.steps:
             if Role.AIMS in step.role:
@@ -165,7 +165,7 @@ class PulseCaster:
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add energy, colour and velocity to returns, by the directions in which rays were cast."""
         surfaces = self._surfaces
-        setup = self._setup
+        setup = self.setup
         poses = batch.poses
         origins, directions = rays = poses.rays(batch.beams, returns.ray, batch.window[0])
         times = poses.times(returns.ray)
@@ -191,7 +191,7 @@ class PulseCaster:
         """Count the returns of each scan, and keep every n-th return of a scan."""
         from . import pulse_loops  # not before: numba takes half a second to import
 
-        keep_every = self._setup.survey.keep_every
+        keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
         hits = np.zeros(len(groups), np.int64)
         rows = np.empty(size, np.int64)

@@ -75,8 +75,9 @@ class Rig:
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
-        self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._caster = SceneCaster(scene, self._surfaces, shared_caster, **options)
+        # The parts from which scans are cast, for other tools to look into.
+        self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
+        self.scene_caster = SceneCaster(scene, self.surfaces, shared_caster, **options)
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)
@@ -109,7 +110,7 @@ class Rig:
         The tree of static bodies is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self.options, self._caster)
+        rig._assemble(scene, survey, self.options, self.scene_caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
@@ -140,30 +141,30 @@ class Rig:
         shared = rig.scene.instances
         assert shared is not None
         rows = np.flatnonzero(shared.owner == owner)
-        rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._caster.move_instances(rig._surfaces, shared, rows)
+        rig.surfaces = self.surfaces.moved(rig.scene, rows)
+        rig.scene_caster.move_instances(rig.surfaces, shared, rows)
         rig._prepare()
         return rig
 
     def _prepare(self) -> None:
         """Create the casters of pulses and of columns, which depend on the surfaces' positions."""
-        caster = self._caster
+        caster = self.scene_caster
         scene = self.scene
         survey = self.survey
-        surfaces = self._surfaces
-        self._pulses = [
+        surfaces = self.surfaces
+        self.pulse_casters = [
             PulseCaster(number, caster, scene, survey, surfaces)
             for number in range(len(survey.carried))
         ]
         if self._device is not None:
             self._device = self._device.moved(scene, surfaces)
-        elif caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
+        elif caster.caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
             self._device = DeviceColumns(caster, scene, survey, surfaces)
 
     @property
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
-        return self._caster.backend
+        return self.scene_caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings `first` to `stop` of a sensor, in the frame of its carrier."""
@@ -217,13 +218,13 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        scanned = self._pulses[number].scan(
+        scanned = self.pulse_casters[number].scan(
             specs[0].scan + specs[0].ahead, pattern, poses, window, groups, firings, tally=tally
         )
         return BatchPoints(
             self.scene,
             self.survey,
-            self._surfaces,
+            self.surfaces,
             specs,
             scanned,
             pattern=pattern,
@@ -304,7 +305,7 @@ class Rig:
         first = specs[0].firings[0]
         scan_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         returns = (
-            self._pulses[specs[0].sensor]
+            self.pulse_casters[specs[0].sensor]
             .scan(
                 specs[0].scan + specs[0].ahead + first_scan,
                 pattern,

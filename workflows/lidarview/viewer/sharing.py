@@ -35,12 +35,12 @@ from .view import MAX_POINTS, View, open_result
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
 _MIN_FRAMES = 30
 _FRAME_MS = 100
-FILM_BYTES = 3_000_000
+FILM_BYTES = 3_000_000  # maximum of a film
 _WIDTHS = range(960, 320, -80)  # of a film, pixels, the widest first
 _FILM_TRIANGLES = 3_000_000
 _FILM_POINTS = 800_000  # that a film shows at a time
 _FRAME_POINTS = 200_000  # that a frame adds
-PAGE_BYTES = 25_000_000
+PAGE_BYTES = 25_000_000  # maximum of a page in one file
 _PAGE_POINTS = 1_000_000
 _PAGE_TRIANGLES = 60_000
 _SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
