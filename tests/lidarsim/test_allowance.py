@@ -46,7 +46,10 @@ def model(more=b"", thousands=0, method=zipfile.ZIP_DEFLATED):
     return write
 
 
-def gltf(accessor, primitives=1, nodes=({"mesh": 0},), roots=(0,)):
+ONE_NODE = ({"mesh": 0},)
+
+
+def gltf(accessor, primitives=1, nodes=ONE_NODE, roots=(0,)):
     """All vertices of the accessor are the twelve bytes of its buffer."""
     uri = "data:;base64," + base64.b64encode(bytes(12)).decode()
     header = {

@@ -55,9 +55,8 @@ class _CachedRig:
     used_at: float  # monotonic time
 
 
-cached_rigs: dict[
-    str, _CachedRig
-] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
+# {handle of a rig, or of a scene: a rig of it in this process}
+cached_rigs: dict[str, _CachedRig] = {}
 _ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
 _lock = threading.Lock()
 
