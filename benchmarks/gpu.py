@@ -144,7 +144,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
     end = time.monotonic() + seconds
     try:
         section = getattr(importlib.import_module(f".{module}", __package__), name)
-        cupy = choose("cuda")._library()  # type: ignore[attr-defined]
+        cupy = choose("cuda").load_cupy()  # type: ignore[attr-defined]
         for title, row in section(Session(cupy, sizes, folder)):
             rows[title] = row
             print(f"{name}: {title}: {shown(row)}", flush=True)

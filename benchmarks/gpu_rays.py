@@ -64,7 +64,7 @@ def name_of(triangles: int) -> str:
 
 def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
     """Time a scan: the cast alone, packing of hits, and copies of hits to the host."""
-    engine: Any = caster._engine
+    engine: Any = caster.engine
     parts = list(engine._chunks(scan))
     hit_parts = [engine._cast("cast_pattern", n, rays) for _, n, rays in parts]
     hits = sum(int((triangle >= 0).sum()) for _, triangle, _ in hit_parts)
@@ -100,7 +100,7 @@ def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
     start = time.perf_counter()
     caster = RayCaster(*mesh, backend="cuda")
     took = time.perf_counter() - start  # type: ignore[attr-defined]
-    tables = caster._engine._meshes
+    tables = caster.engine._meshes
     size = sum(table.nbytes for table in tables) / caster.face_count
     return caster, {"triangles": caster.face_count, "seconds": took, "bytes_a_triangle": size}
 
@@ -120,7 +120,7 @@ def kernels(session: Session) -> Rows:
             rates(session, caster, check_scan(Pattern(directions), MIDDLE)),
         )
         yield f"{name}, brute force", brute_force(session, caster, shuffled)
-    engine: Any = caster._engine
+    engine: Any = caster.engine
     for kernel in ("cast_pattern", "pack", "make_rays"):
         function = engine._module.get_function(kernel)
         yield kernel, {"registers": function.num_regs, "local_bytes": function.local_size_bytes}
@@ -129,7 +129,7 @@ def kernels(session: Session) -> Rows:
 def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[str, float]:
     """Time a subset of the rays against all triangles, without a tree."""
     cupy = session.cupy
-    engine = caster._engine
+    engine = caster.engine
     triangles = engine._meshes[1]  # type: ignore[attr-defined]
     n = int(np.clip(4e10 / caster.face_count, 1024, len(directions)))
     part = cupy.asarray(np.ascontiguousarray(directions[:n]))
@@ -235,7 +235,7 @@ def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -
     still = check_scan(pattern, origin, rotation)
     moving = _moving_scan(pattern, origin, rotation)
     for name, scan in {"scan": still, "moving scan": moving}.items():
-        device_scan, host_scan = (caster._engine.scan(scan) for caster in casters)
+        device_scan, host_scan = (caster.engine.scan(scan) for caster in casters)
         counts[f"different {name}"] = _count_different_hits(device_scan, host_scan)
     counts["different tally"] = int((device_scan.tally != host_scan.tally).sum())  # type: ignore[operator]
     expected = pattern_rays(pattern, host_scan.ray, moving.poses)

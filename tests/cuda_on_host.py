@@ -204,7 +204,7 @@ class SourceBackend(CudaBackend):
         return ""
 
     @staticmethod
-    def _library():
+    def load_cupy():
         return HOST
 
 
@@ -240,6 +240,6 @@ def source_backend(tmp_path_factory):
 @pytest.fixture
 def played_cuda(source_backend, monkeypatch):
     """Have the CPU play the device of backend "cuda"."""
-    others = [backend for backend in registry._BACKENDS if backend.name != "cuda"]
+    others = [backend for backend in registry.BACKENDS if backend.name != "cuda"]
     played = type("Played", (source_backend,), {"name": "cuda"})
-    monkeypatch.setattr(registry, "_BACKENDS", (played, *others))
+    monkeypatch.setattr(registry, "BACKENDS", (played, *others))

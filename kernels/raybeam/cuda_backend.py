@@ -76,7 +76,7 @@ class CudaBackend(Backend):
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
         super().__init__(scene, threads, device)
-        self._cupy = cupy = self._library()
+        self._cupy = cupy = self.load_cupy()
         self._device = _device(cupy, device)
         layout = lay_out(scene.meshes)
         self._roots = layout.roots
@@ -110,7 +110,7 @@ class CudaBackend(Backend):
             self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
 
     @staticmethod
-    def _library() -> Any:
+    def load_cupy() -> Any:
         """Load CuPy on first use; tests replace the module."""
         import cupy
 

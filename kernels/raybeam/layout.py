@@ -83,7 +83,7 @@ def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
         _joined(corners).reshape(-1, 9),
         _joined(faces),
         roots,
-        max(map(_stack_need, trees)),
+        max(map(stack_need, trees)),
         join_masks([mesh.opacity for mesh in meshes], [tree.order for tree in trees]),
     )
 
@@ -103,7 +103,7 @@ def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
     instances[:, 18] = roots[scene.mesh]
     instances[:, 19] = scene.mesh
     # One more for the root of the top.
-    return InstanceTables(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
+    return InstanceTables(_nodes(tree), instances, scene.frame.table, stack_need(tree) + 1)
 
 
 def _joined(tables: list[AnyArray]) -> AnyArray:
@@ -149,7 +149,7 @@ def _records(corners: Floats) -> Floats32:
     return table.reshape(-1, 12)
 
 
-def _stack_need(tree: WideTree) -> int:
+def stack_need(tree: WideTree) -> int:
     """Return the maximum of waiting nodes on a descent: siblings at each level above."""
     used = (tree.lower[:, 0] <= tree.upper[:, 0]).sum(axis=1)
     waiting = np.zeros(len(tree.child), np.int64)  # in the order of processing

@@ -29,9 +29,9 @@ from .scan import Scan
 if TYPE_CHECKING:
     from .moving_loops import BodySamples
 
-_CHUNK = 1 << 17  # rays at a time
-_PAIRS = 1 << 14  # pairs of cells and bodies at a time
-_POSES = 1 << 18  # poses on a device at a time: 25 MB
+CHUNK_RAYS = 1 << 17  # rays at a time
+CHUNK_PAIRS = 1 << 14  # pairs of cells and bodies at a time
+CHUNK_POSES = 1 << 18  # poses on a device at a time: 25 MB
 _BOXES = 128  # static boxes at a time
 _CELLS_PER_SAMPLE = 256  # cells for each sample of the bodies' boxes
 _NO_FRAMES = np.zeros(0)
@@ -110,7 +110,7 @@ def hits_on(
     nearest = Nearest.without_hits(
         np.full(len(scan), end) if limits is None else np.minimum(limits, end)
     )
-    for start, stop in scan.chunks(_CHUNK):
+    for start, stop in scan.chunks(CHUNK_RAYS):
         ray = np.arange(start, stop, dtype=np.int64)
         if scan.room is None:
             scan_rays = scan.rays(start, stop)
@@ -238,8 +238,8 @@ class _Chunk:
         cell, sampled_body = loops.cells_near_bodies(wide_cells, cells, samples, reach)
         body = bodies[order][sampled_body]
         spans = cells[:, loops.BEGIN : loops.END + 1]
-        for start in range(0, len(cell), _PAIRS):
-            pairs = slice(start, start + _PAIRS)
+        for start in range(0, len(cell), CHUNK_PAIRS):
+            pairs = slice(start, start + CHUNK_PAIRS)
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
     def _cast_on_device(self, bodies: Ints) -> None:
@@ -247,7 +247,7 @@ class _Chunk:
         moving = self._moving
         limits = (self._scan.t_min, self._scan.t_max)
         times, time_index = np.unique(self._times, return_inverse=True)
-        step = max(1, _POSES // (SPAN * len(bodies))) * SPAN
+        step = max(1, CHUNK_POSES // (SPAN * len(bodies))) * SPAN
         for number in np.unique(moving.shape[bodies]).tolist():
             shape = moving.shapes[number]
             shape_bodies = bodies[moving.shape[bodies] == number]

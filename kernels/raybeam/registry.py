@@ -8,7 +8,7 @@ from .embree_backend import EmbreeBackend
 from .numpy_backend import NumpyBackend
 
 # In the order in which "auto" tries them. Add new backends here.
-_BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend)
+BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:
@@ -19,7 +19,7 @@ def available_backends() -> dict[str, str]:
     >>> available_backends()["numpy"]
     ''
     """
-    return {backend.name: backend.missing() for backend in _BACKENDS}
+    return {backend.name: backend.missing() for backend in BACKENDS}
 
 
 def backend_build(name: str) -> str:
@@ -46,8 +46,8 @@ def choose(name: str) -> type[Backend]:
         If the backend cannot be used on this machine.
     """
     if name == "auto":
-        return next(backend for backend in _BACKENDS if not backend.missing())
-    by_name = {backend.name: backend for backend in _BACKENDS}
+        return next(backend for backend in BACKENDS if not backend.missing())
+    by_name = {backend.name: backend for backend in BACKENDS}
     if name not in by_name:
         raise ValueError(f"There is no backend {name!r}: use auto, {', '.join(by_name)}.")
     reason = by_name[name].missing()

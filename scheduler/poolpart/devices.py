@@ -53,7 +53,7 @@ def own_device() -> int | None:
     if address not in _own:
         device: int | None = None
         if gpus := probe.visible_gpus():
-            device = on_scheduler(own_client(), _assign, address=address, gpus=gpus)
+            device = on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
             if device is None:
                 raise WorkerLeft(f"the scheduler has given up the worker at {address}")
         _own[address] = device
@@ -63,7 +63,7 @@ def own_device() -> int | None:
 # -- on the scheduler ------------------------------------------------------------------
 
 
-def _assign(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
+def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
     """Return the device of a worker for its list of UUIDs, or None if the worker has left."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:

@@ -38,7 +38,7 @@ from .pipe_states import CHANGE, PUT, TAKE, Replies, Reply, delete_pipes, open_p
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
-_WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
+WAIT_S = 1.0  # longest wait of a request, seconds; a pipe that is closed or fails ends it
 _AGAIN_S = 0.01  # between two requests of one wait
 _LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
 
@@ -564,7 +564,7 @@ def _ask_until(
     interrupted = threading.Event()
 
     async def request() -> Replies:
-        seconds = min(_WAIT_S, max(0.0, deadline - time.monotonic()))
+        seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
         options = {"asker": client.id, "seconds": seconds, **arguments}
         replies: Replies = await ask(client, None, question, **options) or {}
         on_replies(replies)

@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 # may be another) and with CUDA_VISIBLE_DEVICES applied. In a process of its own: cuInit
 # would fix the visible devices of the worker for good. Version 2 tells the instances of a
 # divided (MIG) device apart; drivers before CUDA 11.4 have only the first.
-_DRIVER = "libcuda.so.1"
+CUDA_DRIVER = "libcuda.so.1"
 _LIST_GPUS = """
 import ctypes, sys
 cuda = ctypes.CDLL(sys.argv[1])
@@ -32,12 +32,16 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 
 @cache  # it takes up to a second; an error is not kept
-def _listing() -> tuple[str, ...]:
+def list_gpus() -> tuple[str, ...]:
+    """Return the UUIDs of the CUDA devices of this process, by ordinal; empty without a driver.
+
+    CalledProcessError or TimeoutExpired if the driver fails.
+    """
     try:
-        ctypes.CDLL(_DRIVER)
+        ctypes.CDLL(CUDA_DRIVER)
     except OSError:
         return ()
-    command = [sys.executable, "-c", _LIST_GPUS, _DRIVER]
+    command = [sys.executable, "-c", _LIST_GPUS, CUDA_DRIVER]
     process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     return tuple(process.stdout.split())
 
@@ -48,7 +52,7 @@ def visible_gpus() -> tuple[str, ...]:
     A driver that fails counts as none, with a warning in the log.
     """
     try:
-        return _listing()
+        return list_gpus()
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         logger.warning(
             "No GPU is used, because listing them failed: %s %s", error, error.stderr or ""

@@ -15,7 +15,7 @@ from .internals.client import ask
 from .internals.worker import resources_here as resources_here  # for records of tasks
 
 SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
-_MISSED_BEATS = 3  # heartbeats that a worker may miss at least
+MISSED_BEATS = 3  # heartbeats that a worker may miss at least
 _LOOK_S = 2.0  # between looks for silent workers
 
 
@@ -166,5 +166,5 @@ def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
     """
     latest = max(last_seen.values(), default=0.0)
     # Dask's interval, which is long in large clusters.
-    patience_s = max(SILENT_S, _MISSED_BEATS * (1 + len(last_seen) / 100))
+    patience_s = max(SILENT_S, MISSED_BEATS * (1 + len(last_seen) / 100))
     return {address for address, heartbeat in last_seen.items() if latest - heartbeat > patience_s}

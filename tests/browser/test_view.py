@@ -284,6 +284,7 @@ def classed(view):
 
     rows = view.points
     view.columns["class"] = TABLE["class"]
+    # A spiral has no classes, and a view takes columns only from its file.
     view._coloured["class"] = TABLE["class"]
     values = rows.values
     rows.values = lambda name, some: (

@@ -49,7 +49,8 @@ SIGNALS = {KILL: signal.SIGKILL, TERM: signal.SIGTERM, SEGV: signal.SIGSEGV, STO
 RANDOM = "random time"  # in place of a point
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out
 PIPE_WAIT_S = 10.0  # longest time until a worker of the LIDAR stages waits at a pipe
-# Functions of poolpart/pipe.py in which a thread waits for the scheduler's answer.
+# Functions of poolpart/pipe.py in which a thread waits for the scheduler's answer. They are
+# private: stacks of threads name them, and nobody else should call them.
 REQUESTS = {pipe._ask.__code__, pipe._ask_until.__code__}
 _EVENTS = "events"
 _ARMED = "armed"

@@ -253,6 +253,7 @@ def test_thousands_of_jobs_take_little_memory_and_time(db):
     db.end_jobs((number, number % 1000 == 0, {"points": number}) for number in range(50_000))
     again = reopened(db)
     assert again.ended_count == 50_000 and len(again.failed()) == 50
+    # Private, since memory is what is tested: a byte for each job.
     assert not again.begun and len(again._ended) < 100_000
     again.close()
 

@@ -229,73 +229,106 @@ def test_trajectories_of_bags_are_read_again(written, survey, name):
     assert load_trajectory(path, topic="/tf:Car").pose(0).position[1] == 5
 
 
-@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
-@pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
-def test_bags_have_points_frames_and_a_clock(
-    written, cloud, survey, sweeps, name, layout, step, tmp_path
-):
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    clouds = {}
-    frames = {}
-    fixed = {}
-    boxes = []
-    clocks = []
-    with AnyReader([written(name, layout)], default_typestore=store) as bag:
-        for connection, when, data in bag.messages():
-            message = bag.deserialize(data, connection.msgtype)
-            if connection.topic.endswith("/points"):
-                clouds[connection.topic, when] = message
-            elif connection.topic == "/tf":
-                for transform in message.transforms:
-                    frames[transform.child_frame_id, when] = transform
-            elif connection.topic == "/tf_static":
-                # Without it, `ros2 bag play` would offer the frames only to those who listen then.
-                (offered,) = connection.ext.offered_qos_profiles
-                assert offered.durability == QosDurability.TRANSIENT_LOCAL
-                fixed |= {transform.child_frame_id: transform for transform in message.transforms}
-            elif connection.topic == "/actors":
-                (box,) = message.markers
-                boxes.append((when, box))
-            else:
-                clocks.append(when)
-    assert {topic for topic, _ in clouds} == {"/front/points", "/rear/points"}
-    assert {frame for frame, _ in frames} == {"base_link", "Car"}
-    parents = {(one.header.frame_id, one.child_frame_id) for one in frames.values()}
-    assert parents == {("map", "base_link"), ("map", "Car")}
-    assert {(one.header.frame_id, name) for name, one in fixed.items()} == {
-        ("base_link", "front"), ("base_link", "rear")
-    }  # fmt: skip
-    mount = fixed["front"].transform
-    assert (mount.translation.x, mount.translation.z) == (1, 0.5)
-    np.testing.assert_allclose(2 * np.degrees(np.arcsin(mount.rotation.z)), 30)
-    assert min(clocks) == START_NS
-    assert len(clouds) == len(clocks) == len(boxes) == 10
-    # One box, however many sensors see it. The first of this time is of a sweep without points.
-    assert {(box.ns, box.id) for _, box in boxes} == {("actors", 0)}
-    box = next(box for when, box in boxes if when == START_NS + 300_000_000)
-    assert (box.header.frame_id, box.text, box.type) == ("map", "Car", box.CUBE)
-    place = box.pose.position
-    np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)
-    assert (box.scale.x, box.scale.y, box.scale.z) == (4, 2, 1.5)
-    sweep = 2
-    when = START_NS + 200_000_000
-    message = clouds["/front/points", when]
-    points = of_sweep(cloud, sweep)
-    assert (message.point_step, message.header.frame_id) == (step, "front")
+class Bag:
+    """The messages of a bag, by their topics."""
+
+    def __init__(self, path):
+        self.path = path
+        self.clouds = {}  # {(topic, time): message}
+        self.frames = {}  # {(frame, time): transform}
+        self.fixed = {}  # {frame: transform}
+        self.boxes = []  # (time, marker)
+        self.clocks = []  # times
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader([path], default_typestore=store) as bag:
+            for connection, when, data in bag.messages():
+                self._add(connection, when, bag.deserialize(data, connection.msgtype))
+
+    def _add(self, connection, when, message):
+        if connection.topic.endswith("/points"):
+            self.clouds[connection.topic, when] = message
+        elif connection.topic == "/tf":
+            for transform in message.transforms:
+                self.frames[transform.child_frame_id, when] = transform
+        elif connection.topic == "/tf_static":
+            # Without it, `ros2 bag play` would offer the frames only to those who listen then.
+            (offered,) = connection.ext.offered_qos_profiles
+            assert offered.durability == QosDurability.TRANSIENT_LOCAL
+            self.fixed |= {transform.child_frame_id: transform for transform in message.transforms}
+        elif connection.topic == "/actors":
+            (box,) = message.markers
+            self.boxes.append((when, box))
+        else:
+            self.clocks.append(when)
+
+    def check_frames(self):
+        assert {frame for frame, _ in self.frames} == {"base_link", "Car"}
+        parents = {(one.header.frame_id, one.child_frame_id) for one in self.frames.values()}
+        assert parents == {("map", "base_link"), ("map", "Car")}
+        assert {(one.header.frame_id, name) for name, one in self.fixed.items()} == {
+            ("base_link", "front"), ("base_link", "rear")
+        }  # fmt: skip
+        mount = self.fixed["front"].transform
+        assert (mount.translation.x, mount.translation.z) == (1, 0.5)
+        np.testing.assert_allclose(2 * np.degrees(np.arcsin(mount.rotation.z)), 30)
+
+    def check_boxes(self):
+        # One box, however many sensors see it. The first of this time is of a sweep without points.
+        assert {(box.ns, box.id) for _, box in self.boxes} == {("actors", 0)}
+        box = next(box for when, box in self.boxes if when == START_NS + 300_000_000)
+        assert (box.header.frame_id, box.text, box.type) == ("map", "Car", box.CUBE)
+        place = box.pose.position
+        np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)
+        assert (box.scale.x, box.scale.y, box.scale.z) == (4, 2, 1.5)
+
+    def check_profiles(self):
+        """Readers of Humble take versions up to 8, whose profiles are text."""
+        told = load_yaml((self.path / "metadata.yaml").read_text())
+        told = told["rosbag2_bagfile_information"]
+        assert told["version"] == 8
+        for one in (part["topic_metadata"] for part in told["topics_with_message_count"]):
+            assert bool(load_yaml(one["offered_qos_profiles"])) == (one["name"] == "/tf_static")
+
+
+def rows_of(message):
+    """Return the points of a message as records of its fields."""
     kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4"}
     row = np.dtype({
         "names": [field.name for field in message.fields],
         "formats": [kinds[field.datatype] for field in message.fields],
         "offsets": [field.offset for field in message.fields],
-        "itemsize": step,
+        "itemsize": message.point_step,
     })  # fmt: skip
-    rows = message.data.view(row)
-    carrier = frames["base_link", when].transform
+    return message.data.view(row)
+
+
+@pytest.fixture
+def bag(written, name, layout):
+    """Write the cloud as a bag and read its messages."""
+    return Bag(written(name, layout))
+
+
+@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
+@pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
+def test_bags_have_points_frames_and_a_clock(bag, cloud, survey, sweeps, name, layout, step):
+    assert {topic for topic, _ in bag.clouds} == {"/front/points", "/rear/points"}
+    bag.check_frames()
+    assert min(bag.clocks) == START_NS
+    assert len(bag.clouds) == len(bag.clocks) == len(bag.boxes) == 10
+    bag.check_boxes()
+    sweep = 2
+    when = START_NS + 200_000_000
+    message = bag.clouds["/front/points", when]
+    points = of_sweep(cloud, sweep)
+    assert (message.point_step, message.header.frame_id) == (step, "front")
+    rows = rows_of(message)
+    carrier = bag.frames["base_link", when].transform
     begin = survey.path.pose(0, 2e8)
     translation = [getattr(carrier.translation, axis) for axis in "xyz"]
     np.testing.assert_allclose(translation, begin.position, atol=1e-12)
     np.testing.assert_allclose(2 * np.degrees(np.arcsin(carrier.rotation.z)), begin.yaw_deg)
     # Points are in the sensor's axes at their own times.
+    mount = bag.fixed["front"].transform
     turn = matrices(np.array([[getattr(mount.rotation, axis) for axis in "xyzw"]]))[0]
     on_carrier = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float) @ turn.T
     on_carrier += [getattr(mount.translation, axis) for axis in "xyz"]
@@ -309,12 +342,8 @@ def test_bags_have_points_frames_and_a_clock(
     np.testing.assert_array_equal(rows[channel], rings)
     since = points.time - sweeps.begins_ns[sweep]
     np.testing.assert_allclose(rows[time] * (1e9 if time == "time" else 1), since, atol=10)
-    if name == "rosbag2":  # readers of Humble take versions up to 8, whose profiles are text
-        told = load_yaml((tmp_path / "rosbag2/metadata.yaml").read_text())
-        told = told["rosbag2_bagfile_information"]
-        assert told["version"] == 8
-        for one in (part["topic_metadata"] for part in told["topics_with_message_count"]):
-            assert bool(load_yaml(one["offered_qos_profiles"])) == (one["name"] == "/tf_static")
+    if name == "rosbag2":
+        bag.check_profiles()
     if layout == "autoware":
         np.testing.assert_array_equal(rows["intensity"], np.round(points.intensity * 255))
     if layout == "ouster":

@@ -213,7 +213,7 @@ def over(rise: float, radius: float) -> float:
     return 2 * (math.sqrt(apart**2 - radius**2) + radius * bend)
 
 
-# {case: (start, target, centres, radii, length)}
+# Each case has a start, a target, the centres of discs, their radii, and the length of the way.
 CASES = {
     "no disc": ((0, 0), (3, 4), [], [], 5),
     "nowhere to go": ((1, 1), (1, 1), [], [], 0),

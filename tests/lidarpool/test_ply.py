@@ -110,7 +110,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     path = tmp_path / "c.ply"
     save_cloud(sample(3), path)
     before = path.read_bytes()
-    write = ply._write_open3d
+    write = ply.write_with_open3d
 
     def faulty(target, cloud, real):
         write(target, cloud[1:] if fault == "fewer" else cloud, real)
@@ -122,7 +122,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
         if fault == "no space":
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(ply, "_write_open3d", faulty)
+    monkeypatch.setattr(ply, "write_with_open3d", faulty)
     expected = {
         "cut": (LidarError, "could not be written"),
         "fewer": (LidarError, "999 of 1,000 points"),

@@ -612,6 +612,7 @@ def test_copies_are_made_now_and_then(url, monkeypatch):
     add(store, 0, 2)
     store.save()
     assert Storage.at(url).read("run.db") == first
+    # Private: the pause after a copy takes 5 s and more, which a test should not wait for.
     monkeypatch.setattr(store._remote, "_due", 0.0)
     store.save()
     assert Storage.at(url).read("run.db") != first

@@ -45,7 +45,7 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
 
 def test_a_terminal_shows_what_is_written_and_how_far(monkeypatch):
     console = Console(file=StringIO(), force_terminal=True, width=90)
-    monkeypatch.setattr(Terminal, "_console", console)
+    monkeypatch.setattr(Terminal, "console", console)
     with Terminal().writing("writing the cloud") as show:
         show("cloud.ply", 6000, 8000, "points")
         show("cloud.ply", 8000, 8000, "points")

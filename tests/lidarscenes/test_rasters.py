@@ -247,7 +247,7 @@ def test_too_large_ones_are_refused_with_what_fits(tmp_path, monkeypatch):
 
 def test_many_pixels_are_a_choice(tmp_path, monkeypatch):
     path = write(tmp_path / "m.tif", np.zeros((300, 500)))
-    monkeypatch.setattr(rasters, "_MAX_UNASKED", 20_000)
+    monkeypatch.setattr(rasters, "MAX_UNASKED_PIXELS", 20_000)
     with pytest.raises(LidarError, match="500 x 300 pixels, 0 million triangles") as refused:
         read(path)
     told = str(refused.value)

@@ -630,7 +630,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
 def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
     monkeypatch.setattr(usd, "subprocess", subprocess)
-    monkeypatch.setattr(usd, "_BASE", 0)
+    monkeypatch.setattr(usd, "USD_CORE_BYTES", 0)
     monkeypatch.setattr(usd, "memory_share", lambda: 60 * 2**20)
     with pytest.raises(LidarError, match=r"m\.usda is broken or cut short \("):
         load_meshes(

@@ -46,7 +46,10 @@ def model(more=b"", thousands=0, method=zipfile.ZIP_DEFLATED):
     return write
 
 
-def gltf(accessor, primitives=1, nodes=({"mesh": 0},), roots=(0,)):
+ONE_NODE = ({"mesh": 0},)
+
+
+def gltf(accessor, primitives=1, nodes=ONE_NODE, roots=(0,)):
     """All vertices of the accessor are the twelve bytes of its buffer."""
     uri = "data:;base64," + base64.b64encode(bytes(12)).decode()
     header = {
@@ -207,7 +210,7 @@ def test_memory_is_at_most_what_a_control_group_allows(monkeypatch, tmp_path):
     (tmp_path / "memory.max").write_text(f"{limit}\n")
     (tmp_path / "memory").mkdir()
     (tmp_path / "memory/memory.limit_in_bytes").write_text(f"{limit}\n")
-    monkeypatch.setattr(allowance, "_CONTROL_GROUPS", tmp_path)
+    monkeypatch.setattr(allowance, "CONTROL_GROUPS", tmp_path)
     assert allowance.memory.__wrapped__() == limit
     for name in ("memory.max", "memory/memory.limit_in_bytes"):
         (tmp_path / name).write_text("max\n")

@@ -79,7 +79,7 @@ MODELS["on the move, beams of several rays"] = Survey(
 
 @pytest.fixture
 def backend(source_backend, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, source_backend))
+    monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
     monkeypatch.setattr(source_backend, "chunk", 997)
     return source_backend.name
 

@@ -484,7 +484,7 @@ def test_only_the_faces_of_sheeting_bloom():
 
 
 def test_a_device_leaves_what_faces_are_made_of_to_numpy(source_backend, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, source_backend))
+    monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
     scene = Scene.from_meshes([front(), level("Ground")])
     options = replace(survey(), columns=("class", "material", "intensity", "reflectance", "range"))
     got, want = (
@@ -532,7 +532,7 @@ def test_copies_have_their_class_on_all_materials(house):
         ],
     }
     built = build(Scenario.from_data(data, source=house.parent / "a.yaml"))
-    table = Rig(built.scene, built.survey, "numpy")._surfaces.materials
+    table = Rig(built.scene, built.survey, "numpy").surfaces.materials
     kinds = built.scene.surface_kinds
     found = {
         (kinds.names[owner], material): (int(table.semantic_class[k]), table.reflectance[k])

@@ -255,7 +255,8 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     assert Sweep.from_points(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
     pieces = Pieces(cloud, sweeps)
     told = [
-        b"".join(pieces._members(k, points, None)) for k, points in enumerate(sweeps.points(cloud))
+        b"".join(pieces.sample_files(k, points, None))
+        for k, points in enumerate(sweeps.points(cloud))
     ]
     with tarfile.open(fileobj=io.BytesIO(told[2] + bytes(1024))) as tar:
         (name,) = [name for name in tar.getnames() if name.endswith("json")]

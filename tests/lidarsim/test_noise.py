@@ -81,55 +81,71 @@ def everything():
     )
 
 
-def test_no_random_number_is_used_twice(monkeypatch):
-    """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn = {}
-    purposes = {}
-    compiled_bits = compiled()(random_loops.bits.py_func)
+class Draws:
+    """The bits that all functions draw, by their purpose."""
 
-    def recorded(seed, purpose, *key):
+    def __init__(self):
+        self.bits = {}  # {purpose: arrays}
+        self._purposes = {}  # {start: purpose}
+        self._compiled_bits = compiled()(random_loops.bits.py_func)
+
+    def raw(self, seed, purpose, *key):
         bits = raw(seed, purpose, *key)
-        drawn.setdefault(purpose, []).append(np.ravel(bits))
+        self.bits.setdefault(purpose, []).append(np.ravel(bits))
         return bits
 
-    def begun(seed, *which):
+    def starts(self, seed, *which):
         made = starts(seed, *which)
-        purposes.update(zip(made.tolist(), which, strict=True))
+        self._purposes.update(zip(made.tolist(), which, strict=True))
         return made
 
-    def hashed(start, *key):
-        bits = compiled_bits(start, *key)
-        drawn.setdefault(purposes[int(start)], []).append(np.array([bits], np.uint64))
+    def hashed(self, start, *key):
+        bits = self._compiled_bits(start, *key)
+        purpose = self._purposes[int(start)]
+        self.bits.setdefault(purpose, []).append(np.array([bits], np.uint64))
         return bits
 
+
+def watch_arrays(monkeypatch, draws):
+    """Have all modules draw arrays of random numbers by `draws`."""
     for name, module in [*sys.modules.items()]:
-        for known, other in ((raw, recorded), (starts, begun)):
-            if (
-                name.startswith(("lidarpool", "lidarscenes", "lidarsim"))
-                and getattr(module, known.__name__, None) is known
-            ):
-                monkeypatch.setattr(module, known.__name__, other)
+        if name.startswith(("lidarpool", "lidarscenes", "lidarsim")):
+            for known, watched in ((raw, draws.raw), (starts, draws.starts)):
+                if getattr(module, known.__name__, None) is known:
+                    monkeypatch.setattr(module, known.__name__, watched)
+
+
+def watch_loops(monkeypatch, draws):
+    """Have the loops that draw random numbers run in plain Python, and draw by `draws`."""
+    # Some are private: every function is replaced by which a random number reaches a loop.
     sampling = {
         air_loops: ["write_particle", "sample_particles", "sample_fog"],
         spray_loops: ["write_particle", "_column", "_guide", "sample_clumps"],
     }
     for loops, names in sampling.items():
         # Others are compiled without these.
-        plain = vars(random_loops) | vars(loops) | {"bits": hashed}
+        plain = vars(random_loops) | vars(loops) | {"bits": draws.hashed}
         functions = [random_loops.uniform, pulse_loops.scan_row, *(vars(loops)[n] for n in names)]
         for function in functions:
             code = function.py_func.__code__
             plain[code.co_name] = FunctionType(code, plain)
         for name in names:
             monkeypatch.setattr(loops, name, plain[name])
+
+
+def test_no_random_number_is_used_twice(monkeypatch):
+    """With three kinds of particles: keys that differ have hashes that differ."""
+    draws = Draws()
+    watch_arrays(monkeypatch, draws)
+    watch_loops(monkeypatch, draws)
     kinds = rain(20.0), snow(1.0), rain(5.0)
     monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
     scene, survey = everything()
     for returns in Rig(scene, survey, "numpy").cast(0, survey.scan_count):
         assert len(returns.radial_velocity) > 1000
     assert len([*imu_samples(survey), *fixes(survey)]) == 2
-    assert {*Purpose.declared.values()} == drawn.keys(), "all are tried"
-    each = {purpose: np.concatenate(bits) for purpose, bits in drawn.items()}
+    assert {*Purpose.declared.values()} == draws.bits.keys(), "all are tried"
+    each = {purpose: np.concatenate(bits) for purpose, bits in draws.bits.items()}
     # Windows of one waveform share samples, returns of a channel its error, those of a packet its
     # fate.
     for again in (SAMPLES, SAMPLE, CHANNEL, PACKET):

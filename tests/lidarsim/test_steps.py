@@ -136,16 +136,16 @@ class Watched:
 @pytest.mark.parametrize("name", SURVEYS)
 def test_steps_read_and_write_what_they_say(name):
     rig = Rig(Scene.seed(), SURVEYS[name], "embree", threads=1)
-    pulses = rig._pulses[0]
+    pulses = rig.pulse_casters[0]
     assert {type(step) for step in pulses.steps} == {
-        step for step in STEPS if step.applies(pulses._setup)
+        step for step in STEPS if step.applies(pulses.setup)
     }
     pulses.steps = [Watched(step) for step in pulses.steps]
     assert sum(map(len, rig.cast(0, 6))) > 500
 
 
 def test_a_survey_without_effects_has_no_steps():
-    (pulses,) = Rig(Scene.seed(), Survey(poses=[(0, 0, 1)]), "numpy")._pulses
+    (pulses,) = Rig(Scene.seed(), Survey(poses=[(0, 0, 1)]), "numpy").pulse_casters
     assert pulses.steps == []
 
 

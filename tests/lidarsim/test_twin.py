@@ -278,21 +278,24 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
     found = caster.sampled(hits, (FIRST, FIRST + count), KEYS, each)
     air = survey.air(0)
-    cloud = caster._fog
+    cloud = caster.fog_cells
     expected = []
     for pulse in range(count):
         own = reach[pulse].tolist()
         key = key_of(FIRST + pulse)
         drawn = []
-        for number, (kind, seen) in enumerate(zip(survey.particles, caster._kinds, strict=True)):
-            given = noise.threshold, named_seed(9, "kind 1" if number else ""), key, own
-            drawn += twin.particles(kind, air, *given, (seen.counts, seen.by_range[0]))
+        for number, (kind, seen) in enumerate(
+            zip(survey.particles, caster.detectable_kinds, strict=True)
+        ):
+            precipitation = twin.Precipitation(kind, air, noise.threshold)
+            seed = named_seed(9, "kind 1" if number else "")
+            tables = seen.counts, seen.by_range[0]
+            drawn += twin.particles(precipitation, seed, key, own, tables)
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
             peaks = table - np.arange(len(table))[:, None]
-            drawn += twin.fog(
-                survey.backscatter_at(905.0), air, 9, key, own, 0.5, cloud.cell_m, peaks
-            )
+            cells = twin.FogCells(0.5, cloud.cell_m, peaks)
+            drawn += twin.fog(survey.backscatter_at(905.0), air, 9, key, own, cells)
         drawn.sort(key=lambda one: one.subray)
         expected += [(pulse * each + one.subray, one.distance, one.energy) for one in drawn]
     ray, distance, energy = map(np.array, zip(*expected, strict=True))
@@ -324,14 +327,15 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []
+    precipitation = twin.Precipitation(kind, air, noise.threshold)
     table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
     stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
         own = far[pulse * each : (pulse + 1) * each].tolist()
-        seen = twin.clumps(kind, air, noise.threshold, 9, key_of(FIRST + pulse), own, boxes,
-                           (mean, tables[0]))  # fmt: skip
+        key = key_of(FIRST + pulse)
+        seen = twin.clumps(precipitation, 9, key, own, boxes, (mean, tables[0]))
         clumps += [(pulse * each + one.subray, one.distance, one.energy) for one in seen]
         left += [twin.veiled(end, boxes, 0.1) for end in own if end < np.inf]
     ray, distance, energy = map(np.array, zip(*clumps, strict=True))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -62,8 +63,17 @@ def tree(path, *arguments, tell=None, **options):
     return mesh
 
 
-def optical_depth(density, low, size, start, way, kind="spherical", steps=200_000, reach=60.0):
+class Grid(NamedTuple):
+    """Voxels of leaves, each a cube."""
+
+    density: np.ndarray  # (nx, ny, nz): leaf area, 1/m
+    low: np.ndarray  # (3,): corner with the least coordinates
+    size: float  # edge of a voxel, metres
+
+
+def optical_depth(grid, start, way, kind="spherical", steps=200_000, reach=60.0):
     """Integrate the optical depth along rays (n, 3) by the midpoint rule, from one place."""
+    density, low, size = grid
     s = (np.arange(steps) + 0.5) * (reach / steps)
     out = []
     for one in np.atleast_2d(way):
@@ -232,12 +242,13 @@ def test_random_grids_stop_what_the_integral_says(tmp_path):
     low = np.array([-3.0, -2.0, -1.0])
     size = 0.8
     mesh = tree(tmp_path / "T.vox", density, low=low, size=size, skip=(0,))
+    grid = Grid(density, low, size)
     sensor = Sensor(Beams(np.radians(np.linspace(-70, 70, 12))), Spin(25, 360))
     ahead = sensor.directions(np.arange(25)).reshape(-1, 3)
     off = 0.0
     variance = 0.0
     for place in [(-6.0, 0.3, 0.7), (0.31, 0.2, 1.3), (1.0, 0.0, 6.0)]:
-        tau = optical_depth(density, low, size, np.array(place), ahead, steps=20_000, reach=20)
+        tau = optical_depth(grid, np.array(place), ahead, steps=20_000, reach=20)
         survey = Survey(sensor, poses=[place] * 40, steps=1, materials=[GROUND])
         rig = Rig(Scene.from_meshes([mesh, ball("Sky", 30.0, fineness=2)]), survey, CPU[-1])
         for batch in rig.cast(0, 40):

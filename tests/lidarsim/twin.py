@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -241,10 +242,21 @@ def white(distance: float, air: Air) -> float:
     return energy_of(1, distance, air.extinction) * share
 
 
+class Precipitation(NamedTuple):
+    """Particles of a kind in the air, as a receiver meets them."""
+
+    kind: Particles
+    air: Air
+    threshold: float  # energy that is detected
+
+
 def particles(
-    kind: Particles, air: Air, threshold: float, seed: int, key: Key, reach: list[float],
+    precipitation: Precipitation,
+    seed: int,
+    key: Key,
+    reach: list[float],
     tables: tuple[Floats, Floats],
-) -> Iterator[Hit]:  # fmt: skip
+) -> Iterator[Hit]:
     """Draw the particles that a beam meets, whose sub-rays reach so far.
 
     Tables are cumulative probabilities of numbers of particles, and quantiles of ranges.
@@ -255,12 +267,13 @@ def particles(
         subray = bits(seed, PARTICLE_SUBRAY, key, number) % len(reach)
         if distance < reach[subray]:
             rank = uniform(seed, PARTICLE_DIAMETER, key, number)
-            energy = len(reach) * particle(kind, air, threshold, distance, rank)
+            energy = len(reach) * particle(precipitation, distance, rank)
             yield Hit(subray, distance, energy, None)
 
 
-def particle(kind: Particles, air: Air, threshold: float, distance: float, rank: float) -> float:
+def particle(precipitation: Precipitation, distance: float, rank: float) -> float:
     """Energy of a particle, by its rank among the larger ones that may be detected."""
+    kind, air, threshold = precipitation
     # The least diameter has half of the threshold; diameters above are exponential.
     full = kind.reflectance * white(distance, air)
     wide_mm = 1000 * math.hypot(air.exit_m, air.divergence * distance)
@@ -275,9 +288,13 @@ Boxes = list[tuple[float, ...]]  # of spray: where a beam enters and leaves each
 
 
 def clumps(
-    kind: Particles, air: Air, threshold: float, seed: int, key: Key, reach: list[float],
-    boxes: Boxes, table: tuple[float, Floats],
-) -> Iterator[Hit]:  # fmt: skip
+    precipitation: Precipitation,
+    seed: int,
+    key: Key,
+    reach: list[float],
+    boxes: Boxes,
+    table: tuple[float, Floats],
+) -> Iterator[Hit]:
     """Draw the clumps that a beam meets in boxes of spray, whose sub-rays reach so far.
 
     The table says how many it would meet at a density of 1, and has quantiles of their ranges.
@@ -298,7 +315,7 @@ def clumps(
             subray = bits(seed, SPRAY_SUBRAY, key, number) % len(reach)
             rank = uniform(seed, SPRAY_DIAMETER, key, number)
             if distance < reach[subray]:
-                energy = len(reach) * particle(kind, air, threshold, distance, rank)
+                energy = len(reach) * particle(precipitation, distance, rank)
                 yield Hit(subray, distance, energy, None)
             number += 1
             left = depth()
@@ -311,14 +328,20 @@ def veiled(distance: float, boxes: Boxes, extinction: float) -> float:
     return math.exp(-2 * extinction * depth)
 
 
-def fog(
-    back_scatter: float, air: Air, seed: int, key: Key, reach: list[float],
-    begin: float, cell: float, peaks: Floats,
-) -> Iterator[Hit]:  # fmt: skip
-    """Draw the peak of fog in a beam, as far as the sub-ray in its middle reaches.
+class FogCells(NamedTuple):
+    """Cells of fog along a beam."""
 
-    Rows of `peaks` are the probabilities, cumulative, that the highest of so many cells is each.
-    """
+    begin: float  # range of the first cell, metres
+    cell: float  # length of a cell, metres
+    # Rows are the probabilities, cumulative, that the highest of so many cells is each.
+    peaks: Floats
+
+
+def fog(
+    back_scatter: float, air: Air, seed: int, key: Key, reach: list[float], cells_of_fog: FogCells
+) -> Iterator[Hit]:
+    """Draw the peak of fog in a beam, as far as the sub-ray in its middle reaches."""
+    begin, cell, peaks = cells_of_fog
     cells = min(math.floor((min(reach[0], 1e4) - begin) / cell), len(peaks) - 1)
     if cells >= 1:
         highest = sum(peaks[cells] <= uniform(seed, FOG_CELL, key))

@@ -37,7 +37,7 @@ FLOOR = np.array([[[-50, -50, 0], [50, -50, 0], [0, 80, 0.0]]])
 def small(monkeypatch):
     """Draw small pictures, which are fast."""
     monkeypatch.setattr(lidarview.render.film, "SIZE", (96, 54))
-    monkeypatch.setattr(lidarview.render.film, "_FOCAL", 92.2)
+    monkeypatch.setattr(lidarview.render.film, "FOCAL_PX", 92.2)
 
 
 def write(folder, moves):
@@ -147,7 +147,7 @@ def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
 
 
 def test_a_film_that_would_be_too_large_is_narrower(drive, monkeypatch):
-    monkeypatch.setattr(lidarview.viewer.sharing, "_FILM_BYTES", 400_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "FILM_BYTES", 400_000)
     made = film_of(open_result(drive), ".gif")
     assert len(made) < 400_000
     (drive / "a.gif").write_bytes(made)
@@ -198,13 +198,13 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
         rows[name] = dense[:, axis]
     (drive / "cloud.ply").write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
     whole = len(page_of(open_result(drive)))
-    monkeypatch.setattr(lidarview.viewer.sharing, "_PAGE_BYTES", whole - 200_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", whole - 200_000)
     page = page_of(open_result(drive))
     assert len(page) <= whole - 200_000
     places = answers(page)["cloud?"]["arrays"]["positions"]
     far = [np.linalg.norm(some, axis=1) > 15 for some in (places, dense)]
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
-    monkeypatch.setattr(lidarview.viewer.sharing, "_PAGE_BYTES", 500_000)
+    monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", 500_000)
     with pytest.raises(LidarError, match="Even without points"):
         page_of(open_result(drive))
 

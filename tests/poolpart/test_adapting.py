@@ -179,7 +179,7 @@ def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_unti
         task.cancel()
         # The scheduler has decided, and the queue has not been told.
         adaptation = scheduler.plugins[poolpart.adapting.NAME]
-        adaptation._cancelled.add("GPU-0")
+        adaptation._cancelled.add("GPU-0")  # private: the moment is too short to meet otherwise
         task = gpu.submit(worker_name)
         client.sync(queue.begin, number)
         wait_until(lambda: not scheduler.workers)
@@ -298,7 +298,7 @@ def note(number, partition):
 @pytest.mark.slow
 def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypatch):
     """Idle workers go at once, while tasks come one by one."""
-    monkeypatch.setattr(poolpart.deploy.clusters, "_ADAPT_EVERY_S", 0.01)
+    monkeypatch.setattr(poolpart.deploy.clusters, "ADAPT_EVERY_S", 0.01)
     ran.clear()
     partitions = {name: adaptive(0, 2) | {"idle_s": 0.0} for name in ("A", "B")}
     with cluster_of(partitions) as client:

@@ -31,7 +31,9 @@ def scheduler_of(**partitions):
 
 def assign(scheduler, **visible):
     """Devices of workers by address; a letter in `visible` is a device that it sees."""
-    return {a: devices._assign(a, gpus, dask_scheduler=scheduler) for a, gpus in visible.items()}
+    return {
+        a: devices.assign_device(a, gpus, dask_scheduler=scheduler) for a, gpus in visible.items()
+    }
 
 
 def test_rotated_lists_all_use_their_first():

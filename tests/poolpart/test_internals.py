@@ -203,11 +203,11 @@ def test_the_rest_works_where_a_feature_is_off(start, monkeypatch):
 
 def test_an_untested_version_is_warned_about(monkeypatch):
     monkeypatch.setattr("distributed.__version__", "2031.10.0")
-    names._warn_if_untested.cache_clear()
+    names.warn_if_untested.cache_clear()
     with pytest.warns(UserWarning, match="tested with distributed .* and this is 2031.10.0"):
         names.require(names.MAP)
     monkeypatch.setattr("distributed.__version__", f"{names.TESTED[1]}+3.gabcdef")
-    names._warn_if_untested.cache_clear()
+    names.warn_if_untested.cache_clear()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         names.require(names.MAP)

@@ -322,6 +322,7 @@ def test_workers_that_end_before_they_keep_their_slots_again_print_nothing(
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)  # before they answer
     wait_until(lambda: inherit.NAME not in own_nannies.cluster.scheduler.plugins)
+    # Requests under way show nowhere else: that is what the test is about.
     assert inherit._requests
     for pid in pids:
         os.kill(pid, signal.SIGKILL)

@@ -399,6 +399,7 @@ def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordere
     results = Partition("A", client).map(
         wait_for, ["again"] * 4, chunk=1, window=4, ordered=ordered
     )
+    # The futures of a map stay inside: nothing public says that a result was there and is lost.
     wait_until(lambda: all(future.done() for future in results._running))
     again.clear()
     client.sync(client.cluster.workers["x"].close)

@@ -244,7 +244,7 @@ def test_two_pipes_of_one_name(client, make_pipe):
 )
 def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch, change, outcome):
     """By the scheduler's answer: it would look by itself only after the longest wait."""
-    monkeypatch.setattr(pipe_module, "_WAIT_S", LONG_S)
+    monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
     pipe = make_pipe(client, capacity=1)
     pipe.put("first")
     with ThreadPoolExecutor(1) as thread:
@@ -601,7 +601,7 @@ def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(
         "has_ended",
         property(lambda state: looks.append(state.name) or has_ended(state)),
     )
-    monkeypatch.setattr(pipe_module, "_WAIT_S", LONG_S)
+    monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
     monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
     idle = [make_pipe(client) for _ in range(8)]
     busy = make_pipe(client)

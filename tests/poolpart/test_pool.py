@@ -151,7 +151,7 @@ def test_a_block_dissolves_what_its_pool_has_made(start):
 
 def test_a_worker_that_is_stopped_is_left_out(nannies, monkeypatch):
     monkeypatch.setattr("poolpart.workers.SILENT_S", 1.0)
-    monkeypatch.setattr("poolpart.workers._MISSED_BEATS", 1)
+    monkeypatch.setattr("poolpart.workers.MISSED_BEATS", 1)
     pid = nannies.run(os.getpid).popitem()[1]
     os.kill(pid, signal.SIGSTOP)
     try:

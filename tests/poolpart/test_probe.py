@@ -31,11 +31,11 @@ def fake_driver(tmp_path, monkeypatch):
         defines = [f"-DBODY={body}", f"-DUUID={uuid}", f"-DERROR={error}"]
         command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]
         subprocess.run(command, check=True)
-        monkeypatch.setattr(probe, "_DRIVER", str(library))
-        probe._listing.cache_clear()
+        monkeypatch.setattr(probe, "CUDA_DRIVER", str(library))
+        probe.list_gpus.cache_clear()
 
     yield install
-    probe._listing.cache_clear()
+    probe.list_gpus.cache_clear()
 
 
 def said(caplog):

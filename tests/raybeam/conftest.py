@@ -20,7 +20,7 @@ def usable(name, request):
     if name == "source":
         made = request.getfixturevalue("source_backend")
         patch = request.getfixturevalue("monkeypatch")
-        patch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, made))
+        patch.setattr(registry, "BACKENDS", (*registry.BACKENDS, made))
     elif reason := available_backends()[name]:
         pytest.skip(f"{name}: {reason}")
     return name

@@ -42,7 +42,7 @@ def test_batches_may_be_cut_anywhere(caster, shapes, monkeypatch):
     shuffled = vase.cast(origins[order], directions[order])
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(whole, name)[order])
-    monkeypatch.setattr(type(vase._engine), "chunk", 97)
+    monkeypatch.setattr(type(vase.engine), "chunk", 97)
     same(vase.cast(origins, directions), whole)
 
 

@@ -30,8 +30,10 @@ def lines_and_triangles(vertices, faces, origin, direction):
     return np.where(bad, np.inf, t), np.where(bad, -np.inf, margin)
 
 
-def check(hits, vertices, faces, origins, directions, graze, t_min=0.0, t_max=np.inf):
+def check(hits, mesh, rays, graze, t_min=0.0, t_max=np.inf):
     """Compare with the oracle; within `graze` metres of an edge either answer is right."""
+    vertices, faces = mesh
+    origins, directions = rays
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(origins, unit.shape)
     surely_hit = 0
@@ -74,10 +76,10 @@ def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
     size = np.ptp(vertices, axis=0).max()
     graze = size * (4e-6 if backend == "embree" else 1e-12) + 1e-8
     engine = caster(vertices, faces)
-    check(
-        engine.cast(origins, directions, 5, 25), vertices, faces, origins, directions, graze, 5, 25
-    )
-    sure = check(engine.cast(origins, directions), vertices, faces, origins, directions, graze)
+    mesh = vertices, faces
+    rays = origins, directions
+    check(engine.cast(*rays, 5, 25), mesh, rays, graze, 5, 25)
+    sure = check(engine.cast(*rays), mesh, rays, graze)
     if kind in ("random", "huge") or (kind == "tiny" and backend != "embree"):
         assert sure > 0.8 * n  # else the comparison says little
 

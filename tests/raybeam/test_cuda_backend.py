@@ -24,7 +24,7 @@ def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, 
         unread.append(weakref.ref(values))
         self[...] = values
 
-    cupy = source_backend._library()
+    cupy = source_backend.load_cupy()
     monkeypatch.setattr(type(cupy.empty(1)), "set", copy)
     monkeypatch.setattr(cupy.cuda.Stream, "synchronize", synchronize)
     engine = source_backend(plain(mesh))

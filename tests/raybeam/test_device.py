@@ -37,7 +37,7 @@ def vase(request, kernels, shapes, monkeypatch):
     apart[:, 3] = 0.5, 0.2, -0.3
     placed = [Instance(mesh)] if request.param == "plain" else [Instance(mesh, apart)] * 3
     caster = RayCaster.from_instances(placed, kernels)
-    monkeypatch.setattr(type(caster._engine), "chunk", 333)
+    monkeypatch.setattr(type(caster.engine), "chunk", 333)
     return caster
 
 
@@ -61,7 +61,7 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
     given = {"keep_every": every, "groups": [0, 0, 13, 1990], "tally": True}
     scan = scan_of(**given)
     hits, (origins, directions), counts, (rows, counted) = visited(vase, scan)
-    want = vase._engine.scan(scan)
+    want = vase.engine.scan(scan)
     assert vase.on_device
     for got, name in zip(hits, ("ray", "distance", "triangle", "instance"), strict=True):
         np.testing.assert_array_equal(got, getattr(want, name))
@@ -92,7 +92,7 @@ def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
     counters = table, vase.face_count + 9
     hits, _, counts, (met, counted) = visited(vase, scan, counters, others)
     ray, distance, triangle, instance = hits
-    own = vase._engine.scan(scan_of())
+    own = vase.engine.scan(scan_of())
     found = {r: (d, t, i) for r, d, t, i in zip(*(a.tolist() for a in (
         own.ray, own.distance, own.triangle, own.instance)), strict=True)}  # fmt: skip
     for r, d, t in zip(others.ray, others.distance, others.triangle, strict=True):

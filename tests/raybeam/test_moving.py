@@ -161,9 +161,9 @@ def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
     expected = by_all(moving, scan, times)
     assert len(expected) > 80 and listed(hits) == expected
     assert len({body for _, _, body, _ in expected}) > 10
-    monkeypatch.setattr(module, "_CHUNK", 650)
-    monkeypatch.setattr(module, "_PAIRS", 7)
-    monkeypatch.setattr(module, "_POSES", 999)
+    monkeypatch.setattr(module, "CHUNK_RAYS", 650)
+    monkeypatch.setattr(module, "CHUNK_PAIRS", 7)
+    monkeypatch.setattr(module, "CHUNK_POSES", 999)
     assert listed(hits_on(moving, scan, lambda ray: times[ray])) == expected
 
 

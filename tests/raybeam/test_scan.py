@@ -99,10 +99,9 @@ def hits_of(caster, origins, directions, *limits):
     """What `cast` finds of rays, as a scan gives it."""
     if len(directions) and np.abs((directions**2).sum(axis=1) - 1).max() > 1e-14:
         # Those that drift: not quite of unit length, which `cast` would make them.
-        found = caster._engine.closest(Rays(origins, directions, *(limits or (0.0, np.inf))))
-        ray = found.ray.astype(np.uint32)
-        distance = found.t / caster._scene.frame.scale
-        return SimpleNamespace(ray=ray, distance=distance, triangle=found.triangle)
+        rays = Rays(origins, directions, *(limits or (0.0, np.inf)))
+        ray, distance, triangle, _ = caster.engine.nearest(rays)
+        return SimpleNamespace(ray=ray, distance=distance, triangle=triangle)
     hits = caster.cast(origins, directions, *limits)
     ray = np.flatnonzero(hits.hit).astype(np.uint32)
     return SimpleNamespace(ray=ray, distance=hits.distance[ray], triangle=hits.triangle[ray])
@@ -161,7 +160,7 @@ def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
     assert len(whole) > 400
     for chunk in (97, 1000, 1 << 17):
         vase = caster(*shapes["vase"]())
-        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
+        monkeypatch.setattr(type(vase.engine), "chunk", chunk)
         same(scanned(vase, case, (700, 2700), t_min=0.5, t_max=2), whole)
 
 
@@ -221,7 +220,7 @@ def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeyp
     whole = scanned(vase, case, **given)
     want_tally = np.bincount(whole.triangle, minlength=vase.face_count)
     for chunk, every in ((1 << 16, 1), (1 << 16, 5), (111, 2), (111, 10_000)):
-        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
+        monkeypatch.setattr(type(vase.engine), "chunk", chunk)
         for groups in GROUPS:
             got = scanned(vase, case, **given, keep_every=every, groups=groups, tally=True)
             hits, keep = thinned(whole, groups, every, 2400)

@@ -87,7 +87,7 @@ def check(folder: Path, numbers: range, jobs: list[tuple[Scene, Survey]], client
 def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     client, tmp_path, left_over, monkeypatch
 ):
-    before = {*rigs._cache}  # of other tests of this process
+    before = {*rigs.cached_rigs}  # of other tests of this process
     trees = []
     build = lidarsim.simulator.scene_caster.RayCaster
     monkeypatch.setattr(
@@ -101,7 +101,7 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     assert all("the mirror is loose" in row.error for row in made.failed)
     assert 2 <= len(trees) <= 4, "two scenes on two workers"
     assert left_over(client) == ([], [], [])
-    wait_until(lambda: rigs._cache.keys() <= before)  # workers are told, and not waited for
+    wait_until(lambda: rigs.cached_rigs.keys() <= before)  # workers are told, and not waited for
     check(tmp_path, range(4), JOBS, client)
 
 

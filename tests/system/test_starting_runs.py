@@ -92,7 +92,7 @@ def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client,
     """Its answer cannot be had for longer than Dask's own calls wait for one."""
     stopped: list[int] = []
     ready: list[str] = []  # the first has the scene, so that it need not ask the second for it
-    take = CastingWorkers._take
+    take = CastingWorkers._take  # private: the step after an answer, at which the fault must strike
 
     def stop_and_take(workers: CastingWorkers, address: str, *answer: object) -> None:
         ready.append(address)
@@ -148,7 +148,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
 
     monkeypatch.setattr(jobs, "_submit_job", submit)
     monkeypatch.setattr(jobs, "_close_job", close)
-    monkeypatch.setattr(poolpart.deploy.clusters, "_LOOK_EVERY_S", 0.1)
+    monkeypatch.setattr(poolpart.deploy.clusters, "LOOK_EVERY_S", 0.1)
     options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
     told: list[str] = []
     with import_jobqueue().SLURMCluster(

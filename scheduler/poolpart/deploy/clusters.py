@@ -30,8 +30,8 @@ from ..rules import check_count, check_name
 logger = logging.getLogger(__name__)
 
 _NAME = "poolpart"  # of what looks after the jobs of a cluster
-_ADAPT_EVERY_S = 1.0
-_LOOK_EVERY_S = 5.0  # for workers that are gone
+ADAPT_EVERY_S = 1.0  # seconds between two adaptations of the partitions to their tasks
+LOOK_EVERY_S = 5.0  # seconds between two looks for workers that are gone
 INFORMATION = " - INFO - "  # in lines of Dask's logs that are no complaints
 _DEATH_S = 60  # a worker that finds no scheduler for so long ends, as those of dask-jobqueue do
 
@@ -226,7 +226,7 @@ class _JobStarter:
         for part in self._parts.values():
             part.add(self._cluster, part.initial_count)
         await _start(self._cluster)
-        callback = PeriodicCallback(self._look, 1000 * _ADAPT_EVERY_S)
+        callback = PeriodicCallback(self._look, 1000 * ADAPT_EVERY_S)
         self._cluster.periodic_callbacks[_NAME] = callback  # ends with the cluster
         callback.start()
 
@@ -237,7 +237,7 @@ class _JobStarter:
         with suppress(OSError):  # the scheduler is ending
             changed = await self._adapt()
             looked_at = time.monotonic()
-            due = looked_at - self._logs_read_at >= _LOOK_EVERY_S
+            due = looked_at - self._logs_read_at >= LOOK_EVERY_S
             if changed or due:
                 # A SpecCluster drops a lost worker, and starts a new worker when it is awaited.
                 try:

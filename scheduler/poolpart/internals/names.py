@@ -267,7 +267,7 @@ def require(feature: str) -> None:
     PoolError
         If names are missing.
     """
-    _warn_if_untested()
+    warn_if_untested()
     missing = missing_names(feature)
     if missing:
         raise PoolError(
@@ -284,7 +284,8 @@ def missing_names(feature: str) -> tuple[str, ...]:
 
 
 @cache
-def _warn_if_untested() -> None:
+def warn_if_untested() -> None:
+    """Warn once in a process if this version of Dask was not tested."""
     oldest, version, newest = map(_numbers, (TESTED[0], distributed.__version__, TESTED[1]))
     if not oldest <= version <= newest:
         warnings.warn(

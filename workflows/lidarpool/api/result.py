@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # In a notebook: the pictures of a result, and their size in pixels; scaled down by much, their
 # letters could not be read.
 _SHOWN = ("hits", "cloud")
-_SIZE = (800, 500)
+PICTURE_SIZE = (800, 500)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,9 +183,9 @@ class Result(RunResult):
     def _images(self) -> str:
         """Pictures of the result as HTML."""
         with TemporaryDirectory(prefix="lidarpool-") as folder:
-            drawn = self.pictures(folder, only=_SHOWN, size=_SIZE)
+            drawn = self.pictures(folder, only=_SHOWN, size=PICTURE_SIZE)
             data = [b64encode(path.read_bytes()).decode() for path in drawn]
-        style = f"display:block;width:100%;max-width:{_SIZE[0]}px"
+        style = f"display:block;width:100%;max-width:{PICTURE_SIZE[0]}px"
         return "".join(
             f'<img alt="{name}" src="data:image/png;base64,{image}" style="{style}">'
             for name, image in zip(_SHOWN, data, strict=True)

@@ -40,7 +40,7 @@ class Terminal(Screen):
         return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
-    def _console(self) -> Console | None:
+    def console(self) -> Console | None:
         """Console of a terminal with a movable cursor, or None."""
         console = Console(file=self._stream) if self._stream else None
         return console if console and console.is_terminal and not console.is_dumb_terminal else None
@@ -68,7 +68,7 @@ class Terminal(Screen):
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
         """Show a status while the body runs; in a log, too, if the status is `logged`."""
-        console = self._console
+        console = self.console
         if logged and console is None and self._stream:
             _tell(self._stream, words)
         with nullcontext() if console is None else console.status(words):
@@ -77,7 +77,7 @@ class Terminal(Screen):
     @contextmanager
     def writing(self, words: str) -> Iterator[WritingProgress]:
         """Show a bar for each output that the body writes; in a log, `words` and lines."""
-        console = self._console
+        console = self.console
         if console is not None:
             with progress_rows(console) as show:
                 yield show
@@ -88,7 +88,7 @@ class Terminal(Screen):
     @contextmanager
     def progress(self) -> Iterator[Show]:
         """Show bars by stage with rates and time left; lines of text if not on a terminal."""
-        if (console := self._console) is not None:
+        if (console := self.console) is not None:
             with bars(console) as show:
                 yield show
         else:

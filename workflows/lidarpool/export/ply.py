@@ -51,7 +51,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
                 file.write(_rows(chunk, row).data)
                 continue
             piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
-            _write_open3d(piece, chunk, position_type)
+            write_with_open3d(piece, chunk, position_type)
             start, row = _layout(piece, path, len(chunk))
             written = piece.read_bytes()
             vertex_line = b"element vertex %d\n" % len(chunk)
@@ -132,7 +132,7 @@ def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
         )
 
 
-def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
+def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
     """Write a cloud with positions of a type; LidarError if Open3D reports an error."""
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()

@@ -63,7 +63,7 @@ class Pieces(pieces.Pieces):
                 boxes = (
                     Boxes.from_points(self.sweeps, number, points) if self.sweeps.actors else None
                 )
-                sample = b"".join(self._members(number, points, boxes))
+                sample = b"".join(self.sample_files(number, points, boxes))
                 if tar.tell() and tar.tell() + len(sample) > MAX_SHARD_BYTES:
                     self._put(storage, start, tar)
                     tar = io.BytesIO()
@@ -88,8 +88,8 @@ class Pieces(pieces.Pieces):
         storage.prepare(name.rpartition("/")[0])
         storage.write(name, tar.getbuffer())
 
-    def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
-        """Yield the files of a sample, each with its header."""
+    def sample_files(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
+        """Yield the files of a sweep's sample, each with its header."""
         sweeps = self.sweeps
         entry = self.entry
         present = SweepBoxes.select(sweeps, boxes and boxes.inward(sweeps.pose, number))

@@ -48,7 +48,7 @@ _OPEN_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}
 
 _BLOCK_VERTICES = 100_000  # that are reprojected at a time, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and temporary arrays
-_MAX_UNASKED = 5_000_000  # pixels that are read without a window and a step; more take long
+MAX_UNASKED_PIXELS = 5_000_000  # pixels that are read without a window and a step; more take long
 _MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
@@ -413,7 +413,7 @@ def _check_size(
     count = int(np.prod(sides.astype(object)))
     max_read = max_pixels = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
     if not chosen:
-        max_pixels = min(max_pixels, _MAX_UNASKED)
+        max_pixels = min(max_pixels, MAX_UNASKED_PIXELS)
     if count <= max_pixels:
         return
     lower, upper = grid.extent

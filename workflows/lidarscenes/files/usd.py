@@ -61,7 +61,7 @@ _LIMITS = {
     "poses of what moves": 1_000_000,
     "moving objects": 10_000,
 }
-_BASE = 512 * 2**20  # bytes that usd-core takes for any file
+USD_CORE_BYTES = 512 * 2**20  # bytes that usd-core takes for any file
 _LATEST_S = 9e8
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
 
@@ -112,7 +112,7 @@ def _contents(
 def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[_Frame]:
     """Read a file in a process of its own, and yield the frames of its standard output."""
     script = Path(__file__).with_name("usd_child.py")
-    memory = memory_share() + _BASE
+    memory = memory_share() + USD_CORE_BYTES
     # The user's plug-ins and search paths would change the scene.
     environment = {name: text for name, text in os.environ.items() if not name.startswith("PXR_")}
     # A thread that is refused for the memory limit would be waited for until the alarm. One thread

@@ -12,7 +12,7 @@ from .errors import LidarError
 
 UNPACKED_TIMES = 100  # of the file's bytes
 MIN_LIMIT_BYTES = 256 * 2**20  # for small files
-_CONTROL_GROUPS = Path("/sys/fs/cgroup")
+CONTROL_GROUPS = Path("/sys/fs/cgroup")  # folder in which Linux states limits of memory
 _PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
 _SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
 
@@ -95,10 +95,10 @@ def _control_group_limits() -> list[int]:
     for line in memberships:
         _, controllers, group = line.split(":", 2)
         if not controllers:
-            top = _CONTROL_GROUPS
+            top = CONTROL_GROUPS
             file_name = "memory.max"
         elif "memory" in controllers.split(","):
-            top = _CONTROL_GROUPS / "memory"
+            top = CONTROL_GROUPS / "memory"
             file_name = "memory.limit_in_bytes"
         else:
             continue

@@ -41,7 +41,9 @@ class _Interrupt:
             self.first_at = time.monotonic()
             raise KeyboardInterrupt
         if time.monotonic() - self.first_at > _IMPATIENT_S:
-            _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
+            _exit_at_once(
+                b"lidarpool: stopped at once; workers of this machine end by themselves.\n"
+            )
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
@@ -56,7 +58,7 @@ def _drops_errors(frame: FrameType | None) -> bool:
 
 def end_on_signals() -> None:
     """Let the signals end the process at once, as long as no work has started."""
-    _on_signals(lambda number, frame: _exit(f"lidarpool: {UNTOUCHED}\n".encode()))
+    _on_signals(lambda number, frame: _exit_at_once(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
 def interrupt_on_signals() -> None:
@@ -72,7 +74,7 @@ def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
             signal.signal(number, handler)
 
 
-def _exit(message: bytes) -> NoReturn:
+def _exit_at_once(message: bytes) -> NoReturn:
     """End the process at once, with a message on stderr."""
     with suppress(OSError):  # the terminal may be gone
         os.write(2, message)

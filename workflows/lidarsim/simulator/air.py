@@ -105,13 +105,13 @@ class WeatherStep(PulseStep):
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
         min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
-        self._kinds = [
+        self.detectable_kinds = [
             _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
         ]
-        names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self.detectable_kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.backscatter_at(self._wavelength_nm)
-        self._fog = _fog_cells(
+        self.fog_cells = _fog_cells(
             air, scatters, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
@@ -155,13 +155,13 @@ class WeatherStep(PulseStep):
             self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
         )
         parts: list[SampledHits] = []
-        for kind, seed in zip(self._kinds, self._seeds, strict=True):
+        for kind, seed in zip(self.detectable_kinds, self._seeds, strict=True):
             if kind is not None:
                 random = random_keys(seed, self.purposes[2:], keys, first)
                 parts += _particles(kind, random, subrays, reach)
-        if self._fog is not None:
+        if self.fog_cells is not None:
             random = random_keys(self._seed, self.purposes[:2], keys, first)
-            parts.append(_fog_hits(self._fog, random, subrays, self._clouded(hits, reach)))
+            parts.append(_fog_hits(self.fog_cells, random, subrays, self._clouded(hits, reach)))
         if not parts:
             return None
         ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))

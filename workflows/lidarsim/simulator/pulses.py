@@ -44,7 +44,7 @@ class PulseCaster:
         survey: Survey,
         surfaces: Surfaces,
     ) -> None:
-        self._setup = setup = setup_of(scene, survey, sensor_number)
+        self.setup = setup = setup_of(scene, survey, sensor_number)
         self._caster = caster
         self._surfaces = surfaces
         self.emitter = Emitter(setup)
@@ -89,8 +89,8 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first_row, poses, firings, self.emitter)
 
         all_beams = batch(0, beam_count)
-        if self._setup.has_several_returns:
-            pose_beams = poses.rays_per_pose or self._setup.sensor.channels
+        if self.setup.has_several_returns:
+            pose_beams = poses.rays_per_pose or self.setup.sensor.channels
             chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
             chunk_starts = range(0, beam_count, chunk_beams)
             chunks = [
@@ -111,7 +111,7 @@ class PulseCaster:
         The counts and the numbers of the other returns are as if the removed ones were undetected.
         """
         returns = scanned.returns
-        sensor = self._setup.sensor
+        sensor = self.setup.sensor
         if returns.reported is returns.distance or returns.reported is None:  # without noise
             return scanned
         in_range = returns.reported >= sensor.min_range_m
@@ -150,7 +150,7 @@ class PulseCaster:
         Energies are computed only for kept returns, and only if steps deflect beams before they are
         cast (`Role.AIMS`); else `BatchPoints` computes energies by the reported directions.
         """
-        setup = self._setup
+        setup = self.setup
         poses = batch.poses
         for step in self.steps:
             if Role.AIMS in step.role:
@@ -173,7 +173,7 @@ class PulseCaster:
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add energy, colour and velocity to returns of deflected beams, by cast directions."""
         surfaces = self._surfaces
-        setup = self._setup
+        setup = self.setup
         poses = batch.poses
         origins, directions = rays = poses.rays(batch.beams, returns.ray, batch.window[0])
         times = poses.times(returns.ray)
@@ -199,7 +199,7 @@ class PulseCaster:
         """Count the returns of each scan, and keep every n-th return of a scan."""
         from . import pulse_loops  # not before: numba takes half a second to import
 
-        keep_every = self._setup.survey.keep_every
+        keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
         hits = np.zeros(len(scan_starts), np.int64)
         rows = np.empty(size, np.int64)

@@ -82,8 +82,9 @@ class Rig:
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
-        self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._caster = SceneCaster(scene, self._surfaces, shared_caster, **options)
+        # The parts from which scans are cast, for other tools to look into.
+        self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
+        self.scene_caster = SceneCaster(scene, self.surfaces, shared_caster, **options)
         self._device: DeviceColumns | None = None
         self._prepare()
         check_trajectory(survey.path)
@@ -119,7 +120,7 @@ class Rig:
         The tree of static bodies is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self.options, self._caster)
+        rig._assemble(scene, survey, self.options, self.scene_caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
@@ -154,8 +155,8 @@ class Rig:
         instances = rig.scene.instances
         assert instances is not None
         rows = np.flatnonzero(instances.owner == owner)
-        rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._caster.move_instances(rig._surfaces, instances, rows)
+        rig.surfaces = self.surfaces.moved(rig.scene, rows)
+        rig.scene_caster.move_instances(rig.surfaces, instances, rows)
         rig._prepare()
         return rig
 
@@ -164,23 +165,23 @@ class Rig:
 
         Columns are computed on a CUDA device if it casts the rays and no sensor has steps.
         """
-        caster = self._caster
+        caster = self.scene_caster
         scene = self.scene
         survey = self.survey
-        surfaces = self._surfaces
-        self._pulses = [
+        surfaces = self.surfaces
+        self.pulse_casters = [
             PulseCaster(number, caster, scene, survey, surfaces)
             for number in range(len(survey.carried))
         ]
         if self._device is not None:
             self._device = self._device.moved(scene, surfaces)
-        elif caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
+        elif caster.caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
             self._device = DeviceColumns(caster, scene, survey, surfaces)
 
     @property
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
-        return self._caster.backend
+        return self.scene_caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings `first` to `stop` of sensor `number`, in the carrier's frame.
@@ -243,13 +244,13 @@ class Rig:
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
         first_key = specs[0].scan + specs[0].ahead  # a scan's number in keys of random numbers
-        scanned = self._pulses[number].scan(
+        scanned = self.pulse_casters[number].scan(
             first_key, pattern, poses, window, groups, firings, tally=tally
         )
         return BatchPoints(
             self.scene,
             self.survey,
-            self._surfaces,
+            self.surfaces,
             specs,
             scanned,
             pattern=pattern,
@@ -335,7 +336,7 @@ class Rig:
         first = specs[0].firings[0]
         scan_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         returns = (
-            self._pulses[specs[0].sensor]
+            self.pulse_casters[specs[0].sensor]
             .scan(
                 specs[0].scan + specs[0].ahead + first_scan,
                 pattern,

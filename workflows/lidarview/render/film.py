@@ -24,7 +24,7 @@ BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "
 _RED = "#ff4d5e"
 _WHITE = "#ffffff"
 _MAX_PIXEL = 4000
-_FOCAL = 922.0  # pixels: 55 degrees across
+FOCAL_PX = 922.0  # focal length of the camera, pixels: 55 degrees across
 # distances of the camera from the carrier, and of its target ahead, times the range
 _BEHIND = 1.7
 _ABOVE = 0.95
@@ -64,7 +64,7 @@ class _Sights(NamedTuple):
         ahead = unit((self.targets - self.eyes)[number, None])
         right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
         axes = np.concatenate([right, np.cross(right, ahead), ahead])
-        return Camera(self.eyes[number], axes, _FOCAL, np.array(SIZE) / 2, SIZE)
+        return Camera(self.eyes[number], axes, FOCAL_PX, np.array(SIZE) / 2, SIZE)
 
 
 @dataclass(eq=False)

@@ -35,12 +35,12 @@ from .view import MAX_POINTS, View, open_result
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
 _MIN_FRAMES = 30
 _FRAME_MS = 100
-_FILM_BYTES = 3_000_000
+FILM_BYTES = 3_000_000  # maximum of a film
 _WIDTHS = range(960, 320, -80)  # of a film, pixels, the widest first
 _FILM_TRIANGLES = 3_000_000
 _FILM_POINTS = 800_000  # that a film shows at a time
 _FRAME_POINTS = 200_000  # that a frame adds
-_PAGE_BYTES = 25_000_000
+PAGE_BYTES = 25_000_000  # maximum of a page in one file
 _PAGE_POINTS = 1_000_000
 _PAGE_TRIANGLES = 60_000
 _SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
@@ -95,7 +95,7 @@ def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> b
         show("film", len(frames), len(film.moments_ns), "frames")
 
     sample = frames[len(frames) // 6 :: len(frames) // 3]
-    max_bytes = 0.95 * _FILM_BYTES * len(sample) / len(frames)
+    max_bytes = 0.95 * FILM_BYTES * len(sample) / len(frames)
     widths = (w for w in _WIDTHS if len(_encode(sample, suffix, w, quality)) < max_bytes)
     return _encode(frames, suffix, next(widths, _WIDTHS[-1]), quality)
 
@@ -212,7 +212,7 @@ def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
     page = _page_with_modules()
     view = replace(view, triangles=_PAGE_TRIANGLES)
     answers = _pack_answers(view, show)
-    free_bytes = _PAGE_BYTES - len(page) - sum(len(text) + 99 for text in answers.values())
+    free_bytes = PAGE_BYTES - len(page) - sum(len(text) + 99 for text in answers.values())
     max_points = _PAGE_POINTS
     while len(cloud := _packed(*_thinned(view, max_points))) > free_bytes:
         max_points = int(max_points * min(0.9, 0.95 * max(free_bytes, 0) / len(cloud)))

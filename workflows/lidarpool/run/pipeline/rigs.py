@@ -55,7 +55,8 @@ class _CachedRig:
     used_at: float  # monotonic time
 
 
-_cache: dict[str, _CachedRig] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
+# {handle of a rig, or of a scene: a rig of it in this process}
+cached_rigs: dict[str, _CachedRig] = {}
 _ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
 _lock = threading.Lock()
 
@@ -70,15 +71,15 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
     RigFailed
         If the rig cannot be built.
     """
-    cached = _cache.get(handle)
+    cached = cached_rigs.get(handle)
     if cached is None:
         with _lock:
-            cached = _cache.get(handle)
+            cached = cached_rigs.get(handle)
             if cached is None:
-                cached = _cache[handle] = _build(handle, plan, scene)
+                cached = cached_rigs[handle] = _build(handle, plan, scene)
                 if (run := handle.partition(".")[0]) in _ended_runs:
                     drop_all(run)
-    its_scene = _cache.get(cached.scene, cached)
+    its_scene = cached_rigs.get(cached.scene, cached)
     cached.used_at = its_scene.used_at = time.monotonic()
     return cached.rig
 
@@ -90,9 +91,9 @@ def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
         name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
         survey: Survey = pickle.loads(packed)  # noqa: S301
         now_s = time.monotonic()
-        unused = [h for h, cached in [*_cache.items()] if now_s - cached.used_at > UNUSED_S]
+        unused = [h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S]
         drop([unused_handle for unused_handle in unused if unused_handle != name])
-        if (cached_scene := _cache.get(name)) is not None:
+        if (cached_scene := cached_rigs.get(name)) is not None:
             rig = cached_scene.rig.with_survey(cached_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
             static_scene: Scene = pickle.loads(scene)  # noqa: S301
@@ -104,7 +105,7 @@ def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    _cache[name] = _CachedRig(rig, name, time.monotonic())
+    cached_rigs[name] = _CachedRig(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _CachedRig(rig, name, time.monotonic())
 
@@ -112,14 +113,14 @@ def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
 def drop(handles: Collection[str]) -> None:
     """Drop cached rigs and scenes by their handles; unknown handles are ignored."""
     for handle in handles:
-        _cache.pop(handle, None)
+        cached_rigs.pop(handle, None)
 
 
 def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run that has ended."""
     _ended_runs.append(run)
     # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
-    drop([handle for handle in [*_cache] if handle.partition(".")[0] == run])
+    drop([handle for handle in [*cached_rigs] if handle.partition(".")[0] == run])
 
 
 @dataclass(frozen=True, slots=True)
