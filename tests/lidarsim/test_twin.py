@@ -276,7 +276,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     second = np.diff(ray, prepend=-1) == 0
     triangle = np.where((what[ray] == 1) | second, 0, 2).astype(np.int32)
     hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
-    found = caster.sampled(hits, (FIRST, FIRST + count), KEYS, each)
+    found = caster.sample_air_hits(hits, (FIRST, FIRST + count), KEYS, each)
     air = survey.air(0)
     cloud = caster.fog_cells
     expected = []
