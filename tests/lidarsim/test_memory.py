@@ -30,7 +30,7 @@ from lidarpool import (
 from lidarsim.scene.colours import Colours
 from lidarsim.sensor.survey import OPTIONAL_NAMES
 from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.memory import TRIANGLE, cast_bytes, scans_that_fit
+from lidarsim.simulator.memory import HIT_COUNTER, cast_bytes, scans_that_fit
 from lidarsim.simulator.rig import Rig
 
 RAYS = 600_000
@@ -112,7 +112,7 @@ def test_the_estimate_is_safe_and_near(name):
 def test_as_many_scans_as_fit(limit, name):
     survey = SURVEYS[name]
     fit = scans_that_fit(SCENE, survey, limit)
-    limit += TRIANGLE * SCENE.counters
+    limit += HIT_COUNTER * SCENE.counters
     assert fit >= 1
     assert fit == 1 or cast_bytes(SCENE, survey, min(fit, survey.scan_count)) <= limit
     assert fit >= survey.scan_count or cast_bytes(SCENE, survey, fit + 1) > limit

@@ -1,6 +1,9 @@
 """Fits the performance of a sensor to a recording; writes a sensor file and its page.
 
-All intervals are confidence intervals of 95 %.
+A figure is a number of the performance, such as the noise of ranges; intervals of figures are
+confidence intervals of 95 %. A cell is a ring and a column, which is a step of azimuth of a
+revolution. All pulses that the sweeps send into a cell are pulses of the same ray. Arrays have s
+sweeps, r rings (rows), c columns and k rays; positions and directions are in the sensor frame.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from .recordings import RecordedPoints, Recording, open_recording
 
 
 class _Chart(NamedTuple):
-    """Labels of a chart, and the factor from a figure to the unit of the y axis."""
+    """Labels of a chart, and the factor from the values of figures to the unit of the y axis."""
 
     x_label: str
     y_label: str
@@ -103,7 +106,8 @@ _ASSUMED_NOISE_M = 0.02
 _ASSUMED_SHIFT_M = 0.5
 
 # Noise of ranges and directions
-_INITIAL_AIM_RAD = 0.002  # scatter of directions before its estimate, for the choice of outliers
+# noise of directions before the noise is estimated, for the choice of outliers
+_INITIAL_DIRECTION_NOISE_RAD = 0.002
 _MAX_SIGMAS = 6.0  # a return beyond is of something that moves
 _MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
 _MIN_REFLECTANCE = 1 / 400  # reflectance of surfaces that are reported as 0
@@ -149,7 +153,7 @@ _STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error
 class Fit:
     """Result of `fit`; printed as a table."""
 
-    figures: dict[str, Any]  # all that the page shows; lengths in metres
+    figures: dict[str, Any]  # numbers and texts of the page; lengths in metres
     model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:
@@ -188,22 +192,24 @@ def fit(
     intensity: str | None = None,
     white: Annotated[float, Field(gt=0)] | None = None,
 ) -> Fit:
-    """Fit the performance of a sensor to sweeps of a static unit.
+    """Fit the performance of a sensor to sweeps of the sensor at a standstill.
 
     Parameters
     ----------
     recording
         Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
     model
-        The sensor, by name or file; figures that the recording does not determine stay. By default
-        a sensor with the recorded beams.
+        The sensor, by name or file; the model keeps its figures that the recording does not
+        determine. By default a sensor with the recorded beams.
     scene, pose
         The recorded place as a scene, and the sensor's pose in the scene; by default surfaces are
         those of the recording.
     sensor, intensity
-        Of several, name of the sensor or topic of a bag; column, if not ``intensity``.
+        Name of the sensor, or topic of a bag, if the recording has several; column with the
+        intensities, if not ``intensity``.
     white
-        Intensity of a white surface, if it is the same at all ranges; known of Velodyne and Ouster.
+        Intensity that the sensor reports of a white surface, if the intensity is the same at all
+        ranges. By default the value of Velodyne and Ouster for their recordings, else unknown.
 
     Raises
     ------
@@ -249,7 +255,7 @@ def fit(
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, pose: Any) -> Floats:
-    """Return the ranges of a scene in the cells, (r, c), metres; NaN where no ray hits."""
+    """Cast a ray into each cell; return ranges of the scene (r, c), metres, NaN without a hit."""
     rays = stack.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     ranges = Scanner(scene, sensor).ranges([pose], number=0).reshape(stack.rough_sigma.shape)
@@ -267,8 +273,8 @@ def _check_pose(stack: SweepStack, expected: Floats, name: str) -> None:
 
 def _lost_by_range(stack: SweepStack, expected: Floats) -> list[dict[str, float]]:
     """Compute the curve of the share of lost pulses by the range of the scene, (r, c)."""
-    plane = find_surfaces(stack, expected, 0 * stack.rough_sigma)
-    cells = plane.smooth & (stack.trials > 0)
+    surfaces = find_surfaces(stack, expected, 0 * stack.rough_sigma)
+    cells = surfaces.smooth & (stack.trials > 0)
     returned = np.isfinite(stack.ranges).sum(axis=0)
     lost = 1 - returned[cells] / stack.trials[cells]
     return _curve(expected[cells], lost)
@@ -278,9 +284,9 @@ class _MeasuredRays(NamedTuple):
     """Rays on smooth surfaces, and the performance that was fitted to their returns."""
 
     rays: SmoothRays
-    energy: Floats | None  # (k,): of the returns; None if unknown
+    energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
     estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
-    sigma: Floats  # (r, c): standard deviation of ranges, metres
+    sigma: Floats  # (r, c): standard deviation of the ranges of a cell, metres
 
 
 def _measure_rays(
@@ -294,9 +300,9 @@ def _measure_rays(
     white = white or recording.white
     sigma = stack.rough_sigma.copy()
     estimates: dict[str, Estimate] = {}
-    for _ in range(2):  # the first pass finds the noise beyond which the second leaves returns out
-        aim_rad = 0.0 if estimates else _INITIAL_AIM_RAD
-        rays = select_smooth_rays(stack, sigma, aim_rad, expected)
+    for _ in range(2):  # the second pass leaves returns out by the noise that the first pass fits
+        direction_noise_rad = 0.0 if estimates else _INITIAL_DIRECTION_NOISE_RAD
+        rays = select_smooth_rays(stack, sigma, direction_noise_rad, expected)
         if len(rays.row) < _MIN_RAYS:
             message = f"{recording.name} has {len(rays.row)} rays on smooth surfaces"
             raise LidarError(
@@ -309,9 +315,10 @@ def _measure_rays(
 
 
 def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
-    """Return the energies of the returns of rays (k,), or None if they are unknown.
+    """Return the mean energies of the returns of rays (k,), or None if unknown.
 
-    The energy is 1 for a white surface at 10 m, or the intensity if intensities `are_energies`.
+    The energy is 1 for a white surface at 10 m; or the energy is the intensity, if the intensities
+    of the recording `are_energies`. `white` is the intensity of a white surface, None if unknown.
     """
     if not np.isfinite(rays.intensity).all():
         return None
@@ -339,16 +346,16 @@ def _noise_curves(measured: _MeasuredRays, sweep_count: int) -> dict[str, list[d
 
 
 def _range_variances(measured: _MeasuredRays) -> Floats:
-    """Return variances (k,) of ranges without noise of directions, m²; NaN of single returns."""
+    """Return variances (k,) of ranges, m², less those by directions; NaN of single returns."""
     rays = measured.rays
     estimate = measured.estimates.get("angle_deg")
-    aim_rad = 0.0 if estimate is None else np.radians(estimate.value)
+    direction_noise_rad = 0.0 if estimate is None else np.radians(estimate.value)
     variance = np.where(rays.freedom > 0, rays.variance, np.nan)
-    return np.asarray(variance - (aim_rad * rays.slope) ** 2)
+    return np.asarray(variance - (direction_noise_rad * rays.slope) ** 2)
 
 
 def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    """Check that each recorded ring is near a beam of a model, unless that needs a calibration."""
+    """Return True if each ring is near a beam of a model, or a calibration file has the beams."""
     offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
     is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
     return model.needs_calibration or is_near
@@ -357,7 +364,7 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor with estimates in its performance; figures without an estimate stay."""
+    """Return a sensor with estimates in its performance; figures without estimates stay."""
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()
     stated = performance.model_dump(
@@ -393,7 +400,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def from_variance(cls, value: Any, variance: Any) -> Estimate:
-        """Build the estimate of a normally distributed value."""
+        """Build the estimate of a normally distributed value with a variance."""
         half = _CONFIDENCE_SIGMAS
         return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -half, half)))
 
@@ -404,21 +411,26 @@ class Estimate(NamedTuple):
 
     @classmethod
     def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
-        """Estimate the quotient of the sums of parts (n,) and totals (n,), such as lost pulses.
+        """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
 
-        The interval is that of Clopper and Pearson for as many independent pulses as explain the
-        scatter of the n shares; the interval is not empty if the share is 0.
+        The interval is that of Clopper and Pearson for the number of independent pulses whose
+        binomial variance is the variance of the share by the n parts, at most the sum of totals.
+        The interval is not empty if the share is 0.
         """
         from scipy.stats import beta
 
         total = float(totals.sum())
         share = float(parts.sum()) / total
-        square = float(((parts - share * totals) ** 2).sum()) / total**2
-        binomial = share * (1 - share) / total
-        count = total * binomial / square if square > binomial > 0 else total
+        share_variance = float(((parts - share * totals) ** 2).sum()) / total**2
+        binomial_variance = share * (1 - share) / total
+        pulses = (
+            total * binomial_variance / share_variance
+            if share_variance > binomial_variance > 0
+            else total
+        )
         tail = (1 - _CONFIDENCE) / 2
-        lower = beta.ppf(tail, share * count, (1 - share) * count + 1) if share > 0 else 0.0
-        upper = beta.isf(tail, share * count + 1, (1 - share) * count) if share < 1 else 1.0
+        lower = beta.ppf(tail, share * pulses, (1 - share) * pulses + 1) if share > 0 else 0.0
+        upper = beta.isf(tail, share * pulses + 1, (1 - share) * pulses) if share < 1 else 1.0
         return cls(share, float(lower), float(upper))
 
     def is_within(self, share: float) -> bool:
@@ -426,7 +438,7 @@ class Estimate(NamedTuple):
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of a power times a scale; negative numbers count as 0."""
+        """Return the estimate of `scale` times a power; negative numbers count as 0."""
         value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
         return Estimate(value, min(limits), max(limits))
 
@@ -435,14 +447,14 @@ class Estimate(NamedTuple):
 class SweepStack:
     """Returns of all sweeps in the same cells, the highest ring first; NaN without a return."""
 
-    rings: Ints  # (r,): numbers
-    elevation_deg: Floats  # (r,)
-    directions: Floats  # (r, c, 3): unit vectors
+    rings: Ints  # (r,): numbers of the rings
+    elevation_deg: Floats  # (r,): of the rings
+    directions: Floats  # (r, c, 3): mean unit directions of the cells
     ranges: Floats32  # (s, r, c): metres
     intensities: Floats32  # (s, r, c)
-    azimuth_offsets: Floats32  # (s, r, c): from the azimuths of the directions, radians
-    rough_sigma: Floats  # (r, c): rough scatter of ranges from sweep to sweep, metres
-    trials: Ints  # (r, c): sweeps that cover the cell; the others have a gap there
+    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less those of `directions`, radians
+    rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, metres
+    trials: Ints  # (r, c): number of sweeps that cover the cell, with a return or a lost pulse
     notes: tuple[str, ...]
 
     @property
@@ -502,16 +514,16 @@ class SweepStack:
 class _CommonCells:
     """Cells of a sensor that are filled sweep by sweep; a ring is added with its first return."""
 
-    numbers: Ints  # (s,): sweeps of the recording that are read
+    numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
     reference: RecordedPoints  # the sweep whose rings and steps of azimuth define the cells
     images: RangeImages  # of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
-    values: Floats32  # (4, s, r, c): range, intensity, azimuth and elevation in degrees
+    values: Floats32  # (4, s, r, c): range, metres; intensity; azimuth and elevation, degrees
 
     @classmethod
     def read(cls, recording: Recording) -> _CommonCells:
-        """Define the cells by the largest of the first three sweeps, without any returns yet."""
+        """Define empty cells by the largest of the first three sweeps."""
         sweeps = (recording.read_points(k) for k in range(min(3, recording.count)))
         reference = max(sweeps, key=len)
         if not len(reference):
@@ -542,6 +554,7 @@ class _CommonCells:
             # Rings of false alarms alone may have no return in the first sweeps.
             foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
             is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
+            # With other steps of azimuth, more points lie behind others of their cell.
             if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
                 raise LidarError(f"sweep {number} is of another sensor, or another mode.")
         self._add_rings(sweep)
@@ -585,24 +598,24 @@ def _mean_directions(
 ) -> tuple[Floats, Floats32]:
     """Return the mean directions of cells (r, c, 3), and offsets of azimuths (s, r, c), radians.
 
-    `values` (4, s, r, c) are those of `_CommonCells`, `elevation_deg` (r,) those of the rings.
+    `values` (4, s, r, c) are those of `_CommonCells`, `elevation_deg` (r,) the elevations of rings.
     """
     grid_azimuth = np.radians(step_deg * np.arange(values.shape[-1]))
     grid_elevation = elevation_deg[:, None]
     azimuth_offset = (np.radians(values[2]) - grid_azimuth + np.pi) % (2 * np.pi) - np.pi
     elevation_offset = np.radians(values[3] - grid_elevation)
-    mean_azimuth, mean_elevation = (
+    mean_azimuth_offset, mean_elevation_offset = (
         np.nansum(offset, axis=0) / np.maximum(np.isfinite(offset).sum(axis=0), 1)
         for offset in (azimuth_offset, elevation_offset)
     )
-    azimuth = grid_azimuth + mean_azimuth
-    elevation = np.radians(grid_elevation) + mean_elevation
+    azimuth = grid_azimuth + mean_azimuth_offset
+    elevation = np.radians(grid_elevation) + mean_elevation_offset
     directions = [
         np.cos(elevation) * np.cos(azimuth),
         np.cos(elevation) * np.sin(azimuth),
         np.sin(elevation),
     ]
-    return np.stack(directions, axis=-1), azimuth_offset - mean_azimuth
+    return np.stack(directions, axis=-1), azimuth_offset - mean_azimuth_offset
 
 
 def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
@@ -612,31 +625,31 @@ def _median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
 
 
 def rough_scatter(ranges: Floats32) -> Floats:
-    """Estimate the scatter (r, c) of ranges (s, r, c) from neighbouring rays, metres.
+    """Estimate the standard deviation (r, c) over the sweeps of ranges (s, r, c), metres.
 
-    The scatter is at least that of the ring. Surfaces that are weak or steep scatter more than
-    others of a ring.
+    The estimate is a median over neighbouring rays, and at least the median of the ring. Ranges of
+    weak or steep surfaces scatter more than ranges of other surfaces of the ring.
     """
     changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
-    ring = _median(changes, (0, 2))[:, None]
-    ray = _median(changes, 0)
+    ring_scatter = _median(changes, (0, 2))[:, None]
+    ray_scatter = _median(changes, 0)
     shifts = range(-_NEIGHBOUR_RAYS, _NEIGHBOUR_RAYS + 1)
-    neighbourhood = _median(np.stack([np.roll(ray, shift, axis=1) for shift in shifts]), 0)
-    ring = np.where(np.isnan(ring), _MAX_KINK_M, np.maximum(ring, 1e-4))
-    return np.fmax(neighbourhood, ring)
+    neighbourhood = _median(np.stack([np.roll(ray_scatter, shift, axis=1) for shift in shifts]), 0)
+    ring_scatter = np.where(np.isnan(ring_scatter), _MAX_KINK_M, np.maximum(ring_scatter, 1e-4))
+    return np.fmax(neighbourhood, ring_scatter)
 
 
 class Surfaces(NamedTuple):
     """Surfaces of a range image, (r, c) each."""
 
-    azimuth_slope: Floats  # change of the range with the azimuth, metres in a radian
-    slope: Floats  # change of the range with the direction of steepest change, metres in a radian
+    azimuth_slope: Floats  # growth of the range with the azimuth, metres in a radian
+    slope: Floats  # growth of the range with the direction of steepest growth, metres in a radian
     smooth: Bools  # whether the neighbours lie in one plane with the cell
-    normal: Floats  # (r, c, 3): normal of the plane, over its product with the ray's direction
+    scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
 class _Neighbours(NamedTuple):
-    """Points (r, c, 3) of the cells beside each cell of a range image."""
+    """Points (r, c, 3) of the cells beside each cell of a range image, metres."""
 
     next_1: Floats
     previous_1: Floats
@@ -660,19 +673,22 @@ class _Neighbours(NamedTuple):
         return np.cross(run, rise)
 
     def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
-        """Mark points (r, c, 3) whose neighbours lie in their plane, within tolerances (r, c)."""
+        """Mark points (r, c, 3) whose neighbours lie in the plane of the point and its normal.
+
+        Tolerances (r, c) are for neighbours in the next column; for others they are doubled.
+        """
         means_1 = (self.next_1 + self.previous_1) / 2
         means_2 = (self.next_2 + self.previous_2) / 2
         coplanar = np.ones(points.shape[:2], bool)
         pairs = ((means_1, 1), (means_2, 2), (self.above, 2), (self.below, 2))
-        for neighbours, columns in pairs:
+        for neighbours, tolerance_factor in pairs:
             offset = np.abs(((neighbours - points) * normal).sum(axis=-1))
-            coplanar &= offset < columns * tolerance_m
+            coplanar &= offset < tolerance_factor * tolerance_m
         return coplanar
 
 
 def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
-    """Find slopes and edges of a range image (r, c) with known errors of its ranges (r, c)."""
+    """Find slopes and edges of a range image `distance` (r, c) with errors (r, c), metres."""
     points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _beam_origins(points)
@@ -682,19 +698,20 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfa
         normal = neighbours.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * directions).sum(axis=-1, keepdims=True)
-        change = length * (directions - normal)
-        slope = np.linalg.norm(change, axis=-1)
+        gradient = length * (directions - normal)
+        slope = np.linalg.norm(gradient, axis=-1)
         tolerance_m = _MAX_KINK_M + _MAX_KINK_PER_M * distance + 5 * error_m
         smooth = (slope < _MAX_TANGENT * distance) & (distance > _MIN_RANGE_M)
         smooth &= neighbours.are_coplanar(points, normal, tolerance_m)
-    azimuth_slope = change[..., 1] * directions[..., 0] - change[..., 0] * directions[..., 1]
+    azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
     return Surfaces(azimuth_slope, slope, smooth, normal)
 
 
 def _beam_origins(points: Floats) -> Floats:
     """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), metres.
 
-    Beams of a row meet on the axis, near zero.
+    Beams of a row meet on the z axis, near zero: heights grow linearly with the distance from the
+    axis, and the height at distance 0 is the origin.
     """
     with warnings.catch_warnings(action="ignore"):
         distance = np.hypot(points[..., 0], points[..., 1])
@@ -708,10 +725,10 @@ def _beam_origins(points: Floats) -> Floats:
 
 
 def covered_cells(returned: Bools) -> Bools:
-    """Return a mask of the cells (s, r, c) that sweeps cover, without gaps.
+    """Return a mask of the cells (s, r, c) into which a sweep sent a pulse: no gaps.
 
-    Lost packets and sweeps cut short make gaps. `returned` (s, r, c) are the cells with a return.
-    A run of cells without any, in all rings or in one ring, is a gap if pulses that are lost
+    Lost packets and sweeps cut short make gaps. `returned` (s, r, c) marks the cells with a return.
+    A run of cells without a return, in all rings or in one ring, is a gap if pulses that are lost
     independently would hardly ever make such a run.
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
@@ -726,7 +743,7 @@ def covered_cells(returned: Bools) -> Bools:
 def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
     """Mark runs of empty cells along the last axis, a revolution, that are too long for chance.
 
-    `log_chance` are the logarithms of the chances that a cell is empty.
+    `log_chance` are the logarithms of the chances that cells are empty; the last axis is columns.
     """
     count = empty.shape[-1]
     edge = np.zeros((*empty.shape[:-1], 1), bool)
@@ -805,10 +822,10 @@ def _check_drift(stack: SweepStack, name: str) -> None:
 
 
 class SensorMotion(NamedTuple):
-    """Motion of a sensor between two sweeps; 0 where noise may explain the changes."""
+    """Motion of a sensor between two sweeps; 0 if noise may explain the changes of ranges."""
 
-    shift_m: float
-    yaw_rad: float
+    shift_m: float  # length
+    yaw_rad: float  # magnitude
 
     @property
     def moves(self) -> bool:
@@ -819,21 +836,22 @@ class SensorMotion(NamedTuple):
 class RangeChanges(NamedTuple):
     """Changes of the ranges of smooth surfaces between two sweeps."""
 
-    plane: Surfaces  # of the first sweep
-    chosen: Bools  # (r, c): rays that meet smooth surfaces, not steeply, in both sweeps
-    change: Floats  # (r, c): metres, without that of shifted azimuths
+    surfaces: Surfaces  # of the first sweep
+    # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
+    chosen: Bools
+    change: Floats  # (r, c): metres, second less first, without the change by shifted azimuths
 
 
 def range_changes(stack: SweepStack, first: int, second: int) -> RangeChanges:
-    """Compare the ranges of two sweeps where the first meets smooth surfaces."""
+    """Compare the ranges of two sweeps where the first sweep meets smooth surfaces."""
     distance = stack.ranges[first].astype(np.float64)
     # Changes of ranges from sweep to sweep are no noise if the sensor moves.
-    plane = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
+    surfaces = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
     with np.errstate(invalid="ignore"):
         azimuth_change = stack.azimuth_offsets[second] - stack.azimuth_offsets[first]
-        change = stack.ranges[second] - distance - plane.azimuth_slope * azimuth_change
-        chosen = plane.smooth & np.isfinite(change) & (plane.slope < _FLAT_TANGENT * distance)
-    return RangeChanges(plane, chosen, change)
+        change = stack.ranges[second] - distance - surfaces.azimuth_slope * azimuth_change
+        chosen = surfaces.smooth & np.isfinite(change) & (surfaces.slope < _FLAT_TANGENT * distance)
+    return RangeChanges(surfaces, chosen, change)
 
 
 def range_scatter(stack: SweepStack, lag: int) -> float:
@@ -854,9 +872,10 @@ def range_scatter(stack: SweepStack, lag: int) -> float:
 def sensor_motion(stack: SweepStack, first: int, second: int) -> SensorMotion:
     """Fit the shift and the yaw of the sensor between two sweeps to the changes of ranges.
 
-    A plane n · x = c is nearer by n · s / (n · d) in the direction d after a shift s.
+    In the direction d, the plane n · x = c is nearer by n · s / (n · d) after a shift s of the
+    sensor.
     """
-    plane, chosen, changes = range_changes(stack, first, second)
+    surfaces, chosen, changes = range_changes(stack, first, second)
     if chosen.sum() < _MIN_RAYS:
         return SensorMotion(0.0, 0.0)
     change = changes[chosen]
@@ -866,7 +885,9 @@ def sensor_motion(stack: SweepStack, first: int, second: int) -> SensorMotion:
     normal_error = _ASSUMED_NOISE_M / (np.sqrt(10) * distance * 2 * np.pi / column_count)
     noise = np.hypot(_ASSUMED_NOISE_M + _MAX_KINK_PER_M * distance, _ASSUMED_SHIFT_M * normal_error)
     # Yaw as metres at a distance of 10 m, so that the unknowns are of about the same size.
-    design = np.column_stack([-plane.normal[chosen], plane.azimuth_slope[chosen] / _YAW_ARM_M])
+    design = np.column_stack(
+        [-surfaces.scaled_normal[chosen], surfaces.azimuth_slope[chosen] / _YAW_ARM_M]
+    )
     changed = np.abs(change) > 5 * noise  # in a street, few rays show how far the sensor moves
     for rays in (slice(None), changed):
         motion = _rigid_motion(design[rays], change[rays], noise[rays])
@@ -883,9 +904,10 @@ def sensor_motion(stack: SweepStack, first: int, second: int) -> SensorMotion:
 def _explains(
     motion: Floats, design: Floats, change: Floats, noise: Floats, normal_error: Floats
 ) -> bool:
-    """Return True if a motion (4,) explains most of the large changes (k,) that are predicted.
+    """Return True if a motion (4,) explains most of the large changes that the motion predicts.
 
-    `noise` (k,) is that of the changes, metres; `normal_error` (k,) that of the rows of `design`.
+    `motion` and `design` (k, 4) are those of `_rigid_motion`. `change` (k,) has the changes of
+    ranges and `noise` (k,) their noise, metres; `normal_error` (k,) the errors of normals, radians.
     """
     predicted = design @ motion
     residual = np.abs(change - predicted)
@@ -898,9 +920,11 @@ def _explains(
 
 
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a shift and a yaw (4,) to changes of ranges (k,); 0 where undetermined.
+    """Fit a motion (4,) to changes of ranges (k,): shift x, y, z and yaw at `_YAW_ARM_M`, metres.
 
-    Huber's estimate: few rays of things that move count little.
+    A row of `design` (k, 4) is the change of the range with the motion; `noise` (k,) is the noise
+    of `change`, metres. Components along principal axes of the covariance that are not significant
+    are 0. Huber's estimate: few rays of things that move count little.
     """
     motion: Floats = np.zeros(4)
     if len(change) < _MIN_RAYS:
@@ -924,10 +948,10 @@ class SmoothRays(NamedTuple):
     row: Ints
     column: Ints
     distance: Floats  # mean of the ranges, metres
-    slope: Floats  # by how much the range changes with the direction, metres in a radian
+    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, metres in a radian
     intensity: Floats  # mean; NaN if unknown
-    returns: Ints  # sweeps with a return
-    trials: Ints  # sweeps that cover the ray
+    returns: Ints  # number of sweeps with a return
+    trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
     variance: Floats  # of the range over the sweeps, square metres
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
@@ -937,7 +961,7 @@ class SmoothRays(NamedTuple):
 
 
 class _RayStatistics(NamedTuple):
-    """Statistics of the returns of rays without outliers, (k,) each."""
+    """Statistics of the returns of rays, without returns that are outliers, (k,) each."""
 
     mean_range: Floats  # metres
     mean_intensity: Floats
@@ -946,20 +970,21 @@ class _RayStatistics(NamedTuple):
 
 
 def select_smooth_rays(
-    stack: SweepStack, sigma: Floats, aim_rad: float, expected: Floats | None = None
+    stack: SweepStack, sigma: Floats, direction_noise_rad: float, expected: Floats | None = None
 ) -> SmoothRays:
     """Choose rays away from edges, and compute the statistics of their returns.
 
-    Returns beyond noise of `sigma` (r, c) and directions that scatter by `aim_rad` are left out,
-    and rays with many such returns. Slopes are those of a scene's ranges `expected` (r, c), if
-    known.
+    A return is an outlier if the range is more than `_MAX_SIGMAS` standard deviations from the
+    median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
+    are left out, and rays with many outliers. Slopes are those of a scene's ranges `expected`
+    (r, c), metres, if known.
     """
     median = _median(stack.ranges, 0)
     return_count = np.isfinite(stack.ranges).sum(axis=0)
     error_m = stack.rough_sigma / np.sqrt(np.maximum(return_count, 1))
-    plane = find_surfaces(stack, median, error_m)
-    slopes = plane.slope
-    smooth = plane.smooth
+    surfaces = find_surfaces(stack, median, error_m)
+    slopes = surfaces.slope
+    smooth = surfaces.smooth
     if expected is not None:
         slopes = find_surfaces(stack, expected, 0 * error_m).slope
         smooth &= np.abs(median - expected) < _SCENE_TOLERANCE_M
@@ -968,9 +993,9 @@ def select_smooth_rays(
     cell = np.nonzero(smooth & (neighbours >= 3))
     slope = slopes[cell]
     returns = return_count[cell]
-    limit_m = _MAX_SIGMAS * np.hypot(sigma[cell], aim_rad * slope)
+    limit_m = _MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
     limit_m = np.where(returns > 1, limit_m, np.inf)
-    statistics = _ray_statistics(stack, cell, plane.azimuth_slope[cell], median[cell], limit_m)
+    statistics = _ray_statistics(stack, cell, surfaces.azimuth_slope[cell], median[cell], limit_m)
     rays = SmoothRays(
         row=cell[0],
         column=cell[1],
@@ -996,19 +1021,21 @@ def _ray_statistics(
     """Compute the statistics of returns within a distance (k,) from the median range (k,).
 
     `cell` has the rows and columns (k,) of the rays. Ranges are corrected for the azimuths of
-    their pulses by the slopes (k,) of the surfaces.
+    their pulses by `azimuth_slope` (k,), as of `Surfaces`; all distances are in metres.
     """
     row, column = cell
     ranges = stack.ranges[:, row, column].astype(np.float64)
     ranges -= azimuth_slope * stack.azimuth_offsets[:, row, column].astype(np.float64)
     intensities = stack.intensities[:, row, column].astype(np.float64)
     inliers = np.abs(ranges - median) <= limit_m
-    used = inliers.sum(axis=0)
-    count = np.maximum(used, 1)
-    mean_range = np.where(inliers, ranges, 0).sum(axis=0) / count
-    mean_intensity = np.where(inliers, intensities, 0).sum(axis=0) / count
+    inlier_count = inliers.sum(axis=0)
+    divisor = np.maximum(inlier_count, 1)
+    mean_range = np.where(inliers, ranges, 0).sum(axis=0) / divisor
+    mean_intensity = np.where(inliers, intensities, 0).sum(axis=0) / divisor
     squares = np.where(inliers, (ranges - mean_range) ** 2, 0).sum(axis=0)
-    return _RayStatistics(mean_range, mean_intensity, squares / np.maximum(used - 1, 1), used)
+    return _RayStatistics(
+        mean_range, mean_intensity, squares / np.maximum(inlier_count - 1, 1), inlier_count
+    )
 
 
 def has_frontal_rays(rays: SmoothRays) -> bool:
@@ -1074,8 +1101,9 @@ def _fit_detection(
 def lost_share(rays: SmoothRays, chosen: Bools) -> Estimate | None:
     """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
 
-    A ray is known only by its returns, which therefore determine no share. The other sweeps do:
-    each return in turn is the one that makes the ray known.
+    A ray without any return is unknown, so the rays that are known lose fewer pulses than others.
+    For each return of a ray, the share is that of the other `trials - 1` pulses: the mean of
+    (trials - returns) / (trials - 1) over all returns is unbiased.
     """
     chosen = chosen & (rays.trials > 1)
     if chosen.sum() < _MIN_RAYS:
@@ -1089,8 +1117,8 @@ class ScatterFit(NamedTuple):
     """Noise of ranges and directions that was fitted to the variances of rays."""
 
     estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
-    sigma: Floats  # (k,): standard deviation of the range of each ray, metres
-    deviance: float  # of the rays; smaller is likelier
+    sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
+    deviance: float  # of the fit to all rays; a smaller deviance is likelier
 
 
 class _VarianceSamples(NamedTuple):
@@ -1098,7 +1126,7 @@ class _VarianceSamples(NamedTuple):
 
     variance: Floats  # square metres
     freedom: Ints  # degrees of freedom of the variance
-    growth: Floats  # the quantity with which noise of ranges grows
+    growth: Floats  # the quantity with which noise of ranges grows, such as the range
     slope: Floats  # metres in a radian
     distance: Floats  # metres
     patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
@@ -1108,36 +1136,39 @@ class _VarianceSamples(NamedTuple):
 class _VarianceModel:
     """Variance of ranges: noise that grows with a quantity, plus noise of directions.
 
-    The parameters are the noise of ranges at growth 0, its increase, and the noise of directions,
-    each relative to the usual variance; only `fitted` ones are passed, the others are 0.
+    The three parameters are relative to the usual variance v: for noise of ranges σ at growth 0,
+    (σ / √v) to the power `power`; the increase of that power at `growth_scale`; and the variance
+    by noise of directions at `slope_scale` over v. Methods take the parameters (p,) that `fitted`
+    marks; the others are 0.
     """
 
-    power: int  # of the growth
-    fitted: Bools  # (3,)
-    variance_scale: float  # usual variance, square metres
-    growth_scale: float
-    slope_scale: float
+    power: int  # of σ and the growth: 1 if noise adds, 2 if variances add
+    fitted: Bools  # (3,): which parameters are fitted
+    variance_scale: float  # usual variance v, square metres
+    growth_scale: float  # usual growth, in its unit
+    slope_scale: float  # usual slope, metres in a radian
 
     def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
-        """Return the variances (k,) of rays, square metres."""
+        """Return the variances (k,) of the ranges of rays, square metres."""
         theta = np.zeros(3)
         theta[self.fitted] = parameters
-        ranges = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
-        directions = theta[2] * (slope / self.slope_scale) ** 2
-        return np.asarray(self.variance_scale * (ranges ** (2 / self.power) + directions))
+        range_term = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
+        direction_term = theta[2] * (slope / self.slope_scale) ** 2
+        return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
 
     def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
-        """Return the variances (k,) of samples, square metres."""
+        """Return the variances (k,) that the model gives samples, square metres."""
         return self.variance(parameters, samples.growth, samples.slope)
 
 
-def fit_scatter(rays: SmoothRays, growth_name: str, growth: Floats, power: int) -> ScatterFit:
+def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int) -> ScatterFit:
     """Fit noise of ranges and directions to the variances of rays, by their likelihood.
 
-    Noise of ranges grows with a power of `growth` (k,), whose estimate is `growth_name`. Figures
-    that the rays do not determine, for want of different growths or inclined surfaces, are left
-    out. Intervals are of sandwich estimators, for patches of rays that may be alike, and of errors
-    of the model: edges, slopes, and growth.
+    The noise of ranges is a + b g for power 1 and √(a² + b² g²) for power 2, with the `growth` g
+    (k,); a is the figure `range_m`, and b the figure `increase_name`. Figures that the rays do not
+    determine, for want of different growths or inclined surfaces, are left out. Intervals are of
+    sandwich estimators, for patches of rays that may be alike, and of errors of the model: edges,
+    slopes, and growth.
     """
     lower, middle, upper = np.quantile(growth, (0.05, 0.5, 0.95))
     samples = _variance_samples(rays, growth)
@@ -1153,7 +1184,7 @@ def fit_scatter(rays: SmoothRays, growth_name: str, growth: Floats, power: int) 
     exponents = (1 / power, 1 / power, 0.5)
     scales = np.sqrt(model.variance_scale) / np.array([1, middle, np.radians(model.slope_scale)])
     theta, theta_variance = _fit_variances(model, samples)
-    names = ("range_m", growth_name, "angle_deg")
+    names = ("range_m", increase_name, "angle_deg")
     estimates = {
         names[k]: Estimate.from_variance(value, variance).power(exponents[k], scales[k])
         for k, value, variance in zip(
@@ -1168,9 +1199,9 @@ def fit_scatter(rays: SmoothRays, growth_name: str, growth: Floats, power: int) 
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Choose the rays whose variances are fitted, with the growth (k,) of their noise.
+    """Choose the rays whose variances are fitted; `growth` (k,) is of all rays.
 
-    Rays that lose some of their pulses are known by the nearer or brighter returns only.
+    Rays that lose many pulses are left out: only their nearer or brighter pulses return.
     """
     repeated = (rays.freedom > 0) & (rays.returns >= _MIN_RETURN_SHARE * rays.trials)
     patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
@@ -1186,7 +1217,7 @@ def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
 
 
 def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Floats, Floats]:
-    """Fit the parameters of a model (p,), and estimate their variances (p,)."""
+    """Fit the parameters of a model (p,) to samples, and estimate the variances (p,) of the fit."""
     start = np.array([1.0, 0.1, 0.1])[model.fitted]
     theta, covariance = _fit_trimmed(model, start, samples, _TAIL_CHANCE)
     # Edges that are finer than the rays make the variances of some rays larger: the change of the
@@ -1207,8 +1238,9 @@ def _fit_trimmed(
 ) -> tuple[Floats, Floats]:
     """Fit a model to variances, and estimate the covariance (p, p) of its parameters (p,).
 
-    Variances above a quantile of their distribution, which they exceed with a `chance`, are left
-    out, and the mean of the others is that of the truncated distribution.
+    Samples whose variance is above a quantile, which a share `chance` of the expected distribution
+    exceeds, are left out; the expected mean of the others is that of the truncated distribution.
+    `start` (p,) has initial parameters.
     """
     from scipy.optimize import least_squares
     from scipy.stats import chi2
@@ -1256,8 +1288,9 @@ def _sandwich(design: Floats, residuals: Floats, patch: Ints | None = None) -> F
 def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> Estimate | None:
     """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
 
-    A ray is recorded only if a pulse returned: the likelihood is that of a truncated binomial
-    distribution. None if too few rays lose some of their pulses.
+    `energy` (n,) is that of rays, which return `count` (n,) of `trials` (n,) pulses; `dropout` is
+    the share that is lost at any energy. A ray is recorded only if a pulse returns: the likelihood
+    is that of a truncated binomial distribution. None if too few rays lose some of their pulses.
     """
     from scipy.optimize import brute
     from scipy.special import ndtr
@@ -1284,8 +1317,9 @@ def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> 
 def alarm_share(stack: SweepStack) -> Estimate | None:
     """Estimate the share of pulses into the sky that return.
 
-    A pulse is a pulse into the sky if no other pulse of its ray returns, and no ray beside it
-    repeats, of three pulses or more. None with little sky, or with two sweeps.
+    A pulse counts as a pulse into the sky if no other pulse of its ray returns, and no ray in its
+    neighbourhood returns twice; rays of fewer than three pulses do not count. None with little sky,
+    or with two sweeps.
     """
     from scipy.ndimage import maximum_filter
     from scipy.stats import binomtest
@@ -1303,7 +1337,7 @@ def alarm_share(stack: SweepStack) -> Estimate | None:
 
 
 class _PlaneRays(NamedTuple):
-    """Rays on large planes that several rings cross, (n,) each."""
+    """Rays on large planes that several rings cross, (n,) each; a plane is a flat surface."""
 
     rays: Indices  # indices into the rays
     plane: Ints  # numbers of the planes
@@ -1312,10 +1346,11 @@ class _PlaneRays(NamedTuple):
 def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
     """Estimate by how much the ranges of rows differ from the mean of all: {row: metres}.
 
-    Large planes u · x = 1 and offsets b of the rows are fitted at once: 1 / r = u · d − b / r²,
-    times r². Ranges have standard deviations `error_m` (k,). A row that lies in a single plane
-    has no offset. Intervals hold noise and errors of the planes, which are not quite plane: by how
-    much offsets change without the farther points, and without each plane (jackknife; Efron, 1982).
+    Large planes u · x = 1 and offsets b of the rows are fitted at once to the ranges r of rays with
+    `directions` d (k, 3): 1 / r = u · d − b / r², times r². Ranges have standard deviations
+    `error_m` (k,), metres. A row that meets a single plane has no offset. Surfaces are not quite
+    plane: intervals hold noise, and the changes of the offsets if points far from their planes, or
+    any of the planes, are left out (jackknife; Efron, 1982).
     """
     if not len(rays.row):
         return {}
@@ -1347,10 +1382,10 @@ def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
 
 
 def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats, Floats]:
-    """Return the offsets of rows (r,) and their variances (r,), of mean 0.
+    """Return the offsets of rows (r,), whose mean is 0, and the variances (r,) of the offsets.
 
-    The unknowns of `design` (n, 3 p + r) are the normals of planes, then the offsets; `plane` (n,)
-    is the plane of each equation.
+    The unknowns of `design` (n, 3 p + r) are the vectors u of p planes, then the offsets, see
+    `ring_bias`; `plane` (n,) is the plane of each equation, and `values` (n,) the right sides.
     """
     plane_count = plane.max() + 1
     first = 3 * plane_count
@@ -1418,9 +1453,9 @@ def _segment_planes(points: Floats) -> Ints:
 def _channel_figures(
     stack: SweepStack, measured: _MeasuredRays, expected: Floats | None
 ) -> list[dict[str, Any]]:
-    """Return the noise, bias and spread of azimuths of each ring.
+    """Return the noise, bias and spread of azimuths of each ring, as dictionaries.
 
-    Bias is against the scene's ranges `expected` (r, c), or against large planes.
+    Bias is the difference from the scene's ranges `expected` (r, c), or from large planes.
     """
     rays = measured.rays
     range_variance = _range_variances(measured)
@@ -1456,7 +1491,7 @@ def _bias(
 
 
 def _root_mean(variances: Floats) -> dict[str, float] | None:
-    """Estimate the root of the mean of the finite variances; None for too few variances."""
+    """Estimate the root of the mean of finite variances (n,); None for too few variances."""
     finite = variances[np.isfinite(variances)]
     if len(finite) < _MIN_RAYS:
         return None
@@ -1464,7 +1499,7 @@ def _root_mean(variances: Floats) -> dict[str, float] | None:
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> list[dict[str, float]]:
-    """Estimate a power of the mean of values (k,) in parts of x (k,) of the same size."""
+    """Compute a curve: a power of the mean of values (k,) in parts of x (k,), of equal numbers."""
     finite = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
     order = finite[np.argsort(x[finite], kind="stable")]
     parts = np.array_split(order, min(_CURVE_POINTS, len(order) // _MIN_RAYS) or 1)

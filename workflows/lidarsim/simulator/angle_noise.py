@@ -63,7 +63,7 @@ class RippleStep(PulseStep):
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
         sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
-        # A degree of azimuth is less across a beam, the steeper the beam looks.
+        # An error of azimuth moves a beam across by the horizontal part of its unit direction.
         level = hypot(*sensor.ahead.T[:2])
         across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
         batch.deflect(np.column_stack([across, np.zeros(len(across))]))
@@ -71,7 +71,10 @@ class RippleStep(PulseStep):
 
 
 def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, Floats]:
-    """Return the random errors of beams' angles, across and up: (n,) and (n,), radians."""
+    """Return random angles of beams, across and up: (n,) and (n,), radians.
+
+    `ray` (n,) are numbers of rays in their scans, `scan` (n,).
+    """
     sigma = np.radians(noise.angle_deg)
     across = sigma * normal(noise.seed, ACROSS, scan, ray)
     up = sigma * normal(noise.seed, UP, scan, ray)
@@ -79,7 +82,7 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
 
 
 def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
-    """Return the memory of beams with a direction each, in bytes."""
+    """Return the memory of the directions of deflected beams, in bytes."""
     if setup.has_several_returns:  # then the beams are deflected batch by batch
         return Memory()
     return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

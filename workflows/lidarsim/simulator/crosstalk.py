@@ -40,16 +40,16 @@ SLACK_NS = 10.0  # error of the estimated time at which a pulse reaches the rece
 class ReceivedPulses(NamedTuple):
     """Foreign pulses that rays receive: arrays (k,)."""
 
-    row: Indices  # of the rays
+    row: Indices  # of the receiving rays
     distance: Floats  # at which the pulse appears to the receiver, metres
-    energy: Floats
+    energy: Floats  # 1 for a white surface at `REFERENCE_M`
 
 
 class _WaitingRays(NamedTuple):
-    """Rays whose receiver waits for light: arrays (n,), vectors (n, 3)."""
+    """Rays whose receiver waits for light: arrays (n,), vectors (n, 3) in the scene frame."""
 
-    fired: Floats  # nanoseconds since the start of the station
-    order: Indices  # of the firing times
+    fired: Floats  # firing times, nanoseconds since the start of the station
+    order: Indices  # rows of the rays in order of their firing times
     origins: Floats
     directions: Floats
     gate: Floats  # (2,): nanoseconds after firing between which the receiver waits
@@ -58,9 +58,9 @@ class _WaitingRays(NamedTuple):
 class _Spots(NamedTuple):
     """Points on surfaces that the pulses of a sensor light: arrays (n,)."""
 
-    time: Floats  # nanoseconds since the start of the station
-    position: Floats  # (n, 3)
-    normal: Floats  # (n, 3)
+    time: Floats  # at which the pulse lights the spot, nanoseconds since the start of the station
+    position: Floats  # (n, 3), metres, scene frame
+    normal: Floats  # (n, 3), unit vectors
     triangle: Ints32
     distance: Floats  # from the sensor, metres
 
@@ -69,8 +69,8 @@ class _Candidates(NamedTuple):
     """Spots, and consecutive rays that may see each spot: arrays (k,)."""
 
     spot: Indices
-    start: Indices  # row of the first ray in `_WaitingRays.order`
-    stop: Indices  # one past the row of the last ray
+    start: Indices  # index of the first ray in `_WaitingRays.order`
+    stop: Indices  # one past the index of the last ray
 
 
 class CrosstalkStep(PulseStep):
@@ -93,7 +93,7 @@ class CrosstalkStep(PulseStep):
         self._survey = setup.survey
         self._sensor = setup.sensor
         divergence = setup.reporting.divergence(self._sensor.optics)
-        self._cosine = sin_cos_of(divergence / 2)[1]
+        self._cosine = sin_cos_of(divergence / 2)[1]  # of half the field of view of a ray
         nm = self._sensor.optics.wavelength_nm
         self._other_sensors = [
             number
@@ -136,7 +136,8 @@ class CrosstalkStep(PulseStep):
     ) -> ReceivedPulses:
         """Return the foreign pulses that consecutive rays (n,) receive.
 
-        `rays` count from the start of a scan. Origins and directions are (n, 3).
+        `rays` are numbers counted from the first ray of scan `scan`. Origins, metres, and unit
+        directions are (n, 3), in the scene frame.
         """
         spec = self._survey.scan(scan)
         sensor = self._sensor
@@ -156,7 +157,7 @@ class CrosstalkStep(PulseStep):
     def _received_from(
         self, number: int, spec: ScanSpec, waiting: _WaitingRays, poses: CastPoses
     ) -> ReceivedPulses:
-        """Return the foreign pulses that rays receive from the sensor `number`."""
+        """Return the foreign pulses that rays receive from sensor `number` of the survey."""
         max_range_m = self._survey.carried[number].sensor.max_range_m
         reach_ns = (max_range_m + self._sensor.max_range_m) / LIGHT_M_NS
         first_ns = waiting.fired[waiting.order[0]] - reach_ns
@@ -172,7 +173,7 @@ class CrosstalkStep(PulseStep):
         return ReceivedPulses(row[visible], distance[visible], energy)
 
     def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
-        """Return the spots in the fields of view of rays while the rays wait."""
+        """Return the pairs of a ray and a spot in the ray's field of view while the ray waits."""
         from . import stray_loops  # not before: numba takes half a second to import
 
         candidates = self._candidates(waiting, spots)
@@ -283,11 +284,14 @@ class CrosstalkStep(PulseStep):
         return origins + np.repeat(positions, sensor.channels, axis=0), directions
 
     def _energy(self, spots: _Spots, spot: Indices, towards: Floats, path_m: Floats) -> Floats:
-        """Return the energies received from spots (n,), on the scale of the sensor's pulses."""
+        """Return the energies received from spots `spot` (n,), as of the receiving sensor's pulses.
+
+        `towards` (n, 3) are vectors from the receivers to the spots, of lengths `path_m` (n,).
+        """
         surfaces = self.surfaces
         triangle = spots.triangle[spot]
         cosine = np.abs(products(spots.normal[spot].T, towards.T)) / path_m
-        # The air from the other sensor to the spot, and on to the receiver.
+        # The depth of air from the other sensor to the spot, and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
         table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
@@ -297,14 +301,14 @@ class CrosstalkStep(PulseStep):
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
-    """Return the row and value of each integer of the ranges `first` to `stop` (n,): (k,) each."""
+    """Return rows (k,) and integers (k,) of all half-open ranges, `first` to `stop` (n,)."""
     counts = np.maximum(stop - first, 0)
     row = np.repeat(np.arange(len(counts)), counts)
     return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
-    """Return the firings with a beam within a span of time, nanoseconds: start and stop."""
+    """Return start and stop of firings with beams in a span, ns since the station's start."""
     firings = range(sensor.firings(steps - 1)[1])
     start_of = partial(firing_start_ns, sensor)
     slowest_ns = float(sensor.beams.time_ns.max())

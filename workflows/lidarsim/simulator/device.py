@@ -75,14 +75,14 @@ def needs_hits(scene: Scene, survey: Survey) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class DevicePoints:
-    """Columns of consecutive scans of a station, see `BatchPoints`."""
+    """Points of consecutive scans of a station: columns from the device, as of `BatchPoints`."""
 
     scene: Scene
     survey: Survey
     specs: list[ScanSpec]
-    counts: Ints  # of each scan
-    hits: Ints  # of each scan, also without a reported return
-    tally: tuple[Indices, Ints]  # triangles that were hit, and their hits
+    counts: Ints  # (scans,): number of points of each scan
+    hits: Ints  # (scans,): number of hits of each scan, reported or not
+    tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
     columns: dict[str, AnyArray]  # by name
     returns: BatchPoints | None  # on the host, if NumPy computes columns
 
@@ -99,7 +99,7 @@ class DevicePoints:
         return np.full(len(self), value, column.dtype)
 
     def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of the points `rows` (k,), to the survey's precision: (k, 3)."""
+        """Return the positions of points `rows` (k,), metres, rounded to the precision: (k, 3)."""
         if self.returns is not None:
             return self.returns.positions_of(rows)
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
@@ -107,7 +107,10 @@ class DevicePoints:
 
 
 class DeviceColumns:
-    """Casts surveys whose rays have a single return, and computes columns on the device."""
+    """Casts surveys whose rays have a single return, and computes columns on the device.
+
+    NumPy computes the columns that the device cannot compute, see the module.
+    """
 
     def __init__(
         self, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
@@ -118,27 +121,27 @@ class DeviceColumns:
         self.survey = survey
         stored = {column.name for column in survey.stored_columns}
         computable = _device_column_names(scene, survey)
-        self.all_hits = needs_hits(scene, survey)
-        if self.all_hits and scene.actors:
+        self.needs_all_hits = needs_hits(scene, survey)
+        if self.needs_all_hits and scene.actors:
             computable -= {*_ENERGIES}
         self.device_columns = [
             column for column in _DEVICE_COLUMNS if column.name in stored & computable
         ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
-        # Whether NumPy needs hits on actors.
-        self.some_hits = bool(scene.actors and self.energies)
+        # Whether NumPy computes energies of hits on actors, which the device computes of others.
+        self.needs_actor_hits = bool(scene.actors and self.energies)
         self.bodies, _ = surfaces.bodies()
         self._counters = caster.counters()
         self._surface_tables: tuple[Any, ...] | None = None
         self._rotations: Any = None
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
-        """Return columns of moved instances; unchanged tables stay on the device."""
-        maker = copy(self)
-        maker._scene = scene
-        maker._surfaces = surfaces
-        maker._rotations = None
-        return maker
+        """Return a copy for a scene with moved instances; unchanged tables stay on the device."""
+        moved_columns = copy(self)
+        moved_columns._scene = scene
+        moved_columns._surfaces = surfaces
+        moved_columns._rotations = None
+        return moved_columns
 
     def returns(
         self,
@@ -150,8 +153,8 @@ class DeviceColumns:
     ) -> DevicePoints:
         """Cast consecutive scans of a station, and compute their columns.
 
-        `window` are the first ray in the pattern and one past the last; `groups` are the first
-        rays of the scans.
+        `window` has the first ray in `pattern` and the ray after the last; `groups` (scans,) has
+        the first ray of each scan, counted from the first ray of the window.
         """
         survey = self.survey
         sensor = survey.carried[specs[0].sensor].sensor
@@ -167,7 +170,7 @@ class DeviceColumns:
             tally=True,
         )
         actor_hits = self._caster.on_actors(scan, poses) if poses.actor_trajectories else None
-        if actor_hits is not None:  # numbered within the body of all actors
+        if actor_hits is not None:  # the last body is all actors: its triangles count from 0
             actor_hits = replace(
                 actor_hits, triangle=actor_hits.triangle - np.int32(self.bodies[-1, 0])
             )
@@ -188,9 +191,9 @@ class DeviceColumns:
             start=window[0],
             poses=poses,
         )
-        if self.some_hits:
+        if self.needs_actor_hits:
             for column in self.energies:
-                columns[column.name][transfer.rows] = column.make(returns)
+                columns[column.name][transfer.actor_rows] = column.make(returns)
         return DevicePoints(
             self._scene,
             survey,
@@ -199,7 +202,7 @@ class DeviceColumns:
             hits,
             tally,
             columns,
-            returns if self.all_hits else None,
+            returns if self.needs_all_hits else None,
         )
 
     def tables(self, cupy: Any) -> tuple[Any, ...]:
@@ -223,7 +226,11 @@ class DeviceColumns:
 
 
 class _ColumnTransfer:
-    """Computes columns of a batch on the device, and sends the values to the host."""
+    """Computes columns of a batch on the device, and sends the values to the host.
+
+    `maker` names the columns and has the tables of surfaces. The caster passes the hits of the
+    batch to `make` in parts; `finish` returns the columns of all hits.
+    """
 
     def __init__(
         self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, max_points: int
@@ -232,30 +239,31 @@ class _ColumnTransfer:
         self._specs = specs
         self._groups = groups
         self._max_points = max_points
-        self._transfer: _Transfer | None = None
+        self._buffers: _TransferBuffers | None = None
         self._count = 0
-        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]  # rows, and types as `_HITS`
+        # Rows, rays, distances and triangles of the hits on actors, of each call of `make`.
+        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]
 
     def make(self, hits: DeviceHits) -> None:
-        """Compute the columns of hits, and send the values to the host."""
+        """Compute the columns of the next hits, in ray order, and send the values to the host."""
         if not len(hits):
             return
-        transfer = self._transfer = self._transfer or self._start(hits.cupy)
-        device_arrays = self._compute(hits, transfer)
+        buffers = self._buffers = self._buffers or self._start(hits.cupy)
+        device_arrays = self._compute(hits, buffers)
         rows = slice(self._count, self._count + len(hits))
-        pairs = [(device_arrays[column], host[rows]) for column, host in transfer.columns.items()]
+        pairs = [(device_arrays[column], host[rows]) for column, host in buffers.columns.items()]
         hit_arrays = hits.ray, hits.distance, device_arrays[_TRIANGLE]
         pairs += [
-            (array, host[rows]) for array, host in zip(hit_arrays, transfer.hits, strict=False)
+            (array, host[rows]) for array, host in zip(hit_arrays, buffers.hits, strict=False)
         ]
-        transfer.outbox.send(pairs)
-        if self._maker.some_hits:
+        buffers.outbox.send(pairs)
+        if self._maker.needs_actor_hits:
             self._on_actors.append(self._actor_hits(hits))
         self._count += len(hits)
 
-    def _compute(self, hits: DeviceHits, transfer: _Transfer) -> dict[Column, Any]:
+    def _compute(self, hits: DeviceHits, buffers: _TransferBuffers) -> dict[Column, Any]:
         """Compute columns of hits on the device; unneeded columns have a single element."""
-        computed = {*transfer.columns, *([_TRIANGLE] if transfer.hits else [])}
+        computed = {*buffers.columns, *([_TRIANGLE] if buffers.hits else [])}
         arrays = {
             column: hits.cupy.empty(len(hits) if column in computed else 1, column.dtype)
             for column in _DEVICE_COLUMNS
@@ -269,10 +277,10 @@ class _ColumnTransfer:
             *hits.rays(),
             np.int64(len(hits)),
             np.int32(flags),
-            *transfer.kernel_arguments,
+            *buffers.kernel_arguments,
             *arrays.values(),
         )
-        transfer.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
+        buffers.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
         return arrays
 
     def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
@@ -289,38 +297,40 @@ class _ColumnTransfer:
         return self._count + rows, ray, distance, triangle
 
     @property
-    def rows(self) -> Ints:
-        """Rows of the hits on actors."""
+    def actor_rows(self) -> Ints:
+        """Rows of the hits on actors among all hits of the batch."""
         return np.concatenate([rows for rows, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for all columns; return arrays by name, and the hits for NumPy, as `_HITS`."""
-        if self._transfer is None:
+        """Wait for the values; return {column name: values}, and the hits for NumPy, as `_HITS`."""
+        if self._buffers is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
-        self._transfer.outbox.wait()
+        self._buffers.outbox.wait()
         # Page-locked memory has room for hits of all rays: after few hits, it is given back.
         copies = 2 * self._count < self._max_points
 
         def filled(host: AnyArray) -> AnyArray:
             return host[: self._count].copy() if copies else host[: self._count]
 
-        columns = {column.name: filled(host) for column, host in self._transfer.columns.items()}
-        if self._transfer.hits:
-            return columns, tuple(map(filled, self._transfer.hits))
+        columns = {column.name: filled(host) for column, host in self._buffers.columns.items()}
+        if self._buffers.hits:
+            return columns, tuple(map(filled, self._buffers.hits))
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
-    def _start(self, cupy: Any) -> _Transfer:
-        """Send the arguments of the kernel that are the same for all hits."""
+    def _start(self, cupy: Any) -> _TransferBuffers:
+        """Allocate host arrays, and send the kernel's arguments that are the same for all hits."""
         maker = self._maker
         kernel_arguments = self._kernel_arguments(cupy)
         outbox = Outbox(cupy)
         columns = {
             column: outbox.room(self._max_points, column.dtype) for column in maker.device_columns
         }
-        hits = [outbox.room(self._max_points, kind) for kind in _HITS] if maker.all_hits else []
+        hits = (
+            [outbox.room(self._max_points, kind) for kind in _HITS] if maker.needs_all_hits else []
+        )
         kernel = _kernel(cupy, cupy.cuda.Device().id)
-        return _Transfer(kernel, kernel_arguments, outbox, columns, hits)
+        return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)
 
     def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
         """Return the arguments of the kernel between hits and columns, arrays on the device."""
@@ -351,14 +361,14 @@ class _ColumnTransfer:
 
 
 @dataclass(frozen=True, eq=False)
-class _Transfer:
-    """Kernel and arrays of a batch that has hits."""
+class _TransferBuffers:
+    """Kernel of a batch with hits, and page-locked host arrays that receive the values."""
 
     kernel: Any
     kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
-    columns: dict[Column, AnyArray]  # on the host, page-locked
-    hits: list[AnyArray]  # as `_HITS`, page-locked, if NumPy needs all hits
+    columns: dict[Column, AnyArray]  # with room for all rays
+    hits: list[AnyArray]  # as `_HITS`; empty unless NumPy needs all hits
 
 
 @lru_cache(maxsize=16)

@@ -25,7 +25,8 @@ def range_rates_of_origins(
 ) -> Floats:
     """Return the growth of the ranges of static points by the motion of the carrier, m/s: (n,).
 
-    Origins and unit directions of the rays are (n, 3), in the scene frame.
+    `ray` (n,) are numbers of rays in the order of `poses`. Origins and unit directions of the rays
+    are (n, 3), in the scene frame.
     """
     rates = np.zeros(len(ray))
     if poses.carrier is None:
@@ -47,10 +48,12 @@ def radial_velocities(
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the radial velocities of straight rays (n,) that end on triangles, m/s: (n,).
+    """Return the radial velocities, growth of length, of rays (n,) to triangles, m/s: (n,).
 
     Parameters
     ----------
+    ray
+        (n,): numbers of the rays in the order of `poses`.
     rays
         Origins and unit directions of the rays, (n, 3) each, in the scene frame.
     distance
@@ -78,7 +81,7 @@ def velocities_of_ends(
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the velocities of the surfaces at the ends of rays (n,), m/s: (n, 3).
+    """Return the velocities of actors' surfaces at the ends of rays, scene frame, m/s: (n, 3).
 
     `rays` are origins and unit directions (n, 3) in the scene frame; `distance` (n,) is in metres,
     `times` (n,) are firing times in nanoseconds since the survey's start.

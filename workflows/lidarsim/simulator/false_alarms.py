@@ -23,9 +23,9 @@ PEAK = Purpose(21, "energy of a false alarm")
 class FalseAlarms(NamedTuple):
     """False alarms of rays: arrays (k,)."""
 
-    row: Indices  # of the rays
+    row: Indices  # of the rays of the alarms
     time_s: Floats  # since the receiver opened, seconds
-    energy: Floats
+    energy: Floats  # on the scale of `Noise.threshold`
 
 
 class FalseAlarmStep(PulseStep):
@@ -84,7 +84,7 @@ def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> 
         rows = rows[in_gate]
         since_s = since_s[in_gate] - log(uniform_numbers[in_gate]) / noise.false_alarm_hz
         since_s = np.minimum(since_s, gate_s)
-        share = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
-        peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(share))
+        complement = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
+        peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(complement))
         alarms.append(FalseAlarms(rows, since_s, noise.threshold * peak))
     return FalseAlarms(*map(np.concatenate, zip(*alarms, strict=True)))

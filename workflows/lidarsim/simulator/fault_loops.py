@@ -11,8 +11,9 @@ from raybeam.compiled import compiled
 def remaining(ray, times, spans, firing, channel, rows):
     """Write the rows of returns that no fault takes; return the number of rows.
 
-    Rays (n,) are in order, and have firing times (n,). Each fault acts in a span of times, `spans`
-    (f, 2), and takes the returns of masks of firings, (f, firings), and channels, (f, channels).
+    Rays `ray` (n,), in order, have firing times `times` (n,), nanoseconds. Each of f faults acts in
+    a half-open span of times, `spans` (f, 2), and takes returns by masks of firings (f, firings)
+    and channels (f, channels).
     """
     channels = channel.shape[1]
     count = 0

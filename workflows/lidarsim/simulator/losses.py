@@ -29,7 +29,7 @@ class DirtStep(PulseStep):
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits with the energies behind the dirty window."""
+        """Return hits with the energies behind the dirty window; replace the hits of the batch."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))
@@ -49,7 +49,7 @@ class DirtStep(PulseStep):
 
 
 def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
-    """Return whether directions x, y, z (n,) pass the dirt of a fault: (n,)."""
+    """Return whether unit directions x, y, z (n,), sensor frame, pass a fault's dirt: (n,)."""
     begin, end = fault.azimuth_deg or (0, 360)
     half = ((end - begin) % 360 or 360) / 2
     lowest, highest = fault.elevation_deg or (-90, 90)
@@ -80,8 +80,9 @@ class LossStep(PulseStep):
         firings = batch.firings
         spec = batch.firings.spec
         seed = self.setup.noise.seed
-        repeated, current = spec.repeats or (spec.ahead, 0)
-        if spec.ahead != repeated - current:  # the sweep that is repeated lacks this scan
+        # First scans of the sweep that a frozen sensor sends again, and of the sweep it replaces.
+        first_sent_again, first_replaced = spec.repeats or (spec.ahead, 0)
+        if spec.ahead != first_sent_again - first_replaced:  # the sweep sent again has no such scan
             return returns.take(np.zeros(0, np.intp))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)

@@ -47,7 +47,7 @@ JOINED = 1
 # Descriptions, poses and small arrays.
 SCAN = 500
 STATION = 6000
-TRIANGLE = 16  # counts of hits, twice
+HIT_COUNTER = 16  # of a hit counter (`Scene.counters`): two counts
 
 # Bytes of a rig, measured on Linux.
 SCENE_TRIANGLE = 80  # of a triangle, in every process that knows the scene
@@ -90,11 +90,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
     on_device = on_device and not any(map(steps_of, setups))
     peak = max(_bytes(setup, scans, on_device) for setup in setups)
-    return int(peak) + TRIANGLE * scene.counters
+    return int(peak) + HIT_COUNTER * scene.counters
 
 
 def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
-    """Estimate the memory of scans of a sensor, in bytes, without counts of hits."""
+    """Estimate the peak memory of scans of one sensor, in bytes, without hit counters."""
     survey = setup.survey
     sensor = setup.sensor
     first, stop = sensor.firings(0)
@@ -114,7 +114,8 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
 def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -> Memory:
     """Estimate the memory of rays, poses and steps.
 
-    `casting` is the memory of rays and poses, `counting` the peak of the steps beside it.
+    `retained` is the memory until columns are made, `casting` the memory of rays and poses while
+    rays are cast, and `counting` the largest memory of the steps in addition.
     """
     scene = setup.scene
     survey = setup.survey
@@ -142,7 +143,7 @@ def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -
 
 
 def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
-    """Estimate the memory of a point while columns are computed, in bytes."""
+    """Estimate the memory of one reported return while columns are computed, in bytes."""
     survey = setup.survey
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     if on_device and not needs_hits(setup.scene, survey):
@@ -173,7 +174,7 @@ def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: boo
     The number may exceed the scans of a small survey. The memory is estimated by `cast_bytes`,
     without counts of hits, which are the same for any number of scans.
     """
-    limit += TRIANGLE * scene.counters
+    limit += HIT_COUNTER * scene.counters
     memory_of = partial(cast_bytes, scene, survey, on_device=on_device)
     if (survey_bytes := memory_of(survey.scan_count)) <= limit:
         return int(survey.scan_count * limit / survey_bytes)

@@ -53,7 +53,9 @@ def noisy_ranges(
 ) -> Floats:
     """Return the reported ranges of returns (n,), metres, at least 0.
 
-    The energies are needed where noise or walk depend on them.
+    `distance` (n,) is in metres; `energy` (n,) is the energy, or the height of the return in a
+    waveform, and may be None if neither noise nor walk depends on it. `scan`, `ray` and `number`
+    (n,) count scans, rays in the scan, and returns of the ray.
     """
     sigma = noise.range_m + noise.range_per_m * distance
     if noise.range_at_threshold_m and energy is not None:
@@ -77,7 +79,7 @@ def range_walk(noise: Noise, energy: Floats) -> Floats:
 
 
 def lasting_errors(noise: Noise, channel: Integers, times_ns: Ints) -> Floats:
-    """Return errors of range that last: of channels (n,) at times since the start, metres."""
+    """Return lasting errors of range by channels (n,) and times since the survey's start, m."""
     biases = np.asarray(noise.channel_bias_m, np.float64)
     if not biases.ndim:
         channels = np.arange(channel.max(initial=0) + 1)

@@ -26,12 +26,12 @@ class Windows(NamedTuple):
     """Windows of consecutive samples of waveforms: arrays (n,)."""
 
     beam: Ints  # counted from the first beam of the batch
-    begin: Ints  # first sample, counted from firing
+    begin: Ints  # first sample, counted in samples from the firing
     first_hit: Ints  # row of the first hit of the beam
     stop_hit: Ints  # one past the row of the last hit of the beam
 
     def take(self, rows: slice) -> Windows:
-        """Return the windows of a slice."""
+        """Return the windows of a slice of rows."""
         return Windows(*(column[rows] for column in self))
 
 
@@ -51,7 +51,7 @@ class RecordingStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of a block of samples, and of the records, in bytes."""
+        """Return the memory of a block of samples, and of all records, in bytes."""
         recorded = record(setup.waveform_samples).itemsize * sizes.returns
         sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
@@ -59,9 +59,9 @@ class RecordingStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns with their recorded waveforms.
 
-        A window starts where the signal of its first return does. Later returns of the pulse share
-        the window while their signals stop within. Overlapping windows of a pulse hold the same
-        samples.
+        A window starts where the signal of the window's first return starts. Later returns of the
+        pulse share the window if their signals stop within it. Overlapping windows of a pulse hold
+        the same samples.
         """
         digitizer = Digitizer.for_sensor(self.setup)
         count = self.setup.waveform_samples
@@ -73,7 +73,7 @@ class RecordingStep(PulseStep):
         size = max(1, BLOCK_SAMPLES // samples_per_window)
         for start in range(0, len(windows.beam), size):
             block = windows.take(slice(start, start + size))
-            samples = _sampled(batch, digitizer, block, count)
+            samples = _signal_samples(batch, digitizer, block, count)
             steps, exponents = digitised(self._received(samples, block, batch))
             first, stop = np.searchsorted(window_of_return, [start, start + size])
             rows = window_of_return[first:stop] - start
@@ -94,17 +94,18 @@ class RecordingStep(PulseStep):
         return np.minimum(samples, noise.full)
 
 
-def _window_starts(distance: Floats, pulse_row: Ints, digitizer: Digitizer, count: int) -> Ints:
+def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, count: int) -> Ints:
     """Return the first sample of the window of each return (n,), in samples after firing.
 
-    `pulse_row` numbers the returns of a pulse; windows have `count` samples.
+    `distance` (n,) is in metres, `return_number` (n,) counts the returns of each pulse from 0;
+    windows have `count` samples. Returns that share a window have the same first sample.
     """
     time = distance * digitizer.samples_per_m
     first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
     last = np.ceil(time).astype(np.int64) + digitizer.reach
     begin = first.copy()
-    for number in range(1, int(pulse_row.max(initial=0)) + 1):
-        rows = np.flatnonzero(pulse_row == number)
+    for number in range(1, int(return_number.max(initial=0)) + 1):
+        rows = np.flatnonzero(return_number == number)
         shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
         begin[rows] = np.where(shared, begin[rows - 1], first[rows])
     return begin
@@ -113,10 +114,10 @@ def _window_starts(distance: Floats, pulse_row: Ints, digitizer: Digitizer, coun
 def _windows(
     returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
 ) -> tuple[Windows, Ints]:
-    """Return the windows of returns, of `count` samples each, and the window of each return."""
-    pulse_row = numbers(returns.ray)
-    begin = _window_starts(returns.distance, pulse_row, digitizer, count)
-    starts_window = (pulse_row == 0) | (np.diff(begin, prepend=-1) != 0)
+    """Return windows of `count` samples, and the row of each return's window: (n,)."""
+    return_number = numbers(returns.ray)
+    begin = _window_starts(returns.distance, return_number, digitizer, count)
+    starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
     beam = returns.ray[starts_window] - batch.start
     ray = required(batch.hits).ray
     first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
@@ -125,8 +126,10 @@ def _windows(
     return windows, np.cumsum(starts_window) - 1
 
 
-def _sampled(batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int) -> Floats:
-    """Return the samples of the signals of hits in windows, without noise: (windows, count)."""
+def _signal_samples(
+    batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int
+) -> Floats:
+    """Return samples of all hits' signals, summed, in windows, without noise: (windows, count)."""
     hits = required(batch.hits)
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)

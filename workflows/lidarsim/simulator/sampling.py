@@ -20,8 +20,10 @@ from ..sensor.weather import Weather
 from .rig import Rig
 
 SAMPLE_RAYS = 500_000  # largest number of rays that are cast
-SAMPLE_PARTS = 500  # largest number of parts of a survey that are sampled
-SAMPLE_SCANS = 40  # consecutive scans of a part
+SAMPLE_SECTIONS = (
+    500  # largest number of sections of a survey, of consecutive scans, that are sampled
+)
+SECTION_SCANS = 40  # largest number of consecutive scans of a section
 RANGE_RAYS = 20_000  # largest number of rays that `sample_ranges` casts
 GOLDEN = 0.6180339887498949  # the golden ratio less 1
 
@@ -29,8 +31,9 @@ GOLDEN = 0.6180339887498949  # the golden ratio less 1
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
     """Estimate hits and points of a survey by casting a sample of its rays.
 
-    The rays are spread evenly over all scans; of many thousand scans, over scans of each part. Few
-    rays are all cast. The result has the number of rays that were cast, of hits and of points.
+    The rays are spread evenly over all scans, or over evenly spread sections of many thousand
+    scans. All rays of a small survey are cast. The result has the numbers of `rays` that were cast,
+    and of `hits` and `points` of the whole survey.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count))
     subrays = max(returns.subrays for returns in survey.returns_each)
@@ -46,7 +49,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
         noise = replace(survey.noise, **without_channels)
         sampled = replace(survey, sensors=carried, noise=noise, faults=())
     cast_rays = 0
-    sampled_rays = 0  # of which the cast rays are the sample
+    sampled_rays = 0  # rays of the survey that the cast rays represent
     hits = 0
     points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
@@ -63,8 +66,8 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
     """Return the distances from sampled rays of a survey to the nearest surfaces, metres: (n,).
 
-    Sensors have no limits of range, noise, faults and weather. Rays that meet no surface are left
-    out. `scans` are the scans of the survey that are sampled, by default all.
+    Sensors have neither limits of range nor noise, faults or weather. Rays that meet no surface are
+    left out. `scans` are the scans of the survey that are sampled, by default all.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count) if scans is None else scans)
     rays = survey.ray_count * int((stops - firsts).sum()) // survey.scan_count
@@ -96,16 +99,16 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
-    """Return the start and stop scans of the sampled parts of a survey."""
-    # A part spans at most two stations, which are cast separately.
-    scans_per_part = max(1, min(*survey.steps_each, SAMPLE_SCANS))
-    parts = even_indices(-(-len(scans) // scans_per_part), SAMPLE_PARTS)
-    firsts = scans.start + scans_per_part * parts
-    return firsts, np.minimum(firsts + scans_per_part, scans.stop)
+    """Return the first scans and stops (m,) of evenly spread sections of `scans`."""
+    # A section spans at most two stations, which are cast separately.
+    scans_per_section = max(1, min(*survey.steps_each, SECTION_SCANS))
+    sections = even_indices(-(-len(scans) // scans_per_section), SAMPLE_SECTIONS)
+    firsts = scans.start + scans_per_section * sections
+    return firsts, np.minimum(firsts + scans_per_section, scans.stop)
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return the sensors of a survey with a share 1 / `every` of their rays."""
+    """Return the sensors of a survey, each replaced by a sample of 1 / `every` of its rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
         for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
@@ -113,17 +116,17 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast parts of a survey, and yield their batches."""
+    """Cast sections of a survey, from first scans to stops (m,), and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 
 
 class _SampledRays(NamedTuple):
-    """Rays of a sensor: (k,) each."""
+    """Rays (k,) of a sensor that were chosen for a sample."""
 
     firings: Ints  # (f,): the firings of the rays, each once
-    row: Ints  # of the ray's firing in `firings`
-    channel: Ints
+    row: Ints  # (k,): index in `firings` of each ray's firing
+    channel: Ints  # (k,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,14 +162,14 @@ class _FewRays(Sensor):
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the rays of the sensor that firings sample."""
+        """Return the rays of the sensor for firings (k,) of this sample, one ray each."""
         # Steps of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)
         return _SampledRays(*np.unique(fired, return_inverse=True), channel)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the directions of sampled rays, (k, 1, 3)."""
+        """Return the directions of sampled rays, (k, 1, 3), in the frame of the sensor."""
         rays = self._rays(firings)
         return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 
@@ -177,6 +180,6 @@ class _FewRays(Sensor):
         return None if origins is None else origins[rays.row, rays.channel, None]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the firing times of sampled rays, (k,), nanoseconds."""
+        """Return the times of the first beam in the firings of sampled rays, (k,), nanoseconds."""
         rays = self._rays(firings)
         return self.sampled.begins_ns(rays.firings)[rays.row] + self.sampled.lead_ns

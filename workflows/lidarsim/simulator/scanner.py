@@ -142,7 +142,7 @@ class Scanner:
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
-        """Build the rig; `options` are arguments of `Rig`."""
+        """Check the backend and build the rig; `options` are arguments of `Rig`."""
         check_backend_here(options["backend"])
         try:
             self._rig = Rig(scene, survey, **options)
@@ -159,7 +159,7 @@ class Scanner:
         self._lock = threading.Condition()
         self._casts = 0  # sweeps under way
         self._moves = 0  # moves of instances under way or waiting
-        self._unnumbered = 0  # sweeps and images without a number so far
+        self._unnumbered = 0  # sweeps and images that were scanned without a `number` so far
 
     def __getstate__(self) -> dict[str, Any]:
         with self._lock:
@@ -332,7 +332,7 @@ class Scanner:
             self._rig = self._rig.with_actors(tuple(self._actors))
 
     def _move_instance(self, number: int, pose: Pose) -> None:
-        """Move an instance after the sweeps under way; new sweeps wait meanwhile."""
+        """Wait for the sweeps under way and move an instance, by object number; new sweeps wait."""
         with self._lock:
             self._moves += 1  # new sweeps wait
             try:
@@ -345,12 +345,14 @@ class Scanner:
     def _specs(
         self, rig: Rig, number: int | None, start_s: float | None, count: int
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of a revolution, and its delay relative to a survey, nanoseconds.
+        """Return the scans of a revolution, and the delay of its start, nanoseconds.
 
-        Without a `number`, `count` sweeps are counted, each with new random numbers.
+        The delay is `start_s` less the start of revolution `number` in a survey, 0 without a
+        `start_s`. Without a `number`, the scans are those of revolution 0 with the random numbers
+        of later revolutions, and `count` revolutions of random numbers are used up.
         """
         sensor = rig.survey.sensor
-        ahead = 0
+        ahead = 0  # scans by which random numbers are ahead, see `ScanSpec`
         steps = sensor.steps_of_revolution(number or 0)
         if steps.stop > MAX_SCANS:
             raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
@@ -385,7 +387,7 @@ class Scanner:
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
-    """Return the start times of the first and the last firing of scans, nanoseconds."""
+    """Return the times of the first beams of the first and last firings, ns since time 0."""
     sensor = rig.survey.sensor
     first_and_last = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
     begin, end = (sensor.begins_ns(first_and_last) + (sensor.lead_ns + specs[0].start_ns)).tolist()
@@ -393,7 +395,7 @@ def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
 
 
 def _trajectory_of(pose: Any) -> Trajectory:
-    """Return a trajectory as is, or the trajectory of a static pose."""
+    """Return a trajectory unchanged, or the trajectory that stays at a pose."""
     path: Trajectory = pose if hasattr(pose, "poses") else Stations((pose_of("pose", pose),))
     return path
 
