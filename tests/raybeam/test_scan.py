@@ -99,9 +99,11 @@ def hits_of(caster, origins, directions, *limits):
     """What `cast` finds of rays, as a scan gives it."""
     if len(directions) and np.abs((directions**2).sum(axis=1) - 1).max() > 1e-14:
         # Those that drift: not quite of unit length, which `cast` would make them.
-        rays = Rays(origins, directions, *(limits or (0.0, np.inf)))
-        ray, distance, triangle, _ = caster.engine.nearest(rays)
-        return SimpleNamespace(ray=ray, distance=distance, triangle=triangle)
+        found = caster.engine.closest(Rays(origins, directions, *(limits or (0.0, np.inf))))
+        ray = found.ray.astype(np.uint32)
+        # The scale is private: it is about the engines' arithmetic, and hits come in metres.
+        distance = found.t / caster._scene.frame.scale
+        return SimpleNamespace(ray=ray, distance=distance, triangle=found.triangle)
     hits = caster.cast(origins, directions, *limits)
     ray = np.flatnonzero(hits.hit).astype(np.uint32)
     return SimpleNamespace(ray=ray, distance=hits.distance[ray], triangle=hits.triangle[ray])
