@@ -276,7 +276,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     second = np.diff(ray, prepend=-1) == 0
     triangle = np.where((what[ray] == 1) | second, 0, 2).astype(np.int32)
     hits = PulseReturns(ray, place[ray] + second, triangle, np.ones(len(ray)))
-    found = caster.sampled(hits, (FIRST, FIRST + count), KEYS, each)
+    found = caster.sample_air_hits(hits, (FIRST, FIRST + count), KEYS, each)
     air = survey.air(0)
     cloud = caster._fog
     expected = []
@@ -284,7 +284,9 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
         own = reach[pulse].tolist()
         key = key_of(FIRST + pulse)
         drawn = []
-        for number, (kind, seen) in enumerate(zip(survey.particles, caster._kinds, strict=True)):
+        for number, (kind, seen) in enumerate(
+            zip(survey.particles, caster._detectable_kinds, strict=True)
+        ):
             given = noise.threshold, named_seed(9, "kind 1" if number else ""), key, own
             drawn += twin.particles(kind, air, *given, (seen.counts, seen.by_range[0]))
         if cloud is not None:

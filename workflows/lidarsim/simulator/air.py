@@ -48,9 +48,10 @@ PARTICLE_RANGE = Purpose(13, "range of a particle")
 PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
 AIR = CAUSES.index("air")
-QUANTILES = 1 << 16
+QUANTILES = 1 << 16  # equal shares of a distribution, in tables
 CACHED_TABLES = 32  # as a scanner builds its casters again whenever an object is moved
-MAX_FOG_CELLS = 255  # pulse lengths of fog
+MAX_FOG_CELLS = 255  # cells of half a pulse's length
+# Standard deviations below and above the highest signal, up to which probabilities are summed.
 TAIL_SIGMAS = 6.0
 
 
@@ -58,9 +59,9 @@ class DetectableParticles(NamedTuple):
     """Distribution of the particles of a kind that may be detected."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # By range, (5, QUANTILES): distances that divide the particles into equal shares, metres;
-    # smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest)); energies
-    # of a particle of 1 mm; and energies of a particle that fills the beam.
+    # (5, QUANTILES), a column for each equal share of the particles by range: ascending distances,
+    # metres; smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest));
+    # energies of a particle of 1 mm; and energies of a particle that fills the beam.
     by_range: Floats
     step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
 
@@ -105,14 +106,15 @@ class WeatherStep(PulseStep):
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
         min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
-        self._kinds = [
+        # For each kind of particles; None where no particle can be detected.
+        self._detectable_kinds = [
             _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
         ]
-        names = [f"kind {kind}" if kind else "" for kind in range(len(self._kinds))]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self._detectable_kinds))]
         self._seeds = [named_seed(noise.seed, name) for name in names]
-        scatters = survey.backscatter_at(self._wavelength_nm)
+        backscatter = survey.backscatter_at(self._wavelength_nm)
         self._fog = _fog_cells(
-            air, scatters, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
+            air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
     @staticmethod
@@ -123,8 +125,8 @@ class WeatherStep(PulseStep):
     @staticmethod
     def added(setup: Setup) -> float:
         """Return the mean number of returns of particles and fog in a pulse."""
-        scatters = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
-        return setup.survey.mean_particles(setup.number) + bool(scatters)
+        backscatter = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
+        return setup.survey.mean_particles(setup.number) + bool(backscatter)
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
@@ -132,22 +134,23 @@ class WeatherStep(PulseStep):
         return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch after hits in the air are sampled."""
-        air_hits = self.sampled(
+        """Return the hits of a batch after hits in the air are sampled, see `add_air_hits`."""
+        air_hits = self.sample_air_hits(
             returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
         )
         if air_hits is None:
             return returns
         return add_air_hits(self.setup, returns, batch, air_hits)
 
-    def sampled(
+    def sample_air_hits(
         self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, subrays: int
     ) -> PulseReturns | None:
-        """Sample the hits in the air before surfaces, of `beams` from a first to before a last.
+        """Sample the hits in the air before surfaces, of particles and of fog.
 
-        `hits` are the beams' hits on surfaces; each beam has `subrays` sub-rays. The hits in the
-        air are in the order of rays, which are numbered from the first beam's first ray. Returns
-        None if neither particles nor fog can be detected.
+        `beams` are the numbers of the first beam, and one past the last, as in `keys`. `hits` are
+        the hits of these beams on surfaces; each beam has `subrays` sub-rays. Hits in the air are
+        in the order of rays: sub-rays, numbered from the first of the first beam. Returns None if
+        neither particles nor fog can be detected.
         """
         first, stop = beams
         count = (stop - first) * subrays
@@ -155,25 +158,28 @@ class WeatherStep(PulseStep):
             self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
         )
         parts: list[SampledHits] = []
-        for kind, seed in zip(self._kinds, self._seeds, strict=True):
+        for kind, seed in zip(self._detectable_kinds, self._seeds, strict=True):
             if kind is not None:
                 random = random_keys(seed, self.purposes[2:], keys, first)
                 parts += _particles(kind, random, subrays, reach)
         if self._fog is not None:
             random = random_keys(self._seed, self.purposes[:2], keys, first)
-            parts.append(_fog_hits(self._fog, random, subrays, self._clouded(hits, reach)))
+            parts.append(_fog_hits(self._fog, random, subrays, self._fog_ends(hits, reach)))
         if not parts:
             return None
         ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
         air_hits = returns_without_surface(hits, ray, distance, energy, AIR)
         if len(self._refracting(hits)):
-            air_hits = air_hits.take(~self._within(hits, ray, distance))
+            air_hits = air_hits.take(~self._in_refracting_bodies(hits, ray, distance))
         if parts[1:] or subrays > 1:
             air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
         return air_hits
 
     def _refracting(self, hits: PulseReturns) -> Indices:
-        """Return rows of hits that refract light; of each ray the first, third, … are entries."""
+        """Return rows of hits on surfaces of water and glass with a refractive index.
+
+        Of each ray, the first, third, … such hits enter a body, the others leave it.
+        """
         refracts = self.surfaces.at_wavelength(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
@@ -182,8 +188,8 @@ class WeatherStep(PulseStep):
             refracting if hits.cause is None else refracting & (hits.cause == SURFACE)
         )
 
-    def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether points on rays are in water or glass, where no particles fall: (n,)."""
+    def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Return whether points at distances on rays (n,) are in water or glass: (n,)."""
         rows = self._refracting(hits)
         surface_ray = hits.ray[rows]
         surface_distance = hits.distance[rows]
@@ -195,8 +201,12 @@ class WeatherStep(PulseStep):
             count[present] += surface_distance[first[present] + number] < distance[present]
         return np.asarray(count % 2 == 1)
 
-    def _clouded(self, hits: PulseReturns, reach: Floats) -> Floats:
-        """Return the ranges at which fog ends, (rays,): surfaces, water, glass, but not panes."""
+    def _fog_ends(self, hits: PulseReturns, reach: Floats) -> Floats:
+        """Return the ranges at which the fog before each sub-ray ends, (rays,), metres.
+
+        Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half of
+        the pulse's length: panes of glass do not end fog.
+        """
         rows = self._refracting(hits)
         if not len(rows):
             return reach
@@ -216,7 +226,11 @@ class WeatherStep(PulseStep):
 def light_reach(
     materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
 ) -> Floats:
-    """Return ranges that the light of sub-rays reaches, (count,), metres; inf without an end."""
+    """Return ranges that the light of `count` sub-rays reaches, (count,), metres.
+
+    The range is that of the last hit of a sub-ray on a surface; inf without a hit, or if the last
+    surface lets light pass. `hits.ray` are sub-rays, from 0.
+    """
     ray = hits.ray
     end_distance = hits.distance
     transmits = materials.passes
@@ -240,7 +254,8 @@ def add_air_hits(
     receives the hits in the air, for `SeparationStep`.
     """
     if returns.velocity is not None:  # the air is at rest
-        rays = batch.subray_poses.rays(batch.beams, air_hits.ray, batch.window[0])
+        first_subray = batch.window[0]  # of the batch, in `batch.beams`
+        rays = batch.subray_poses.rays(batch.beams, air_hits.ray, first_subray)
         air_hits = air_hits._replace(
             velocity=range_rates_of_origins(batch.subray_poses, air_hits.ray, *rays)
         )
@@ -269,22 +284,27 @@ def room_for_hits(size: int) -> SampledHits:
 
 
 def _particles(
-    kind: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
+    detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind, on sub-rays with ranges `reach` (rays,), metres."""
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), metres."""
     from . import air_loops  # not before: numba takes half a second to import
 
     beams = len(reach) // subrays
-    tables = air_loops.ParticleTables(kind.counts, kind.by_range, kind.step_mm, exponential())
+    tables = air_loops.ParticleTables(
+        detectable.counts, detectable.by_range, detectable.step_mm, exponential()
+    )
     beam = 0
     while beam < beams:
-        hits = room_for_hits(2 * beams + len(kind.counts))
+        hits = room_for_hits(2 * beams + len(detectable.counts))
         beam, count = air_loops.sample_particles(beam, beams, subrays, tables, random, reach, hits)
         yield hits.first(count)
 
 
 def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
-    """Return the hits of the peaks of fog, on sub-rays with ranges `reach` (rays,), metres."""
+    """Return a hit of fog for each beam that has fog, on its first sub-ray.
+
+    `reach` (rays,) is where fog ends on each sub-ray, metres.
+    """
     from . import air_loops
 
     hits = room_for_hits(len(reach) // subrays)
@@ -310,10 +330,10 @@ def insert_air_hits(
 
 @lru_cache(CACHED_TABLES)
 def _detectable(
-    air: Air, kind: Particles, energy: float, min_range_m: float, max_range_m: float
+    air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
 ) -> DetectableParticles | None:
-    """Return the distribution of particles that return at least an energy; None if empty."""
-    tables = seen_by_range(air, kind, energy, min_range_m, max_range_m)
+    """Return the distribution of particles that return at least `min_energy`; None if empty."""
+    tables = seen_by_range(air, kind, min_energy, min_range_m, max_range_m)
     if tables is None:
         return None
     mean, by_range = tables
@@ -322,24 +342,24 @@ def _detectable(
 
 @lru_cache(CACHED_TABLES)
 def seen_by_range(
-    air: Air, kind: Particles, energy: float, min_range_m: float, max_range_m: float
+    air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
 ) -> tuple[float, Floats] | None:
-    """Return the mean number of particles in a beam that return at least an energy, and a table.
+    """Return the mean number of particles in a beam that return at least `min_energy`, and a table.
 
-    The table is that of `DetectableParticles.by_range`. Returns None if no particle does.
+    The table is that of `DetectableParticles.by_range`. Returns None without such particles.
     """
     distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
-    detectable = np.flatnonzero(air.rate(kind, energy, distance) > 0)
+    detectable = np.flatnonzero(air.rate(kind, min_energy, distance) > 0)
     if not len(detectable):
         return None
     last = min(detectable[-1] + 1, NODES - 1)
     distance = geomspace(distance[max(detectable[0] - 1, 0)], distance[last], NODES)
-    rate = air.rate(kind, energy, distance)
+    rate = air.rate(kind, min_energy, distance)
     parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(parts)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     distance = single(interp(shares, sums / sums[-1], distance))
-    smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
+    smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
     energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
@@ -364,16 +384,19 @@ def _poisson(mean: float) -> Floats:
 @lru_cache(CACHED_TABLES)
 def _fog_cells(
     air: Air,
-    scatters: float,
+    backscatter: float,
     threshold: float,
     min_range_m: float,
     max_range_m: float,
     cell_m: float,
 ) -> FogCells | None:
-    """Return the cells of fog that may be detected; None without such cells."""
+    """Return the cells of fog that may be detected; None without such cells.
+
+    `backscatter` is that of fog and dust, 1/(m sr); `cell_m` is half of the pulse's length.
+    """
     count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
     edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
-    energy = air.cloud(scatters, edges[:-1], edges[1:])
+    energy = air.cloud(backscatter, edges[:-1], edges[1:])
     energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
     if not len(energy):
         return None

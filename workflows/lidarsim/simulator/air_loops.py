@@ -38,8 +38,8 @@ class FogTables(NamedTuple):
 def write_particle(ray, column, quantile, subrays, tables, hits, row):
     """Write the hit of a particle, on a sub-ray, to a row of `hits`, `SampledHits`.
 
-    `column` is the particle's in `tables.by_range`; the `quantile` says how large the particle is
-    among particles that may be detected there.
+    `column` is the particle's in `tables.by_range`; the `quantile`, in [0, 1), is that of the
+    particle's diameter among particles that may be detected there.
     """
     by_range = tables.by_range
     exponential = tables.exponential
@@ -62,20 +62,22 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
     """
     starts = keys.starts
     count = 0
-    row = 0
+    scan_index = 0
     while beam < stop and count + len(tables.counts) <= len(hits.ray):
-        row = scan_row(keys.scan_starts, keys.first + beam, row)
-        scan = keys.scan + row
-        number = keys.first + beam - keys.scan_starts[row]
-        probability = uniform(starts[0], scan, number, 0)
+        scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
+        scan = keys.scan + scan_index
+        number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
+        probability = uniform(starts[0], scan, number_in_scan, 0)
         particle = 0
         while tables.counts[particle] <= probability:
-            index = np.int64(bits(starts[1], scan, number, particle) >> SHIFT_TO_INDEX)
+            index = np.int64(bits(starts[1], scan, number_in_scan, particle) >> SHIFT_TO_INDEX)
             ray = beam * subrays
             if subrays > 1:
-                ray += np.int64(bits(starts[2], scan, number, particle) % np.uint64(subrays))
+                ray += np.int64(
+                    bits(starts[2], scan, number_in_scan, particle) % np.uint64(subrays)
+                )
             if tables.by_range[0, index] < reach[ray]:
-                quantile = uniform(starts[3], scan, number, particle)
+                quantile = uniform(starts[3], scan, number_in_scan, particle)
                 write_particle(ray, index, quantile, subrays, tables, hits, count)
                 count += 1
             particle += 1
@@ -88,20 +90,22 @@ def sample_fog(subrays, tables, keys, reach, hits):
     """Sample the fog return of each beam into `hits`; return their number.
 
     `tables` are `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
-    from the cell with the highest peak before its surface.
+    from the cell with the highest peak before its surface, which is that of its first sub-ray, in
+    the middle. A beam whose surface is nearer than the end of the first cell returns nothing.
     """
     cells = len(tables.energies)
     count = 0
-    row = 0
+    scan_index = 0
     for beam in range(len(reach) // subrays):
         free_cells = (min(reach[beam * subrays], tables.end_m) - tables.begin_m) / tables.cell_m
         if not free_cells >= 1:
             continue
         fog_cells = cells if free_cells >= cells else np.int64(free_cells)
-        row = scan_row(keys.scan_starts, keys.first + beam, row)
-        scan = keys.scan + row
-        number = keys.first + beam - keys.scan_starts[row]
-        probability = fog_cells + uniform(keys.starts[0], scan, number, 0)
+        scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
+        scan = keys.scan + scan_index
+        number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
+        # Row n of the table is n plus probabilities, see `air.FogCells.peaks`.
+        probability = fog_cells + uniform(keys.starts[0], scan, number_in_scan, 0)
         cell = 0  # becomes the cell with the highest peak, by binary search
         upper = cells
         while cell < upper:
@@ -110,7 +114,7 @@ def sample_fog(subrays, tables, keys, reach, hits):
                 cell = middle + 1
             else:
                 upper = middle
-        position_in_cell = uniform(keys.starts[1], scan, number, 0)
+        position_in_cell = uniform(keys.starts[1], scan, number_in_scan, 0)
         hits.ray[count] = beam * subrays
         hits.distance[count] = tables.begin_m + (cell + position_in_cell) * tables.cell_m
         hits.energy[count] = subrays * tables.energies[cell]

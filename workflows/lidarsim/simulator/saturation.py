@@ -11,7 +11,7 @@ from ..sensor.optics import FWHM, LIGHT_M_NS
 from .returns import PulseReturns, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
-_TO_M = LIGHT_M_NS / 4  # half of a width, in range
+_HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width, in metres of range per ns of width
 
 
 class SaturationStep(PulseStep):
@@ -43,11 +43,12 @@ class SaturationStep(PulseStep):
 
 
 def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
-    """Clip returns at the height `full`, and join returns that overlap clipped returns.
+    """Clip returns (n,) at the height `full`, and join returns that overlap clipped returns.
 
     A Gaussian pulse of height A, clipped at S, is above S / 2 for √(1 + log2(A / S)) of its full
     width at half maximum, `pulse_ns` unless a return has a width. With widths, as in waveforms, the
-    range of a clipped return is that of its leading edge.
+    range of a clipped return is early by half of what clipping adds to its width: the receiver
+    measures its leading edge.
     """
     from . import saturation_loops  # not before: numba takes half a second to import
 
@@ -56,22 +57,22 @@ def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseRetur
     width = required(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
     unclipped = np.where(width > 0, width, pulse_ns)  # returns without a waveform have the width 0
     widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
-    early_m = _TO_M * (widened - unclipped) if in_waveforms else 0.0
+    early_m = _HALF_WIDTH_M_NS * (widened - unclipped) if in_waveforms else 0.0
     pulses = saturation_loops.Pulses(
         ray=owned(returns.ray, np.int64),
-        full=height > full,
+        clipped=height > full,
         height=owned(height),
-        front=returns.distance - _TO_M * widened,
-        back=returns.distance + _TO_M * widened,
+        front=returns.distance - _HALF_WIDTH_M_NS * widened,
+        back=returns.distance + _HALF_WIDTH_M_NS * widened,
         distance=np.maximum(returns.distance - early_m, 0),
         energy=required(returns.energy).copy(),
     )
     remains = np.empty(len(height), np.bool_)
-    saturation_loops.join_full(pulses, remains)
-    joined_ns = (pulses.back - pulses.front) / (2 * _TO_M)
+    saturation_loops.join_clipped(pulses, remains)
+    joined_ns = (pulses.back - pulses.front) / (2 * _HALF_WIDTH_M_NS)
     return returns._replace(
         distance=pulses.distance,
         energy=pulses.energy,
-        width=np.where(pulses.full, joined_ns, width),
+        width=np.where(pulses.clipped, joined_ns, width),
         amplitude=np.minimum(height, full),
     ).take(remains)

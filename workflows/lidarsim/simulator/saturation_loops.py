@@ -15,8 +15,8 @@ class Pulses(NamedTuple):
     """Returns of pulses in the order of rays and distances: (n,) each."""
 
     ray: Ints
-    full: Bools  # whether the return fills the receiver
-    height: Floats
+    clipped: Bools  # whether the return fills the receiver
+    height: Floats  # before clipping
     front: Floats  # leading edge of the return, metres
     back: Floats  # trailing edge of the return, metres
     distance: Floats  # metres
@@ -24,16 +24,17 @@ class Pulses(NamedTuple):
 
 
 @compiled()
-def join_full(pulses, remains):
-    """Join overlapping returns of a pulse where a return is full; mark the returns that remain.
+def join_clipped(pulses, remains):
+    """Join overlapping returns of a pulse where a return is clipped; mark the returns that remain.
 
-    Of joined returns the highest remains, with the energy of all joined returns, and with the edges
-    and the smallest distance of the full returns, which are written to `pulses`.
+    Of joined returns the highest remains, with the energy of all joined returns, and with the
+    outermost edges and the smallest distance of the clipped returns. These are written to `pulses`,
+    `Pulses`, and marks to `remains` (n,).
     """
     height = pulses.height
     front = pulses.front
     back = pulses.back
-    full = pulses.full
+    clipped = pulses.clipped
     begin = 0
     for k in range(len(pulses.ray)):
         if pulses.ray[k] != pulses.ray[begin]:
@@ -41,7 +42,7 @@ def join_full(pulses, remains):
         remains[k] = True
         last = k
         for j in range(k - 1, begin - 1, -1):
-            if not (remains[j] and (full[j] or full[last]) and back[j] >= front[last]):
+            if not (remains[j] and (clipped[j] or clipped[last]) and back[j] >= front[last]):
                 continue
             hidden = j
             if height[j] >= height[last]:
@@ -49,7 +50,7 @@ def join_full(pulses, remains):
                 last = j
             remains[hidden] = False
             pulses.energy[last] += pulses.energy[hidden]
-            if full[hidden]:
+            if clipped[hidden]:
                 front[last] = min(front[last], front[hidden])
                 back[last] = max(back[last], back[hidden])
                 pulses.distance[last] = min(pulses.distance[last], pulses.distance[hidden])

@@ -35,12 +35,12 @@ SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
 SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
 SPRAY = CAUSES.index("spray")
 BOX_NS = 1e8  # time between boxes of a vehicle
-BOXES = 10  # boxes of a vehicle at a time
+BOXES = 10  # boxes of a vehicle that exist at a time
 LASTS_NS = BOXES * BOX_NS  # time after which a box is gone
 DECAY_NS = 4e8  # time in which exp(-1) of the spray is left: drops of a few 0.1 mm fall
 FULL_SPEED_M_S = 25.0  # speed at which spray has the stated density
 MIN_SPEED_M_S = 3.0  # speed below which there is no spray
-STEP_NS = 5e5  # for velocities
+STEP_NS = 5e5  # time between the two poses that give the velocity of a vehicle
 
 
 class SprayStep(PulseStep):
@@ -66,15 +66,20 @@ class SprayStep(PulseStep):
         noise = setup.noise
         check_spray(setup.scene.actors)
         air = survey.air(setup.number)
-        span = reach(sensor.min_range_m, sensor.max_range_m)
-        kind = spray(survey.spray_g_m3)
-        self._extinction = kind.extinction / LARGE
-        self._step = 1 / kind.slope
-        self._clumps = seen_by_range(air, kind, FAINTEST * noise.threshold, *span)
+        range_limits_m = reach(sensor.min_range_m, sensor.max_range_m)
+        clump_kind = spray(survey.spray_g_m3)
+        self._extinction = clump_kind.extinction / LARGE
+        self._step_mm = 1 / clump_kind.slope
+        self._clump_distribution = seen_by_range(
+            air, clump_kind, FAINTEST * noise.threshold, *range_limits_m
+        )
         self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
-        # (actors, 2, 3): lowest corner of the box around a mesh, and halves of the box's sides.
+        # (actors, 2, 3), actor frame, metres: lowest corner of the box around a mesh, and halves of
+        # the box's sides.
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
-        self._sizes = np.array([(mesh.min(axis=0), np.ptp(mesh, axis=0) / 2) for mesh in meshes])
+        self._mesh_boxes = np.array(
+            [(mesh.min(axis=0), np.ptp(mesh, axis=0) / 2) for mesh in meshes]
+        )
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
     @staticmethod
@@ -86,16 +91,16 @@ class SprayStep(PulseStep):
     @staticmethod
     def added(setup: Setup) -> float:
         """Return the mean number of clumps in a pulse that meets spray."""
-        return 1.0
+        return 1.0  # an estimate
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of rays in the middles of beams, light and clumps, in bytes."""
+        """Return the memory of central rays, ranges of light, and clumps, in bytes."""
         return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the hits of a batch after spray, which attenuates light and adds hits."""
-        if self._clumps is None:
+        if self._clump_distribution is None:
             return returns
         from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
 
@@ -119,9 +124,9 @@ class SprayStep(PulseStep):
         """Return the hits of clumps in the boxes that beams cross, in the order of sub-rays."""
         from . import spray_loops
 
-        assert self._clumps is not None
-        mean, by_range = self._clumps
-        tables = spray_loops.ClumpTables(mean, by_range, self._step, exponential())
+        assert self._clump_distribution is not None
+        mean, by_range = self._clump_distribution
+        tables = spray_loops.ClumpTables(mean, by_range, self._step_mm, exponential())
         keys = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
         parts: list[PulseReturns] = []
         row = 0
@@ -135,20 +140,22 @@ class SprayStep(PulseStep):
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:
-        """Return where beams, which end at `reach_m` (n,), cross boxes.
+        """Return where the central rays of beams cross boxes.
 
-        The crossings of a beam are consecutive, in the order of vehicles and times.
+        `reach_m` (beams,) is the range at which each beam ends, metres. The crossings of a beam are
+        consecutive, in the order of vehicles, then of the times at which vehicles leave boxes.
         """
         from . import spray_loops
 
-        assert self._clumps is not None
+        assert self._clump_distribution is not None
+        # Cells of consecutive rays are narrow if neighbours along a ring are consecutive.
         ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
         times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
         spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
         rays = np.concatenate(
             [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
         )
-        reach_m = np.minimum(reach_m[ring_order], self._clumps[1][0, -1])
+        reach_m = np.minimum(reach_m[ring_order], self._clump_distribution[1][0, -1])
         cell, box, cell_rays = near_boxes(
             rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
         )
@@ -165,7 +172,12 @@ class SprayStep(PulseStep):
         )
 
     def _boxes(self, trajectories: ActorTrajectories, begin_ns: float, end_ns: float) -> SprayBoxes:
-        """Return the boxes of spray that are in the scene between two times."""
+        """Return the boxes of spray that are in the scene between two times.
+
+        A vehicle leaves a box at each multiple of `BOX_NS`, `created_ns`. Its pose is taken at
+        `pose_ns`: at `created_ns`, or, if that is before the vehicle is in the scene, at the first
+        time at which the vehicle has a velocity.
+        """
         from . import spray_loops
 
         numbers = np.arange(math.floor(begin_ns / BOX_NS) - BOXES, math.floor(end_ns / BOX_NS) + 1)
@@ -173,33 +185,34 @@ class SprayStep(PulseStep):
         actor = np.repeat(moving, len(numbers))
         created_ns = np.tile(BOX_NS * numbers, len(moving))
         first_ns, last_ns = trajectories.presence_ns[actor].T
-        # Before a vehicle is in the scene, it drives as when it appears.
-        known_ns = np.maximum(created_ns, np.maximum(first_ns, 0.0) + STEP_NS)
-        rows = np.flatnonzero((created_ns <= end_ns) & (known_ns <= last_ns))
+        # Before a vehicle is in the scene, it is assumed to drive as when it appears.
+        pose_ns = np.maximum(created_ns, np.maximum(first_ns, 0.0) + STEP_NS)
+        rows = np.flatnonzero((created_ns <= end_ns) & (pose_ns <= last_ns))
         created_ns = created_ns[rows]
         first_ns = first_ns[rows]
-        boxes, speed_m_s = self._boxes_of(trajectories, actor[rows], created_ns, known_ns[rows])
+        boxes, speed_m_s = self._boxes_of(trajectories, actor[rows], created_ns, pose_ns[rows])
         presence_ns = np.stack([np.maximum(created_ns, first_ns), created_ns + LASTS_NS], axis=1)
         fast = np.flatnonzero(speed_m_s >= MIN_SPEED_M_S)
         density = self.setup.survey.wet * np.square(speed_m_s[fast] / FULL_SPEED_M_S)
         return spray_loops.SprayBoxes(boxes[fast], presence_ns[fast], density, LASTS_NS, DECAY_NS)
 
     def _boxes_of(
-        self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, known_ns: Floats
+        self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, pose_ns: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the boxes that actors leave at times (b,), and the speeds of the actors, m/s.
+        """Return the boxes that actors leave at `created_ns` (b,), and the actors' speeds, m/s.
 
-        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame. Poses
-        are taken at `known_ns`.
+        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame, metres.
+        A box starts at the rear of the actor, and is as long along the actor's x axis, forward, as
+        the actor drives in `BOX_NS`. The actor drives straight on from `pose_ns` to `created_ns`.
         """
-        positions, rotations = trajectories.poses(actor, known_ns)
-        earlier, _ = trajectories.poses(actor, known_ns - STEP_NS)
+        positions, rotations = trajectories.poses(actor, pose_ns)
+        earlier, _ = trajectories.poses(actor, pose_ns - STEP_NS)
         velocity = (positions - earlier) / (STEP_NS / 1e9)
         speed_m_s = length(velocity)
-        sides = rotations.transpose(0, 2, 1)
-        lowest, half_sides = self._sizes[actor].transpose(1, 0, 2).copy()
+        axes = rotations.transpose(0, 2, 1)  # rows: axes of the actor, in the scene frame
+        lowest_corner, half_sides = self._mesh_boxes[actor].transpose(1, 0, 2).copy()
         half_sides[:, 0] = speed_m_s * (BOX_NS / 2e9)
-        driven = velocity * ((created_ns - known_ns) / 1e9)[:, None]
-        middle = positions + driven + into_axes(lowest + half_sides, sides)
-        boxes = np.concatenate([middle, (sides * half_sides[:, :, None]).reshape(-1, 9)], axis=1)
+        driven_m = velocity * ((created_ns - pose_ns) / 1e9)[:, None]
+        middle = positions + driven_m + into_axes(lowest_corner + half_sides, axes)
+        boxes = np.concatenate([middle, (axes * half_sides[:, :, None]).reshape(-1, 9)], axis=1)
         return boxes, speed_m_s

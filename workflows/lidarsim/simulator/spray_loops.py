@@ -21,19 +21,21 @@ _GUIDE_PARTS = 1024  # parts of a table in which a column is looked up
 
 
 class CellPairs(NamedTuple):
-    """Cells of consecutive rays and boxes that may meet, in the order of cells."""
+    """Pairs of a cell of consecutive rays and a box that may meet, in the order of cells."""
 
-    cell: Ints  # (p,)
-    box: Ints  # (p,)
+    cell: Ints  # (p,): number of the cell
+    box: Ints  # (p,): row of `SprayBoxes`
     cell_rays: int  # rays of a cell
 
 
 class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
-    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors
-    presence_ns: Floats  # (b, 2): first and last time of each box
-    density: Floats  # (b,): when the box is left behind
+    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, metres
+    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box is left behind.
+    presence_ns: Floats
+    # (b,): when the box is left behind, as a multiple of the density of `ClumpTables`.
+    density: Floats
     lasts_ns: float  # time after which a box is gone
     decay_ns: float  # time in which exp(-1) of the density is left
 
@@ -41,15 +43,17 @@ class SprayBoxes(NamedTuple):
 class Crossings(NamedTuple):
     """Crossings of beams and boxes; the crossings of a beam are consecutive."""
 
-    beam: Ints  # (k,)
-    spans: Floats  # (3, k): where the beam enters and leaves the box, metres, and the box's density
+    beam: Ints  # (k,): number of the beam in the batch
+    # (3, k): ranges at which the beam enters and leaves the box, metres, and the density of the box
+    # at that time, as a multiple of the density of `ClumpTables`.
+    spans: Floats
 
 
 class ClumpTables(NamedTuple):
     """Tables of clumps of spray that may be detected, see `air.DetectableParticles`."""
 
-    mean: float  # clumps that a beam would meet at a density of 1
-    by_range: Floats  # (5, shares): columns of equal shares of `mean`
+    mean: float  # detectable clumps that a beam would meet if all the air had a density of 1
+    by_range: Floats  # (5, shares): columns, ascending in range, that hold equal shares of `mean`
     step_mm: float  # diameter that exp(-1) of the drops exceed
     exponential: Floats  # quantiles of the exponential distribution
 
@@ -94,14 +98,17 @@ def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a 
 
 @inlined
 def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
-    """Write a crossing of beam `k` and a box, if `crossings` has room."""
+    """Write a crossing of ray `k` and box `b` as row `count`, if `crossings` has room.
+
+    `span` is the result of `_span_in_box`, `time` that of the ray, ns.
+    """
     if count < len(crossings.beam):
-        age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
+        negative_age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
         enters, leaves = span
         crossings.beam[count] = k
         crossings.spans[0, count] = enters
         crossings.spans[1, count] = leaves
-        density = spray_boxes.density[b] * exp(age_ns / spray_boxes.decay_ns)
+        density = spray_boxes.density[b] * exp(negative_age_ns / spray_boxes.decay_ns)
         crossings.spans[2, count] = density
 
 
@@ -109,8 +116,9 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
     """Write where rays (6, n), which end at `reach` (n,), metres, cross boxes; return the number.
 
-    Rows of rays are origins and directions; `pairs` are `CellPairs`. As many crossings are written
-    as `crossings` has room for.
+    Rows of rays are origins and directions, `times` (n,) are in ns; `pairs` are `CellPairs`, and
+    `spray_boxes` `SprayBoxes`. As many crossings are written as `crossings` has room for; all are
+    counted.
     """
     boxes = spray_boxes.boxes
     presence_ns = spray_boxes.presence_ns
@@ -148,20 +156,28 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
 
 
 @stage
-def _column(ranges, guide, width_m, distance):
-    """Return the first column at a distance or farther; numba's search takes long to compile."""
-    column = guide[np.int64(min(distance / width_m, _GUIDE_PARTS))]
+def _column(ranges, guide, part_m, distance):
+    """Return the first column at a distance or farther; numba's search takes long to compile.
+
+    `ranges` are those of the columns, metres, ascending. The search starts at the column of `guide`
+    for the distance, see `_guide`; a part of the guide is `part_m` long.
+    """
+    column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
     while column < len(ranges) and ranges[column] < distance:
         column += 1
     return column
 
 
 @stage
-def _guide(ranges, width_m):
-    """Return columns at which the search of a distance starts, by parts of a width, metres."""
+def _guide(ranges, part_m):
+    """Return columns at which searches for distances start: (_GUIDE_PARTS + 4,).
+
+    `guide[k]` is the first column at `(k - 1) * part_m` or farther: a part early, so that rounding
+    of a distance never starts its search too late.
+    """
     guide = np.zeros(_GUIDE_PARTS + 4, np.int64)
     for part in range(1, len(guide)):
-        guide[part] = _column(ranges, guide[part - 1 :], np.inf, width_m * (part - 1))
+        guide[part] = _column(ranges, guide[part - 1 :], np.inf, part_m * (part - 1))
     return guide
 
 
@@ -170,54 +186,59 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
     """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
 
     `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
-    that the light of each sub-ray reaches, metres. Depths between clumps are exponential. Writes
-    `SampledHits`; returns the first crossing that is not sampled yet, and the number of hits.
+    that the light of each sub-ray reaches, metres. The depth between two clumps, as the mean number
+    of clumps in it, is exponential. Writes `SampledHits`; returns the first crossing that is not
+    sampled yet, and the number of hits.
     """
     beam = crossings.beam
     spans = crossings.spans
     exponential = tables.exponential
     starts = keys.starts
     ranges = tables.by_range[0]
-    width_m = ranges[-1] / _GUIDE_PARTS
-    share = tables.mean / len(ranges)
-    guide = _guide(ranges, width_m)
+    part_m = ranges[-1] / _GUIDE_PARTS
+    clumps_per_column = tables.mean / len(ranges)
+    guide = _guide(ranges, part_m)
     count = 0
-    row = 0
+    scan_index = 0
     while k < len(beam) and count + MAX_CLUMPS <= len(hits.ray):
         this_beam = beam[k]
         key = keys.first + this_beam
-        row = scan_row(keys.scan_starts, key, row if keys.scan_starts[row] <= key else 0)
-        scan = keys.scan + row
-        number = key - keys.scan_starts[row]
+        scan_index = scan_row(
+            keys.scan_starts, key, scan_index if keys.scan_starts[scan_index] <= key else 0
+        )
+        scan = keys.scan + scan_index
+        number_in_scan = key - keys.scan_starts[scan_index]
         clump = 0
-        depth = exponential[np.int64(bits(starts[0], scan, number, 0) >> SHIFT_TO_INDEX)]
+        depth = exponential[np.int64(bits(starts[0], scan, number_in_scan, 0) >> SHIFT_TO_INDEX)]
         begin = k
         max_depth = 0.0  # in columns
         while k < len(beam) and beam[k] == this_beam:
-            first_part = min(spans[0, k] / width_m, _GUIDE_PARTS)
-            last_part = min(spans[1, k] / width_m, _GUIDE_PARTS)
+            first_part = min(spans[0, k] / part_m, _GUIDE_PARTS)
+            last_part = min(spans[1, k] / part_m, _GUIDE_PARTS)
             columns = guide[np.int64(last_part) + 3] - guide[np.int64(first_part)]
             max_depth += spans[2, k] * columns
             k += 1
-        if depth > 1.001 * max_depth * share:  # most beams meet too little, by a rough bound
-            continue
+        if depth > 1.001 * max_depth * clumps_per_column:
+            continue  # most beams meet too little, by a rough bound
         k = begin
         while k < len(beam) and beam[k] == this_beam:
-            rate = spans[2, k] * share
-            end = _column(ranges, guide, width_m, spans[1, k])
-            position = np.float64(_column(ranges, guide, width_m, spans[0, k]))  # in columns
+            rate = spans[2, k] * clumps_per_column  # depth of a column in this box
+            end = _column(ranges, guide, part_m, spans[1, k])
+            position = np.float64(_column(ranges, guide, part_m, spans[0, k]))  # in columns
             while depth < (end - position) * rate and clump < MAX_CLUMPS:
                 position += depth / rate
                 column = np.int64(position)
                 ray = this_beam * subrays
                 if subrays > 1:
-                    ray += np.int64(bits(starts[1], scan, number, clump) % np.uint64(subrays))
+                    ray += np.int64(
+                        bits(starts[1], scan, number_in_scan, clump) % np.uint64(subrays)
+                    )
                 if ranges[column] < reach[ray]:
-                    quantile = uniform(starts[2], scan, number, clump)
+                    quantile = uniform(starts[2], scan, number_in_scan, clump)
                     write_particle(ray, column, quantile, subrays, tables, hits, count)
                     count += 1
                 clump += 1
-                index = np.int64(bits(starts[0], scan, number, clump) >> SHIFT_TO_INDEX)
+                index = np.int64(bits(starts[0], scan, number_in_scan, clump) >> SHIFT_TO_INDEX)
                 depth = exponential[index]
             depth -= (end - position) * rate
             k += 1
@@ -226,9 +247,10 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
 
 @compiled()
 def attenuate(crossings, subrays, extinction, reach, hits):
-    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray.
+    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray, both ways.
 
-    `reach` (beams * subrays,) is the range that the light of each sub-ray reaches, metres.
+    `extinction` is that of spray of density 1, 1/m; `reach` (beams * subrays,) is the range that
+    the light of each sub-ray reaches, metres.
     """
     beam = crossings.beam
     spans = crossings.spans

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 STRAY = Purpose(22, "noise of stray light's energy")
 BLOOMING = CAUSES.index("blooming")
-NEAREST_TRIANGLES = 4  # triangles of a cluster that are compared with a ray
+NEAREST_TRIANGLES = 4  # number of triangles of a cluster, nearest by angle, compared with a ray
 CLUSTER_M = 1.0  # size of a cluster of triangles, which are compared with rays together
-FAINTEST = 0.1  # of the threshold: fainter light is never detected, see `detected`
+FAINTEST = 0.1  # share of the detection threshold: fainter light is never detected
 
 
 class StrayLightStep(PulseStep):
@@ -54,11 +54,15 @@ class StrayLightStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of a cause of each return, and of rays, in bytes."""
+        """Return the memory of the causes of returns, and of central rays, in bytes."""
         return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch with the returns of stray light."""
+        """Return the returns of a batch with the returns of stray light.
+
+        A beam adds its strongest stray light if the light is detected, in range, visible from the
+        beam's origin, and not within the gap of another return of the beam.
+        """
         if not self._clusters:
             return returns
         noise = self.setup.noise
@@ -86,7 +90,10 @@ class StrayLightStep(PulseStep):
         return merged(returns, stray)
 
     def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
-        """Return the strongest stray light of the rays in the middles of beams."""
+        """Return the strongest stray light of the central rays of beams.
+
+        `times` (n,) are those of the beams, ns. Points are in the axes of the scene frame.
+        """
         from . import stray_loops  # not before: numba takes half a second to import
 
         origins, directions = batch.central_rays
@@ -121,7 +128,7 @@ class StrayLightStep(PulseStep):
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
-        """Return the triangles of a cluster for loops."""
+        """Return the triangles of a cluster for loops, with the light that they return head-on."""
         from .stray_loops import RetroTriangles
 
         white = np.ones(len(cluster.triangles))
@@ -129,7 +136,10 @@ class StrayLightStep(PulseStep):
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether a ray (n,) has a return within the receiver's gap of a distance: (n,)."""
+        """Return whether beams `ray` (n,) have a return near distances (n,), metres: (n,).
+
+        Near is within half of the pulse's length: the receiver cannot tell such returns apart.
+        """
         first = np.searchsorted(returns.ray, ray, side="left")
         last = np.searchsorted(returns.ray, ray, side="right")
         close = np.zeros(len(ray), np.bool_)
@@ -141,7 +151,7 @@ class StrayLightStep(PulseStep):
 
 
 def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
-    """Return rays (n, 3) for loops, with cones around cells of rays."""
+    """Return rays (n, 3) for loops, with cones around cells of consecutive rays."""
     from . import stray_loops
 
     cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
@@ -162,9 +172,9 @@ class _Bounds(NamedTuple):
 class _RetroCluster:
     """A cluster of triangles of retro-reflectors."""
 
-    triangles: Ints32  # (k,): numbers
+    triangles: Ints32  # (k,): numbers among all triangles of the scene
     corners: Floats  # (k, 3, 3): in the scene frame, or in the frame of an actor
-    actor: int | None = None
+    actor: int | None = None  # number of the actor; None in the still scene
 
     @cached_property
     def bounds(self) -> _Bounds:
@@ -185,7 +195,10 @@ def _retro_clusters(scene: Scene, surfaces: Surfaces) -> Iterator[_RetroCluster]
     def clusters_of(
         faces: Integers, vertices: Floats, first: int, actor: int | None = None
     ) -> Iterator[_RetroCluster]:
-        """Yield the clusters of faces, whose triangles are numbered from `first` on."""
+        """Yield the clusters of the retro-reflecting `faces`.
+
+        Triangles of the faces are numbered from `first` on.
+        """
         rows = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
         return _clusters(first + rows, vertices[faces[rows]], actor)
 
@@ -210,7 +223,7 @@ def _retro_clusters(scene: Scene, surfaces: Surfaces) -> Iterator[_RetroCluster]
 def _clusters(
     triangles: Integers, corners: Floats, actor: int | None = None
 ) -> Iterator[_RetroCluster]:
-    """Divide triangles into clusters, by the cells of a grid."""
+    """Divide triangles with corners (k, 3, 3) into clusters, by the cells of a grid."""
     if not len(triangles):
         return
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)

@@ -29,7 +29,8 @@ class RayCells(NamedTuple):
 
     origins: Floats  # (3, n)
     directions: Floats  # (3, n)
-    cones: Floats  # (c, 5): axis, half angle, and how far origins move, metres
+    # (c, 5): axis, half angle, radians, and largest distance of an origin from the first, metres.
+    cones: Floats
 
 
 class RetroTriangles(NamedTuple):
@@ -39,14 +40,15 @@ class RetroTriangles(NamedTuple):
     middles: Floats  # (t, 3)
     centre: Floats  # (3,): of a ball around the triangles
     radius: float  # of the ball, metres
-    back: Floats  # (t,): light that a triangle returns of a beam at a distance of 10 m
+    # (t,): energy that a beam head-on at 10 m returns, relative to a white surface.
+    back: Floats
 
 
 class StrayLimits(NamedTuple):
     """Limits of stray light."""
 
     min_range_m: float
-    share: float  # stray light at an angle of a degree, by the light within the beam
+    share_at_degree: float  # energy at an angle of 1 degree, as a share of that in the beam
     faintest: float  # smallest energy that may be detected
     extinction: float  # 1/m
 
@@ -55,20 +57,22 @@ class StrayLight(NamedTuple):
     """Strongest stray light of rays, to which loops write."""
 
     energy: Floats  # (n,)
-    points: Floats  # (n, 3): where the light comes from, as seen from the rays' origins
-    new: Bools  # (n,): whether the light was written
+    # (n, 3), metres: from the ray's origin to where the light comes from, in the axes of the rays
+    # and triangles that a loop was given.
+    points: Floats
+    new: Bools  # (n,): set where a loop has written light
 
 
 class SpotPairs(NamedTuple):
     """Pairs of a spot and the rays that may see the spot: (p,) each."""
 
-    spot: Ints
-    first: Ints  # first and last rays, as rows of `ReceivingRays.order`
-    stop: Ints
+    spot: Ints  # row of `LitSpots`
+    first: Ints  # first ray, as a row of `ReceivingRays.order`
+    stop: Ints  # one past the last ray
 
 
 class ReceivingRays(NamedTuple):
-    """Rays of a receiver."""
+    """Rays of a receiver, in the scene frame."""
 
     order: Ints  # (n,): rows in the order of firing times
     fired_ns: Floats  # (n,)
@@ -77,30 +81,30 @@ class ReceivingRays(NamedTuple):
 
 
 class LitSpots(NamedTuple):
-    """Spots on surfaces, lit by pulses of foreign sensors."""
+    """Spots on surfaces, lit by pulses of foreign sensors, in the scene frame."""
 
-    time_ns: Floats  # (s,)
-    positions: Floats  # (s, 3)
+    time_ns: Floats  # (s,): when the pulse lights the spot
+    positions: Floats  # (s, 3), metres
 
 
 class ReceptionLimits(NamedTuple):
     """Limits of the pulses that a receiver gets."""
 
     cosine: float  # of the largest angle between a ray and a spot
-    min_range_m: float
+    min_range_m: float  # of the distance at which the spot seems to be
     max_range_m: float
 
 
 class ReceivedSpots(NamedTuple):
     """Arrays to which loops write rays that receive the light of spots: (k,) each."""
 
-    row: Ints  # of the ray
-    spot: Ints
+    row: Ints  # of the ray, in `ReceivingRays`
+    spot: Ints  # row of `LitSpots`
     distance: Floats  # at which the spot seems to be, metres
-    range_m: Floats  # at which the spot is
+    range_m: Floats  # at which the spot is, metres
 
     def first(self, count: int) -> ReceivedSpots:
-        """Return the first rows, which a loop has written."""
+        """Return views of the first `count` rows, which a loop has written."""
         return ReceivedSpots(
             self.row[:count], self.spot[:count], self.distance[:count], self.range_m[:count]
         )
@@ -108,7 +112,7 @@ class ReceivedSpots(NamedTuple):
 
 @inlined
 def _angle(cosine):
-    """Return the angle of a cosine, which may be rounded beyond 1."""
+    """Return the angle of a cosine, radians; the cosine may be rounded beyond 1."""
     cosine = min(max(cosine, -1.0), 1.0)
     return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
 
@@ -146,10 +150,10 @@ def bound_cells(origins, directions, cones):
 
 @stage
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
-    """Return the tangent of the angle between a ray and a triangle, and the nearest point.
+    """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
 
-    The point is seen from the ray's origin. The tangent is 0 if the ray meets the triangle, and -1
-    if the triangle is not in front of the ray.
+    `ray` is its origin and direction. The point is a vector from the ray's origin. The tangent is 0
+    if the ray meets the triangle, and -1 if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
     a, b, c, d, e, f = any_axes(dx, dy, dz)
@@ -189,11 +193,12 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 
 
 @inlined
-def _cosine_of_reach(rays, c, triangles, limits):
-    """Return whether a cell of rays may receive light of triangles, and the cosine of their angle.
+def _reach_of_cell(rays, c, triangles, limits):
+    """Return whether cell `c` of rays may receive light of triangles, and a cosine.
 
-    The angle is between a ray and the centre of the triangles, at which the light of the nearest
-    triangle becomes too faint.
+    The cosine is that of the largest angle between a ray of the cell and the centre of the
+    triangles at which the ray may receive light: beyond, the light of the nearest triangle is too
+    faint. All triangles are taken to return as much light as the first.
     """
     cones = rays.cones
     first = c * CELL_RAYS
@@ -202,23 +207,28 @@ def _cosine_of_reach(rays, c, triangles, limits):
     z = triangles.centre[2] - rays.origins[2, first]
     size = triangles.radius + cones[c, 4]
     distance = math.sqrt((x * x + y * y) + z * z)
-    half_size = math.pi
+    half_angle = math.pi
     axis_angle = 0.0
     if distance > size:
         sine = size / distance
-        half_size = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
+        half_angle = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
         axis_angle = _angle(((cones[c, 0] * x + cones[c, 1] * y) + cones[c, 2] * z) / distance)
     nearest_m = max(distance - size, max(limits.min_range_m, 1e-3))
-    in_beam = triangles.back[0] * at_right_angles(nearest_m, limits.extinction)
-    reach = math.radians(math.sqrt(limits.share / (limits.faintest / max(in_beam, 1e-300))))
-    reach = min(reach, MAX_STRAY) + half_size
-    _, cosine = sin_cos(min(reach, math.pi))
-    return axis_angle <= cones[c, 3] + reach, cosine
+    in_beam_energy = triangles.back[0] * at_right_angles(nearest_m, limits.extinction)
+    reach_angle = math.radians(
+        math.sqrt(limits.share_at_degree / (limits.faintest / max(in_beam_energy, 1e-300)))
+    )
+    reach_angle = min(reach_angle, MAX_STRAY) + half_angle
+    _, cosine = sin_cos(min(reach_angle, math.pi))
+    return axis_angle <= cones[c, 3] + reach_angle, cosine
 
 
 @inlined
 def _choose_triangles(middles, ray, chosen):
-    """Write the triangles whose middles are nearest to a ray by angle; return their number."""
+    """Write the triangles whose middles are nearest to a ray by angle; return their number.
+
+    `middles` are (t, 3); `chosen` has room for as many triangles as are compared.
+    """
     ox, oy, oz, dx, dy, dz = ray
     count = min(len(middles), len(chosen))
     for number in range(count):
@@ -243,7 +253,7 @@ def _choose_triangles(middles, ray, chosen):
 
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
-    """Write the light of a triangle to ray `k` if the light is stronger than the `strongest`."""
+    """Write the light of triangle `t` to row `k` of `strongest` if the light is stronger."""
     middles = triangles.middles
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
@@ -252,8 +262,8 @@ def _add_light(k, t, ray, triangles, limits, strongest):
         y = nearest[1] + INWARDS * ((middles[t, 1] - ray[1]) - nearest[1])
         z = nearest[2] + INWARDS * ((middles[t, 2] - ray[2]) - nearest[2])
         distance = math.sqrt((x * x + y * y) + z * z)
-        in_beam = triangles.back[t] * at_right_angles(distance, limits.extinction)
-        energy = min(limits.share / (angle * angle), 1.0) * in_beam
+        in_beam_energy = triangles.back[t] * at_right_angles(distance, limits.extinction)
+        energy = min(limits.share_at_degree / (angle * angle), 1.0) * in_beam_energy
         if energy > strongest.energy[k]:
             strongest.energy[k] = energy
             strongest.new[k] = True
@@ -264,18 +274,19 @@ def _add_light(k, t, ray, triangles, limits, strongest):
 
 @compiled()
 def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
-    """Write the light of `triangles` to rays where the light is stronger than the `strongest`.
+    """Write the light of `triangles` to rows of `strongest` where the light is stronger.
 
-    `rays` are `RayCells`, `triangles` `RetroTriangles`, `limits` `StrayLimits`, and `strongest` is
-    `StrayLight`. The light comes from the point of the triangles that is nearest to a ray by angle.
-    `chosen` is scratch memory: the triangles nearest to a ray are compared, as many as its size.
+    `rays` are `RayCells`, `triangles` `RetroTriangles` in the frame of the rays, `limits`
+    `StrayLimits`, and `strongest` is `StrayLight`. The light comes from the point of the triangles
+    that is nearest to a ray by angle. `chosen` is scratch memory: of the triangles, those nearest
+    to a ray are compared, as many as `chosen` has elements.
     """
     centre = triangles.centre
     origins = rays.origins
     directions = rays.directions
     count = origins.shape[1]
     for c in range(len(rays.cones)):
-        in_reach, cosine = _cosine_of_reach(rays, c, triangles, limits)
+        in_reach, cosine = _reach_of_cell(rays, c, triangles, limits)
         if not in_reach:
             continue
         for k in range(c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)):

@@ -1,4 +1,4 @@
-"""Passage of light through grids of leaf area density, until its optical depth is used up."""
+"""Passage of light through grids of leaf area density, until the light meets a leaf."""
 
 from __future__ import annotations
 
@@ -16,28 +16,34 @@ _LEVEL = 1e-30  # voxels a metre: along an axis, slower light stays in its layer
 
 
 class GridPassage(NamedTuple):
-    """Passage of light through grids: arrays (n,), and (n, k) by grids."""
+    """Passage of n rays of light through k grids each."""
 
-    metres: Floats  # (n,): to the leaf that light meets; inf without a leaf
-    remaining_depth: Floats  # (n,): optical depth until a leaf; -inf if light meets a leaf
-    density: Floats  # (n, k): optical depth for each metre of the grids at the leaf
+    metres: Floats  # (n,): from the start to the leaf that light meets; inf without a leaf
+    # (n,): optical depth that is left until a leaf, at the path's end; -inf if light meets a leaf.
+    remaining_depth: Floats
+    density: Floats  # (n, k): optical depth per metre of each grid at the leaf; 0 without a leaf
 
 
 class _GridRays(NamedTuple):
-    """Light in the voxels of k grids around the light; the last axis of all arrays is the ray."""
+    """Rays of light in the voxels of k grids; the last axis of all arrays is the ray.
 
-    row: Indices  # (n,): of the light that is followed
-    even_depth: Floats  # (n,): optical depth for each metre of other media
+    Rays leave the table when they meet a leaf or reach their end.
+    """
+
+    row: Indices  # (n,): number of the ray among those that entered
+    uniform_density: Floats  # (n,): optical depth per metre of the media that are not grids
     length: Floats  # (n,): length of the path, metres
     depth: Floats  # (n,): remaining optical depth until a leaf
     metres: Floats  # (n,): distance from the start
-    cell: Floats  # (3, k, n): voxel of the light
-    step: Floats  # (3, k, n): -1, 0 or 1, the direction of the light
+    cell: Floats  # (3, k, n): indices of the voxel of the light; outside of the grid too
+    step: Floats  # (3, k, n): -1, 0 or 1, the sign of the light's direction
     pace: Floats  # (3, k, n): metres for each voxel; 0 for light that stays in its layer
     shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` metres
-    size: Floats  # (3, k, n): voxels of the grid
-    first: Floats  # (k, n): number of the grid's first voxel
-    crossing: Floats  # (k, n): mean projection of the leaves; 0 without a grid
+    size: Floats  # (3, k, n): number of voxels of the grid
+    first: Floats  # (k, n): index of the grid's first voxel among the densities of all grids
+    # (k, n): optical depth per metre for a leaf area density of 1, which is the mean projection of
+    # the leaves; 0 without a grid.
+    projection: Floats
 
     def take(self, rows: Indices) -> _GridRays:
         """Return the light of selected rows."""
@@ -73,7 +79,7 @@ class Grids:
         return grids
 
     def _place_instances(self, shared: Instances) -> None:
-        """Compute the matrices from the scene frame to the grid of each instance, in voxels."""
+        """Compute the origin of each instance's grid, scene frame, and matrices to its voxels."""
         self._part = shared.part
         to_scene = shared.transforms
         matrices = self._matrices[self._part]
@@ -85,8 +91,8 @@ class Grids:
         instances: Indices,
         starts: Floats,
         directions: Floats,
-        crossing: Floats,
-        even_depth: Floats,
+        projection: Floats,
+        uniform_density: Floats,
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
@@ -95,13 +101,13 @@ class Grids:
         Parameters
         ----------
         instances
-            (n, k): instances with grids around the light; -1 for none.
+            (n, k): instances whose grids overlap along the path; -1 for none.
         starts, directions
             (n, 3): origins of the light, and directions, in the scene frame.
-        crossing
-            (n, k): mean projection of the leaves in each grid.
-        even_depth
-            (n,): optical depth for each metre of other media around the light.
+        projection
+            (n, k): optical depth per metre for a leaf area density of 1 in each grid.
+        uniform_density
+            (n,): optical depth per metre of the media that are not grids.
         length
             (n,): length of the path, metres.
         depth
@@ -112,8 +118,8 @@ class Grids:
                 instances[block],
                 starts[block],
                 directions[block],
-                crossing[block],
-                even_depth[block],
+                projection[block],
+                uniform_density[block],
                 length[block],
                 depth[block],
             )
@@ -130,8 +136,8 @@ class Grids:
         instances: Indices,
         starts: Floats,
         directions: Floats,
-        crossing: Floats,
-        even_depth: Floats,
+        projection: Floats,
+        uniform_density: Floats,
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
@@ -139,29 +145,34 @@ class Grids:
         passage = GridPassage(
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
-        rays = self._enter(instances, starts, directions, crossing, even_depth, length, depth)
+        rays = self._enter(
+            instances, starts, directions, projection, uniform_density, length, depth
+        )
         while len(rays.row):
             density, inside = self._density(rays)
-            density *= rays.crossing
-            total = rays.even_depth.copy()
+            density *= rays.projection
+            total = rays.uniform_density.copy()
             for grid_density in density:
                 total += grid_density
             border = _border(rays, inside)
-            ahead = np.minimum.reduce(border.reshape(-1, len(rays.row)))
-            lost = total * np.maximum(np.minimum(ahead, rays.length) - rays.metres, 0)
-            leaf = lost > rays.depth
-            row = rays.row[leaf]
-            passage.metres[row] = rays.metres[leaf] + rays.depth[leaf] / total[leaf]
-            passage.density[row] = density[:, leaf].T
-            remaining = rays.depth - lost
-            at_end = ~leaf & (ahead >= rays.length)
+            border_m = np.minimum.reduce(border.reshape(-1, len(rays.row)))
+            passed_depth = total * np.maximum(np.minimum(border_m, rays.length) - rays.metres, 0)
+            meets_leaf = passed_depth > rays.depth
+            row = rays.row[meets_leaf]
+            passage.metres[row] = (
+                rays.metres[meets_leaf] + rays.depth[meets_leaf] / total[meets_leaf]
+            )
+            passage.density[row] = density[:, meets_leaf].T
+            remaining = rays.depth - passed_depth
+            at_end = ~meets_leaf & (border_m >= rays.length)
             passage.remaining_depth[rays.row[at_end]] = remaining[at_end]
             rays = rays._replace(
                 depth=remaining,
-                metres=np.maximum(ahead, 0),  # a first border may be before the start, by rounding
-                cell=np.where(border <= ahead, rays.cell + rays.step, rays.cell),
+                # A first border may be before the start, by rounding.
+                metres=np.maximum(border_m, 0),
+                cell=np.where(border <= border_m, rays.cell + rays.step, rays.cell),
             )
-            followed = ~(leaf | at_end)
+            followed = ~(meets_leaf | at_end)
             if not followed.all():
                 rays = rays.take(np.flatnonzero(followed))
         return passage
@@ -171,12 +182,12 @@ class Grids:
         instances: Indices,
         starts: Floats,
         directions: Floats,
-        crossing: Floats,
-        even_depth: Floats,
+        projection: Floats,
+        uniform_density: Floats,
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return light in the voxels at its start, see `through`."""
+        """Return the light of a block in the voxels at its start, see `through`."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]
@@ -186,12 +197,12 @@ class Grids:
         level = np.abs(direction) < _LEVEL
         step = np.where(level, 0, np.sign(direction))
         pace = 1 / np.where(level, 1, direction)
-        never = level | (instances.T < 0)
-        shift = np.where(never, np.inf, ((step > 0) - position) * pace)
+        without_borders = level | (instances.T < 0)
+        shift = np.where(without_borders, np.inf, ((step > 0) - position) * pace)
         pace[level] = 0
         return _GridRays(
             row=np.arange(len(depth)),
-            even_depth=even_depth,
+            uniform_density=uniform_density,
             length=length,
             depth=depth,
             metres=np.zeros(len(depth)),
@@ -201,11 +212,14 @@ class Grids:
             shift=shift,
             size=np.moveaxis(self._sizes[self._part[instances]], 2, 0).swapaxes(1, 2),
             first=self._starts[self._part[instances]].T,
-            crossing=np.where(instances < 0, 0, crossing).T,
+            projection=np.where(instances < 0, 0, projection).T,
         )
 
     def _density(self, rays: _GridRays) -> tuple[Floats, Bools]:
-        """Return the densities at light, and whether its voxels are in a grid: (k, n) each."""
+        """Return leaf area densities, m²/m³, at light, and whether its voxels are in a grid.
+
+        Both are (k, n); densities outside of grids are 0.
+        """
         i, j, k = rays.cell
         size = rays.size
         inside = np.asarray(((rays.cell >= 0) & (rays.cell < size)).all(axis=0))
@@ -215,9 +229,10 @@ class Grids:
 
 
 def _border(rays: _GridRays, inside: Bools) -> Floats:
-    """Return the distances to the borders ahead of light, (3, k, n), metres.
+    """Return the distances from the start to the borders of voxels ahead, (3, k, n), metres.
 
-    Writes infinite shifts for light that leaves a grid for ever.
+    Light that leaves a grid for ever, by `inside` (k, n), has no borders ahead: `rays.shift` is
+    set to inf.
     """
     beyond = ~inside & np.isfinite(rays.shift).any(axis=0)
     if beyond.any():

@@ -19,22 +19,23 @@ from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 # In standard deviations of the system waveform:
 # hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
 NARROW = 0.25
-# planes of neighbouring hits that meet as closely are one surface, see `continue_surfaces`
+# two neighbouring hits whose planes meet within this distance are on one surface, see
+# `continue_surfaces`
 MEET = 1.0
 # Gaussians that are farther apart are fitted separately
 APART = 6.0
 # Gaussians that are nearer are one return
 CLOSE = 1.0
-# a fit may move a Gaussian so far from its first guess
+# largest distance that a fit moves a Gaussian from its first guess
 MOVES = 2.0
 
-FAINT = 0.01  # lowest peak that is found, by the highest peak of the waveform
-CURVED = 0.005  # smallest curvature of a Gaussian that is found, by the highest peak
+FAINT = 0.01  # lowest peak that is found, as a share of the highest sample of the waveform
+CURVED = 0.005  # smallest curvature times variance of a Gaussian that is found, as such a share
 TOGETHER = 4  # largest number of Gaussians that are fitted together
 STEPS = 30  # largest number of steps of Levenberg and Marquardt
-GAIN = 1e-3  # smallest gain of a step after which a fit goes on, by the sum of squares
+GAIN = 1e-3  # share of the sum of squares that a step has to gain for the fit to go on
 ENOUGH = 1e-9  # sum of squares at which a fit stops
-HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
+HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
 _AREA = math.sqrt(2 * math.pi)  # of a Gaussian of height and standard deviation 1
 _KEY_STEPS = 1024  # steps of a sample in which times of hits and peaks are compared
 
@@ -42,19 +43,22 @@ _KEY_STEPS = 1024  # steps of a sample in which times of hits and peaks are comp
 class WaveMarks(NamedTuple):
     """Marks of hits in the order of beams and distances: (n,) each."""
 
-    solid: Bools  # whether a surface was hit
-    starts: Bools  # whether a waveform or a return starts at the hit
-    apart: Bools  # whether the surface of the hit before does not continue
-    searched: Bools  # whether a surface was hit, of waveforms that may be searched
-    every: Bools  # True
+    solid: Bools  # whether the hit is on a surface, not in the air
+    # Whether a waveform starts at the hit, after `divide_into_waveforms`; in waveforms that
+    # `search_waveforms` searches, whether a peak does. `make_returns` clears the marks of hits that
+    # continue a surface: then a return starts at each mark.
+    starts: Bools
+    apart: Bools  # whether the surface of the hit before does not continue at the hit
+    searched: Bools  # whether the hit is `solid`, in a waveform too wide for the closed form
+    all_start: Bools  # always True: before a search, `continue_surfaces` takes each hit as a return
 
 
 class WaveHits(NamedTuple):
     """Hits that have energy, in the order of beams and distances."""
 
-    beam: Ints  # (n,)
-    pulses: PulseHits
-    energy: Floats  # (n,)
+    beam: Ints  # (n,): number of the beam in the batch
+    pulses: PulseHits  # sub-rays, distances and original rows of the hits
+    energy: Floats  # (n,): as if all of the beam were in the hit's sub-ray
     velocity: Floats  # (n,): radial, m/s; empty if returns have none
     marks: WaveMarks
 
@@ -62,8 +66,8 @@ class WaveHits(NamedTuple):
 class WaveLight(NamedTuple):
     """Light of hits in the order of beams and distances: (n,) each."""
 
-    time: Floats  # samples
-    energy: Floats  # of a pulse of energy 1
+    time: Floats  # samples from range 0
+    energy: Floats  # height of the hit's Gaussian: the hit's share of the energy of the beam
 
 
 class WaveSampling(NamedTuple):
@@ -74,24 +78,26 @@ class WaveSampling(NamedTuple):
 
 
 class WavePeaks(NamedTuple):
-    """Peaks that hits have in waveforms that were searched, see `search`."""
+    """Peak to which each hit belongs, in the waveforms that `search_waveforms` searches."""
 
-    number: Ints  # (n,): number of the peak to which a hit belongs, or -1
-    shapes: Floats  # (3, n): time of the peak, samples, its energy and width
+    number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
+    # (3, n): time of the peak, samples from range 0, energy, and width as a multiple of that of the
+    # system waveform.
+    shapes: Floats
 
 
 class WaveReturnArrays(NamedTuple):
     """Arrays to which returns are written: (k,) each."""
 
-    beam: Ints
-    row: Ints  # of the strongest hit
+    beam: Ints  # number of the beam in the batch
+    row: Ints  # of the strongest hit, in the table of hits before sorting
     distance: Floats  # metres
     energy: Floats
     velocity: Floats  # radial, m/s
-    width: Floats  # by the width of the system waveform
+    width: Floats  # as a multiple of the width of the system waveform
 
     def first(self, count: int) -> WaveReturnArrays:
-        """Return copies of the first returns, which a loop has written."""
+        """Return copies of the first `count` returns, which a loop has written."""
         return WaveReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
@@ -103,13 +109,17 @@ class WaveReturnArrays(NamedTuple):
 
 
 class FitScratch(NamedTuple):
-    """Scratch memory for a fit of `TOGETHER` Gaussians to `length` samples."""
+    """Scratch memory for a fit of up to `TOGETHER` Gaussians to up to `length` samples.
+
+    Heights are shares of the highest sample, positions and widths are in standard deviations of
+    the system waveform.
+    """
 
     best: Floats  # (3, TOGETHER): heights, positions and widths; first the guess, then the fit
-    guess: Floats  # (3, TOGETHER)
-    trial: Floats  # (3, TOGETHER)
+    guess: Floats  # (3, TOGETHER): the same of the guess
+    trial: Floats  # (3, TOGETHER): the same after the step that is tried
     lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): Cholesky's lower triangle
-    slopes: Floats  # (3 * TOGETHER, length): of the Gaussians, by parameter
+    slopes: Floats  # (3 * TOGETHER, length): derivatives of the sum by each parameter
     new_slopes: Floats  # (3 * TOGETHER, length)
     residual: Floats  # (length,)
     new_residual: Floats  # (length,)
@@ -122,10 +132,10 @@ class GaussianScratch(NamedTuple):
     curvature: Floats  # second differences of the samples
     minima: Ints  # samples where the curvature has a minimum
     x: Floats  # samples of a piece, in standard deviations of the system waveform
-    y: Floats  # heights of a piece, by the highest peak
-    time: Floats  # of the Gaussians, samples
-    height: Floats
-    width: Floats
+    y: Floats  # samples of a piece, as shares of the highest sample
+    time: Floats  # of the Gaussians, samples from range 0
+    height: Floats  # in units of the samples
+    width: Floats  # in standard deviations of the system waveform
     fit: FitScratch
 
 
@@ -133,7 +143,7 @@ class SearchScratch(NamedTuple):
     """Scratch memory for waveforms of up to `length` samples."""
 
     samples: Floats  # (length,)
-    peaks: Floats  # (3, length): times of peaks, samples, their energies and widths
+    peaks: Floats  # (3, length): peaks of a waveform, as in `WavePeaks.shapes`
     stops: Ints  # (length,): where peaks end, in `_KEY_STEPS` of a sample, from the first sample
     gaussians: GaussianScratch
 
@@ -143,7 +153,7 @@ class SampledWaveform(NamedTuple):
 
     samples: Floats  # (length or more,)
     length: np.int64
-    first: np.int64  # number of the first sample
+    first: np.int64  # number of the first sample, counted from range 0
     top: float  # highest sample
     sigma: float  # standard deviation of the system waveform, samples
 
@@ -232,15 +242,19 @@ def _peaks(wave, stops, peaks):
 
 
 @stage
-def _residual(x, y, samples, gaussians, count, residual, slopes):
-    """Write the residual of a sum of Gaussians, and its slopes; return the sum of squares."""
-    for s in range(samples):
+def _residual(x, y, sample_count, gaussians, count, residual, slopes):
+    """Write the residual of a sum of `count` Gaussians, and slopes; return the sum of squares.
+
+    `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
+    a `FitScratch`.
+    """
+    for s in range(sample_count):
         residual[s] = y[s]
     for k in range(count):
         height = gaussians[0, k]
         position = gaussians[1, k]
         width = gaussians[2, k]
-        for s in range(samples):
+        for s in range(sample_count):
             z = (x[s] - position) / width
             bell = exp(-0.5 * (z * z))
             residual[s] -= height * bell
@@ -249,7 +263,7 @@ def _residual(x, y, samples, gaussians, count, residual, slopes):
             slopes[count + k, s] = slope
             slopes[2 * count + k, s] = slope * z
     cost = 0.0
-    for s in range(samples):
+    for s in range(sample_count):
         cost += residual[s] * residual[s]
     return cost
 
@@ -269,17 +283,17 @@ def _solve(lower, size, step):
 
 
 @stage
-def _step(residual, slopes, samples, count, damping, lower, step):
+def _step(residual, slopes, sample_count, count, damping, lower, step):
     """Write a step of Levenberg and Marquardt for `count` Gaussians, by Cholesky's method."""
     size = 3 * count
     for row in range(size):
         gradient = 0.0
-        for s in range(samples):
+        for s in range(sample_count):
             gradient += slopes[row, s] * residual[s]
         step[row] = gradient
         for column in range(row + 1):
             element = 0.0
-            for s in range(samples):
+            for s in range(sample_count):
                 element += slopes[row, s] * slopes[column, s]
             if row == column:
                 element = element * (1 + damping) + 1e-12
@@ -293,12 +307,13 @@ def _step(residual, slopes, samples, count, damping, lower, step):
 
 
 @stage
-def _fit(x, y, samples, count, scratch):
-    """Fit a sum of `count` Gaussians to `samples` by least squares, in `scratch.best`.
+def _fit(x, y, sample_count, count, scratch):
+    """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x`, by least squares.
 
     The method is that of Levenberg and Marquardt; the fit stops when a step gains too little, or
     after `STEPS`. Heights are at most `HIGHEST`, positions within `MOVES` of the guess, and widths,
-    standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess.
+    standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess, and
+    receives the fit.
     """
     best = scratch.best
     guess = scratch.guess
@@ -311,17 +326,17 @@ def _fit(x, y, samples, count, scratch):
     for row in range(3):
         for k in range(count):
             guess[row, k] = best[row, k]
-    widest = max((x[samples - 1] - x[0]) / (4 * count), 1.5)
+    widest = max((x[sample_count - 1] - x[0]) / (4 * count), 1.5)
     damping = 1e-3
-    cost = _residual(x, y, samples, best, count, residual, slopes)
+    cost = _residual(x, y, sample_count, best, count, residual, slopes)
     for _ in range(STEPS):
-        _step(residual, slopes, samples, count, damping, scratch.lower, step)
+        _step(residual, slopes, sample_count, count, damping, scratch.lower, step)
         for k in range(count):
             position = best[1, k] + step[count + k]
             trial[0, k] = min(max(best[0, k] + step[k], 0.0), HIGHEST)
             trial[1, k] = min(max(position, guess[1, k] - MOVES), guess[1, k] + MOVES)
             trial[2, k] = min(max(best[2, k] + step[2 * count + k], 1.0), widest)
-        new_cost = _residual(x, y, samples, trial, count, new_residual, new_slopes)
+        new_cost = _residual(x, y, sample_count, trial, count, new_residual, new_slopes)
         better = new_cost < cost
         converged = better and cost - new_cost <= GAIN * cost
         converged = converged or new_cost <= ENOUGH or damping >= 1e6
@@ -338,8 +353,12 @@ def _fit(x, y, samples, count, scratch):
 
 
 @stage
-def _guess_gaussians(wave, scratch):
-    """Write the minima of the second derivative to `minima`; return their number."""
+def _find_minima(wave, scratch):
+    """Write the samples at which the second derivative is minimal; return their number.
+
+    Each minimum is the first guess of a Gaussian. `scratch` is a `GaussianScratch`, whose `minima`
+    receive indices of samples.
+    """
     samples = wave.samples
     length = wave.length
     variance = wave.sigma * wave.sigma
@@ -359,7 +378,11 @@ def _guess_gaussians(wave, scratch):
 
 @stage
 def _fit_piece(wave, begin, stop, first, end, scratch):
-    """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform."""
+    """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform.
+
+    Writes `time`, `height` and `width` of `scratch`, a `GaussianScratch`, whose `minima` are the
+    guess.
+    """
     samples = wave.samples
     sigma = wave.sigma
     minima = scratch.minima
@@ -389,7 +412,7 @@ def _fit_piece(wave, begin, stop, first, end, scratch):
 
 @stage
 def _sort_gaussians(scratch, count, faintest):
-    """Sort Gaussians that are at least `faintest` high by time; return their number.
+    """Sort Gaussians by time, without those lower than `faintest`; return their number.
 
     A fit may move a Gaussian beyond its piece.
     """
@@ -418,7 +441,11 @@ def _sort_gaussians(scratch, count, faintest):
 
 @stage
 def _join_gaussians(wave, scratch, count, stops, peaks):
-    """Join close Gaussians, write the result to `stops` and `peaks`, and return its size."""
+    """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
+
+    See `SearchScratch`. A peak has the sum, mean and variance of its Gaussians, and ends half-way
+    to the next peak.
+    """
     sigma = wave.sigma
     time = scratch.time
     height = scratch.height
@@ -458,7 +485,7 @@ def _gaussians(wave, scratch, stops, peaks):
     points of inflection around the minima), none narrower than the system waveform.
     """
     minima = scratch.minima
-    count = _guess_gaussians(wave, scratch)
+    count = _find_minima(wave, scratch)
     # A piece is fitted by itself: `begin` is its first Gaussian, `first` its first sample.
     begin = 0
     first = 0
@@ -482,7 +509,9 @@ def _gaussians(wave, scratch, stops, peaks):
 def order_hits(subrays, ray, distance, energy, row):
     """Write the rows of hits that have energy to `row[:, 0]`, by beam, then by distance.
 
-    Returns the number of hits, and the largest number of hits of a beam, of `subrays` sub-rays.
+    Hits are in the order of rays, which are sub-rays: `subrays` of each beam. `row` is
+    `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
+    of hits that have energy, and the largest number of hits of a beam.
     """
     count = 0
     begin = 0
@@ -515,7 +544,7 @@ def _end_of_beam(beam, begin):
 
 @inlined
 def _is_apart(apart, first, end):
-    """Return whether a surface does not continue at a hit after `first` and before `end`."""
+    """Return whether hits `first` to `end` are on more than one surface, by the marks `apart`."""
     any_apart = False
     for k in range(first + 1, end):
         any_apart |= apart[k]
@@ -523,19 +552,22 @@ def _is_apart(apart, first, end):
 
 
 @compiled()
-def divide(hits, sigma_m, neighbours, parts):
-    """Mark where waveforms start, and write the rows of waveforms to search; return their number.
+def divide_into_waveforms(hits, sigma_m, neighbours, parts):
+    """Mark where waveforms start, and write the waveforms to search; return their number.
 
-    Hits that are together, and yet not narrow, are searched unless they are on one surface. `hits`
-    are `WaveHits`, `sigma_m` is the standard deviation of the system waveform, and `parts` (k, 2)
-    receives first hits and the hits after the last.
+    A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
+    that of the hit before. A waveform is searched if its hits are farther apart than `NARROW`, and
+    not on one surface. `hits` are `WaveHits`, whose marks `starts`, `apart` and `searched` are
+    written; `sigma_m` is the standard deviation of the system waveform in range, and `neighbours`
+    are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the hit after the last,
+    of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
     starts = hits.marks.starts
     apart = hits.marks.apart
     searched = hits.marks.searched
-    surface_marks = SurfaceMarks(searched, hits.marks.every, apart)
+    surface_marks = SurfaceMarks(searched, hits.marks.all_start, apart)
     count = 0
     begin = 0
     while begin < len(beam):
@@ -569,7 +601,7 @@ def divide(hits, sigma_m, neighbours, parts):
     return count
 
 
-def room_for(length: int) -> SearchScratch:
+def scratch_for(length: int) -> SearchScratch:
     """Return scratch memory for waveforms of up to `length` samples."""
     size = 3 * TOGETHER
     fit = FitScratch(
@@ -599,7 +631,7 @@ def room_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return the number of the peak of a waveform, among `count`, to which a hit belongs."""
+    """Return the number of the peak, among `count`, to which a hit at a time belongs."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
@@ -608,11 +640,12 @@ def _peak_of_hit(time, wave, stops, count):
 
 
 @compiled()
-def search(light, parts, sampling, starts, peaks, scratch):
-    """Find the peaks of hits in waveforms, from `parts[k, 0]` to `parts[k, 1]` each.
+def search_waveforms(light, parts, sampling, starts, peaks, scratch):
+    """Sample waveforms, and write the peak to which each of their hits belongs.
 
-    `light` is a `WaveLight`, `sampling` a `WaveSampling`, and `scratch` a `SearchScratch`. Writes
-    `peaks`, `WavePeaks`, and marks in `starts` (n,) the first hits of peaks.
+    Waveform k is that of the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
+    `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. Writes `peaks`, `WavePeaks`,
+    and marks in `starts` (n,) the first hits of peaks.
     """
     sigma = sampling.sigma
     time = light.time
@@ -644,11 +677,12 @@ def search(light, parts, sampling, starts, peaks, scratch):
 def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Write the returns of the waveforms of beams to `output`, see `waveform.returns_in`.
 
-    `hits` are `WaveHits`, `peaks` `WavePeaks`, and `output` is a `WaveReturnArrays`; `sigma_m` is
-    the standard deviation of the system waveform in range. Hits of a return are one Gaussian with
-    their mean and variance. Returns the number of returns.
+    `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbours` `pulse_loops.Neighbours`, and `output`
+    is a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in range. A
+    return starts at each mark `starts`, unless the hit continues a surface: such marks are cleared.
+    Hits of a return are one Gaussian with their mean and variance. Returns the number of returns.
 
-    The arrays are taken from their tuples once: in each return, numba would count them again.
+    The arrays are taken from their tuples once: numba counts references at each access.
     """
     beam = hits.beam
     energy = hits.energy
@@ -661,10 +695,10 @@ def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # no
     begin = 0
     while begin < len(beam):
         end = _end_of_beam(beam, begin)
-        several = False
+        has_several_returns = False
         for k in range(begin + 1, end):
-            several |= starts[k]
-        if several and len(neighbours.pairs):
+            has_several_returns |= starts[k]
+        if has_several_returns and len(neighbours.pairs):
             continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
         for k in range(begin + 1, end + 1):
             if k < end and not starts[k]:

@@ -38,7 +38,7 @@ class WaveformStep(PulseStep):
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns in the waveforms of the hits of a batch."""
+        """Return the returns in the waveforms of the hits of a batch; their `ray` is the beam."""
         digitizer = Digitizer.for_sensor(self.setup)
         in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
@@ -46,10 +46,10 @@ class WaveformStep(PulseStep):
 
 @dataclass(frozen=True)
 class Digitizer:
-    """Sampling of waveforms, and the search for returns."""
+    """Settings of a receiver that samples waveforms and searches them for returns."""
 
-    sigma_ns: float  # standard deviation of the system waveform
-    sample_ns: float  # time between samples
+    sigma_ns: float  # standard deviation of the system waveform, ns
+    sample_ns: float  # time between samples, ns
     decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
 
     @classmethod
@@ -71,7 +71,7 @@ class Digitizer:
 
     @property
     def reach(self) -> int:
-        """Samples that a return reaches before and behind its peak."""
+        """Number of samples before, and behind, the peak of a return where the return is not 0."""
         return int(np.ceil(CUT * self.sigma))
 
     @property
@@ -82,7 +82,8 @@ class Digitizer:
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
         """Return heights of returns (n,) by energy and full width at half maximum, ns.
 
-        A width of 0 is unknown.
+        A return as wide as the system waveform is as high as its energy. A width of 0 is unknown,
+        and taken as that of the system waveform.
         """
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
@@ -100,13 +101,17 @@ def returns_in(
     Parameters
     ----------
     hits
-        Hits of sub-rays, in the order of sub-rays.
+        Hits of sub-rays, in the order of sub-rays; `ray` is the sub-ray, counted in the batch.
     digitizer
         Sampling of the waveforms.
     subrays
         Sub-rays of a beam.
     planes
         Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+
+    Returns
+    -------
+    Returns whose `ray` is the beam, counted in the batch. Hits without energy are dropped.
     """
     from . import wave_loops  # not before: numba takes half a second to import
 
@@ -114,7 +119,8 @@ def returns_in(
     count = len(wave_hits.beam)
     neighbours = neighbours_of(subrays, planes)
     parts = np.empty((count, 2), np.int64)
-    parts = parts[: wave_loops.divide(wave_hits, digitizer.sigma_m, neighbours, parts)]
+    part_count = wave_loops.divide_into_waveforms(wave_hits, digitizer.sigma_m, neighbours, parts)
+    parts = parts[:part_count]
     peaks = _search(wave_hits, digitizer, subrays, parts)
     output = wave_loops.WaveReturnArrays(
         beam=np.empty(count, np.int64),
@@ -140,7 +146,10 @@ def returns_in(
 
 
 def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
-    """Return the hits that have energy for loops, by beam, then by distance."""
+    """Return the hits that have energy, sorted by beam, then by distance, for loops.
+
+    `marks.solid` and `marks.all_start` are filled in; loops write the other marks.
+    """
     from . import pulse_loops, wave_loops
 
     ray = owned(hits.ray, np.int64)
@@ -154,6 +163,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
         subray=ray[order],
         distance=distance[order],
         row=row,
+        # Scratch memory of `continue_surfaces`.
         subray_hits=np.empty(max_hits * subrays, np.int64),
         changes=np.empty(max_hits + 1, np.int64),
     )
@@ -162,7 +172,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
         starts=np.empty(count, np.bool_),
         apart=np.empty(count, np.bool_),
         searched=np.empty(count, np.bool_),
-        every=np.ones(count, np.bool_),
+        all_start=np.ones(count, np.bool_),
     )
     return wave_loops.WaveHits(
         beam=pulse_hits.subray // subrays,
@@ -174,7 +184,11 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
 
 
 def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> WavePeaks:
-    """Return the peaks of hits in waveforms; parts (k, 2) are first hits and ends of waveforms."""
+    """Return the peaks of hits in waveforms that are searched; mark where peaks start.
+
+    `parts` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
+    `hits.marks.starts`.
+    """
     from . import wave_loops
 
     count = len(hits.beam)
@@ -184,8 +198,8 @@ def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> 
     distance = hits.pulses.distance
     lengths_m = distance[parts[:, 1] - 1] - distance[parts[:, 0]]
     longest = int(float(lengths_m.max()) * digitizer.samples_per_m)
-    scratch = wave_loops.room_for(longest + 2 * digitizer.reach + 8)
+    scratch = wave_loops.scratch_for(longest + 2 * digitizer.reach + 8)
     sampling = wave_loops.WaveSampling(digitizer.sigma, digitizer.decomposes)
     light = wave_loops.WaveLight(distance * digitizer.samples_per_m, hits.energy / subrays)
-    wave_loops.search(light, parts, sampling, hits.marks.starts, peaks, scratch)
+    wave_loops.search_waveforms(light, parts, sampling, hits.marks.starts, peaks, scratch)
     return peaks
