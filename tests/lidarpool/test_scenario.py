@@ -429,16 +429,16 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     told = [note for note in advice(build(made)) if "up_axis" in note]
     assert len(told) == bool(says)
     if says:
-        assert says in told[0] and "give {file: …, up_axis: z}; any" in told[0]
+        assert says in told[0] and "give {file: …, up_axis: z}; set" in told[0]
 
 
 def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
     mesh_file(tmp_path / "hall.glb", (8, 6, 2), 0, generator="Blender", version="2.0")
     made = Scenario.from_data({"scene": {"files": ["hall.glb"]}}, folder=tmp_path)
-    assert any("give {file: …, up_axis: z}; any" in note for note in advice(build(made)))
+    assert any("give {file: …, up_axis: z}; set" in note for note in advice(build(made)))
     assert not caplog.messages
     Scene.load(tmp_path / "hall.glb")
-    assert 'give Scene.load(path, up_axis="z"); any up_axis ends' in caplog.messages[0]
+    assert 'give Scene.load(path, up_axis="z"); set up_axis to' in caplog.messages[0]
 
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):

@@ -104,7 +104,7 @@ def test_vertices_are_at_the_middles_of_pixels(tmp_path, suffix, meaning):
 def test_rotated_and_sheared_rasters(tmp_path, mirrored):
     turned = np.array([[1.6, -0.9], [0.7, 1.8]]) @ np.diag([2, -2 * mirrored])
     place = Affine(*turned[0], X0, *turned[1], Y0)
-    mesh, *_ = read(write(tmp_path / "m.tif", storage=place))
+    mesh, *_ = read(write(tmp_path / "m.tif", place=place))
     columns, rows = np.meshgrid(np.arange(8) + 0.5, np.arange(6) + 0.5)
     middles = np.stack([columns.ravel(), rows.ravel()], axis=1) @ turned.T + [X0, Y0]
     np.testing.assert_allclose(mesh.vertices, np.column_stack([middles, SLOPE.ravel()]), rtol=1e-14)
@@ -162,7 +162,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     east, south = np.meshgrid(np.arange(40), np.arange(60))
     place = from_origin(-58.5, -34.5, 1 / 1200, 1 / 1200)
     heights = 3.0 * east - 2.0 * south
-    mesh, taken, _ = read(write(tmp_path / "m.tif", heights, crs="EPSG:4326", storage=place))
+    mesh, taken, _ = read(write(tmp_path / "m.tif", heights, crs="EPSG:4326", place=place))
     assert taken.epsg == 32721 and " from EPSG:4326" in taken.summary
     x, y, z = mesh.vertices.T
     longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
@@ -180,7 +180,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     column = (longitude + 58.5) * 1200
     row = (-34.5 - latitude) * 1200
     np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=0.3)
-    wide = write(tmp_path / "wide.tif", crs="EPSG:4326", storage=from_origin(-10, 50, 5, 1))
+    wide = write(tmp_path / "wide.tif", crs="EPSG:4326", place=from_origin(-10, 50, 5, 1))
     with pytest.raises(LidarError, match=r"spans 40 degrees.*give cloud\.epsg"):
         read(wide)
     assert read(wide, epsg=3035)[1].epsg == 3035
@@ -192,7 +192,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
 
 def test_what_states_no_place(tmp_path):
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
-        path = write(tmp_path / "m.tif", crs=None, storage=())
+        path = write(tmp_path / "m.tif", crs=None, place=())
     mesh, taken, notes = read(path)
     assert by_place(mesh)[0.5, 5.5] == 0 and by_place(mesh)[7.5, 0.5] == 47 and taken.crs == ""
     assert ["no place" in notes[0], "no coordinate system" in notes[1]] == [True, True]

@@ -226,7 +226,7 @@ def test_columns_of_actors(scene, name, scenes, backend):
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
     survey = MADE["on the move"]
     spans = [(0, 9), (9, 28)]
-    monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
+    monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(finish=lambda scans: None))
     tasks = []
     for name in (backend, "numpy"):
         rig = Rig(scenes["both"], survey, name)

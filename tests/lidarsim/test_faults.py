@@ -229,7 +229,7 @@ def test_images_find_the_rays_of_frozen_sweeps():
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
     image = Image.from_points(sweeps, 2, points)
-    azimuth = image.of_rays()["azimuth"][image.row, image.column]
+    azimuth = image.ray_arrays()["azimuth"][image.row, image.column]
     np.testing.assert_allclose(azimuth, some["azimuth"], atol=1e-4)
 
 
