@@ -111,9 +111,14 @@ def recorded(
     if cache is None or not cache.exists():
         sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
         scanner = Scanner(
-            scene or street(), sensor, columns=["intensity"], noise=noise, precision_m=1e-4,
-            coordinates="sensor", threads=1,
-        )  # fmt: skip
+            scene or street(),
+            sensor,
+            columns=["intensity"],
+            noise=noise,
+            precision_m=1e-4,
+            coordinates="sensor",
+            threads=1,
+        )
         clouds = [scanner.sweep(position, number=number) for number in range(sweeps)]
         arrays = {
             f"{name}{number}": values

@@ -125,8 +125,15 @@ def draw_deviations(axes: Any, comparison: Comparison) -> None:
     for source, values in comparison.deviations_mm.items():
         if values.any():  # without noise there is nothing to draw
             share = np.full(len(values), 1 / len(values))
-            axes.hist(values, 61, range=(-limit, limit), weights=share, histtype="step",
-                      color=COLOURS[source], label=source)  # fmt: skip
+            axes.hist(
+                values,
+                61,
+                range=(-limit, limit),
+                weights=share,
+                histtype="step",
+                color=COLOURS[source],
+                label=source,
+            )
 
 
 def main() -> None:

@@ -265,10 +265,12 @@ def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, 
     """Count coordinates of the device's rays of hits that differ from expected rays."""
     parts: list[tuple[Float, Float]] = []
     caster.visit(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
-    return int(sum(
-        (rays != np.concatenate(arrays, axis=1).T).sum()
-        for arrays, rays in zip(zip(*parts, strict=True), expected, strict=True)
-    ))  # fmt: skip
+    return int(
+        sum(
+            (rays != np.concatenate(arrays, axis=1).T).sum()
+            for arrays, rays in zip(zip(*parts, strict=True), expected, strict=True)
+        )
+    )
 
 
 def leaks(session: Session) -> Rows:

@@ -58,10 +58,12 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     vertices[..., :2] = middle[:, None] + box[:, :2] * half[:, None]
     vertices[..., 2] = (box[:, 2] + 1) / 2 * height[:, None]
     buildings = faces + len(box) * np.arange(count)[:, None, None]
-    return joined([
-        (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
-        flat_ground(side, pitch),
-    ])  # fmt: skip
+    return joined(
+        [
+            (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
+            flat_ground(side, pitch),
+        ]
+    )
 
 
 def panelled_box(panels: int) -> Mesh:

@@ -55,10 +55,20 @@ def add_workers(scheduler: Any, number: int) -> None:
     for index in range(number):
         address = f"tcp://10.{index >> 16}.{index >> 8 & 255}.{index & 255}:1"
         worker = WorkerState(
-            address=address, status=Status.running, pid=0, name=index, nthreads=1,
-            memory_limit=0, local_directory="", nanny=None, server_id=address,
-            services={}, versions={}, extra={}, scheduler=scheduler,
-        )  # fmt: skip
+            address=address,
+            status=Status.running,
+            pid=0,
+            name=index,
+            nthreads=1,
+            memory_limit=0,
+            local_directory="",
+            nanny=None,
+            server_id=address,
+            services={},
+            versions={},
+            extra={},
+            scheduler=scheduler,
+        )
         scheduler.workers[address] = worker
         scheduler.aliases[index] = address
         scheduler.running.add(worker)
@@ -107,9 +117,15 @@ class Tasks:
         """End tasks, and remove them from the scheduler."""
         for state in states:
             self.scheduler.transition(
-                state.key, "memory", "benchmark", worker=state.processing_on.address,
-                nbytes=1, type=b"", typename="int", startstops=[],
-            )  # fmt: skip
+                state.key,
+                "memory",
+                "benchmark",
+                worker=state.processing_on.address,
+                nbytes=1,
+                type=b"",
+                typename="int",
+                startstops=[],
+            )
             self.scheduler.transitions({state.key: "forgotten"}, "benchmark")
 
 

@@ -288,10 +288,14 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
         counts = CostSamples(scans, processes)
         with tempfile.TemporaryDirectory() as folder:
             result = simulate(
-                ROOM, small_survey(scans), client=client, backend="numpy",
-                folder=Path(folder) / "run", on_progress=counts,
+                ROOM,
+                small_survey(scans),
+                client=client,
+                backend="numpy",
+                folder=Path(folder) / "run",
+                on_progress=counts,
                 collectors=max(2, gpus // GPUS_EACH),
-            )  # fmt: skip
+            )
     casting = next(stage for stage in result.stages if stage.stage == "intersect")
     casting_s = min(MINUTE_S, casting.stop - casting.start)
     until = casting.start + casting_s

@@ -52,9 +52,19 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     def cast() -> int:
         for k in range(len(origins)):
             mujoco.mj_multiRay(
-                model, data, origins[k], rays[k], None, True, -1, geom[k], distance[k], None,
-                beams, max_range_m,
-            )  # fmt: skip
+                model,
+                data,
+                origins[k],
+                rays[k],
+                None,
+                True,
+                -1,
+                geom[k],
+                distance[k],
+                None,
+                beams,
+                max_range_m,
+            )
         return int(((distance >= 0) & (distance <= max_range_m)).sum())
 
     return cast

@@ -49,9 +49,17 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
     with importlib.resources.as_file(files / "intersect.cu") as kernels:
         flags = [flag for flag in cuda_backend.flags(_STACK, False, False) if flag != "-fmad=false"]
         command = [
-            "g++", "-O2", "-ffp-contract=off", "-shared", "-fPIC", *flags,
-            f'-DSOURCE="{kernels}"', "-o", str(library), str(_HOST / "intersect.cpp"),
-        ]  # fmt: skip
+            "g++",
+            "-O2",
+            "-ffp-contract=off",
+            "-shared",
+            "-fPIC",
+            *flags,
+            f'-DSOURCE="{kernels}"',
+            "-o",
+            str(library),
+            str(_HOST / "intersect.cpp"),
+        ]
         subprocess.run(command, check=True)
     loaded = ctypes.CDLL(str(library))
     loaded.what_was_seen.restype = ctypes.POINTER(ctypes.c_longlong)

@@ -200,9 +200,15 @@ def _annotate(
     if mark:
         axes.axvline(position[0], color=colour, lw=0.9 * unit, ls=(0, (3, 2)))
     axes.annotate(
-        words, position, xytext=(5 * unit, 5 * unit), textcoords="offset points", family=FONT,
-        fontsize=6.8 * unit, color=colour, va="bottom",
-    )  # fmt: skip
+        words,
+        position,
+        xytext=(5 * unit, 5 * unit),
+        textcoords="offset points",
+        family=FONT,
+        fontsize=6.8 * unit,
+        color=colour,
+        va="bottom",
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -108,9 +108,12 @@ class Backend(ABC):
         """Return the closest hit of every ray, misses included."""
         n = len(rays)
         hits = Hits(
-            np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n),
+            np.full(n, np.inf),
             np.full(n, -1, np.int32),
-        )  # fmt: skip
+            np.zeros(n),
+            np.zeros(n),
+            np.full(n, -1, np.int32),
+        )
         for start in range(0, n, self.chunk):
             chunk_hits = self.closest(rays.part(start, start + self.chunk))
             row = start + chunk_hits.ray.astype(np.int64)

@@ -85,9 +85,14 @@ class CudaBackend(Backend):
         with self._device:
             masks = layout.masks or Masks(*NO_MASKS)
             tables: tuple[AnyArray, ...] = (
-                layout.nodes, layout.triangles, layout.corners, layout.faces,
-                masks.uv, masks.mask, masks.records,
-            )  # fmt: skip
+                layout.nodes,
+                layout.triangles,
+                layout.corners,
+                layout.faces,
+                masks.uv,
+                masks.mask,
+                masks.records,
+            )
             self._meshes = tuple(to_device(cupy, table) for table in tables)
             no_table = to_device(cupy, np.zeros(2, np.int64))
             self._no_counters = no_table, np.int32(0), cupy.zeros(1, np.int64)
@@ -198,10 +203,21 @@ class CudaBackend(Backend):
             rays, time_index, body, poses, boxes = map(cp.asarray, bodies[:5])
             hits = [cp.asarray(column) for column in columns]
             self._run(
-                "cast_bodies", n, *self._meshes, *self._instance_tables, rays, time_index,
-                np.int64(n), body, np.int32(len(body)), poses, boxes, np.int32(len(poses)),
-                *limits, *hits,
-            )  # fmt: skip
+                "cast_bodies",
+                n,
+                *self._meshes,
+                *self._instance_tables,
+                rays,
+                time_index,
+                np.int64(n),
+                body,
+                np.int32(len(body)),
+                poses,
+                boxes,
+                np.int32(len(poses)),
+                *limits,
+                *hits,
+            )
             for column, target in zip(hits, columns, strict=True):
                 target[:] = column.get()
 
@@ -243,10 +259,15 @@ class CudaBackend(Backend):
         for start, stop in scan.chunks(self.chunk):
             window = (np.int64(rows), np.int64((scan.first + start) % rows))
             arguments = (
-                *self._pose_tables(scan.poses, start, stop), tables[0], tables[-1], *window,
-                *self._pattern_flags(scan, start), *self._motion(scan.poses, start, stop),
-                np.int64(stop - start), *limits,
-            )  # fmt: skip
+                *self._pose_tables(scan.poses, start, stop),
+                tables[0],
+                tables[-1],
+                *window,
+                *self._pattern_flags(scan, start),
+                *self._motion(scan.poses, start, stop),
+                np.int64(stop - start),
+                *limits,
+            )
             yield start, stop - start, arguments
 
     def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
@@ -329,11 +350,21 @@ class CudaBackend(Backend):
         kinds = (np.uint32, np.float64, np.int32, np.int32)
         packed = tuple(cp.empty(int(kept_counts.sum()), kind) for kind in kinds)
         self._run(
-            "pack", n, self._meshes[3], *hits, sums, np.int64(n), np.float64(scale),
-            np.int64(start), *other_hits, cp.asarray(table.astype(np.int32)),
-            np.int32(len(kept_counts)), np.int32(min(groups.keep_every, _MAX_INT)), *counting,
+            "pack",
+            n,
+            self._meshes[3],
+            *hits,
+            sums,
+            np.int64(n),
+            np.float64(scale),
+            np.int64(start),
+            *other_hits,
+            cp.asarray(table.astype(np.int32)),
+            np.int32(len(kept_counts)),
+            np.int32(min(groups.keep_every, _MAX_INT)),
+            *counting,
             *packed,
-        )  # fmt: skip
+        )
         return packed
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:

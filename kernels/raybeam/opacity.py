@@ -97,9 +97,14 @@ class Masks:
     records: Ints
 
     def opaque(
-        self, mesh: Indices, position: Indices, a: Floats, b: Floats, c: Floats,
+        self,
+        mesh: Indices,
+        position: Indices,
+        a: Floats,
+        b: Floats,
+        c: Floats,
         det: Floats,
-    ) -> Bools:  # fmt: skip
+    ) -> Bools:
         """Return a mask (m,) of the rays inside triangles that meet an opaque part.
 
         Parameters

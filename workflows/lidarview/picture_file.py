@@ -276,10 +276,15 @@ class PictureContent:
         names = json.loads(arrays["names"].tobytes())
         mesh_of_actor = arrays["actor_mesh"].tolist()
         meshes = [
-            SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
-                 colours=_colours(arrays, f"{mesh}_colours"), animation=_animation(arrays, mesh))
+            SceneMesh(
+                "",
+                arrays[f"{mesh}_vertices"],
+                arrays[f"{mesh}_faces"],
+                colours=_colours(arrays, f"{mesh}_colours"),
+                animation=_animation(arrays, mesh),
+            )
             for mesh in (f"mesh{number}" for number in range(max(mesh_of_actor, default=-1) + 1))
-        ]  # fmt: skip
+        ]
         actors = []
         for number, name in enumerate(names["actors"]):
             times, positions, rotations = (arrays[f"actor{number}_{part}"] for part in _TRACK)

@@ -115,9 +115,15 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     air = cloud["cause"] == 1
     for which, colour, label in ((~air, SURFACE, "surfaces"), (air, AIR, "air")):
         axes.plot(
-            cloud["range"][which], cloud["intensity"][which], ".", ms=2, mew=0, color=colour,
-            label=f"simulated: {label}", rasterized=True,
-        )  # fmt: skip
+            cloud["range"][which],
+            cloud["intensity"][which],
+            ".",
+            ms=2,
+            mew=0,
+            color=colour,
+            label=f"simulated: {label}",
+            rasterized=True,
+        )
     distance = np.geomspace(0.5, 100, 400)
     alpha = survey.extinction(survey.sensor)
     white = 0.5 * (10 / distance) ** 2

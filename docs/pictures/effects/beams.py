@@ -96,9 +96,12 @@ def picture(path: Path) -> None:
         edges.plot(offsets, exact, color=colour, lw=1.2, label=f"{name}: closed form")
         for count, mark in ((19, "x"), (217, "o")):
             beam = Returns(
-                "all", count, 3.0, beam_profile="even" if name == "even" else "gaussian",
+                "all",
+                count,
+                3.0,
+                beam_profile="even" if name == "even" else "gaussian",
                 pulse_ns=1,
-            )  # fmt: skip
+            )
             sampled = offsets[::4]
             simulated = [share(beam, 0.075 * x) for x in sampled]
             edges.plot(
@@ -118,9 +121,12 @@ def picture(path: Path) -> None:
         waist = EXIT_M / 2
         half = OVAL[axis] / 2000
         widths.loglog(
-            ranges, 2e3 * np.hypot(waist, half * ranges), color=colour, lw=1.2,
+            ranges,
+            2e3 * np.hypot(waist, half * ranges),
+            color=colour,
+            lw=1.2,
             label=f"{label}: 2 √(w0² + (θR/2)²)",
-        )  # fmt: skip
+        )
         sampled = ranges[::6]
         simulated = [4e3 * footprint(beam, distance)[:, axis].std() for distance in sampled]
         widths.loglog(sampled, simulated, "o", ms=4, mfc="none", color=colour, label="simulated")

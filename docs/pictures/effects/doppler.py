@@ -83,9 +83,15 @@ def picture(path: Path) -> None:
         arrowprops={"arrowstyle": "-|>", "color": "#ffd23f", "lw": 2},
     )
     map_axes.text(
-        -9, -4.6, f"sensor, {SPEED:.0f} m/s", color="#ffd23f", ha="center", va="top", fontsize=8,
+        -9,
+        -4.6,
+        f"sensor, {SPEED:.0f} m/s",
+        color="#ffd23f",
+        ha="center",
+        va="top",
+        fontsize=8,
         bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
-    )  # fmt: skip
+    )
     for (_, speed, yaw), trajectory in zip(OTHERS, trajectories, strict=True):
         x, y, _ = trajectory.pose(0, 1e9).position
         dx, dy = np.round([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))], 6)
@@ -98,16 +104,26 @@ def picture(path: Path) -> None:
         side = 3.4 if dy == 0 and y > 0 else -3.4
         label_position = (x + 3.5, y) if dy else (x, y + side)
         map_axes.text(
-            *label_position, f"{speed:.0f} m/s", color="white", ha="left" if dy else "center",
-            va="center", fontsize=8, bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
-        )  # fmt: skip
+            *label_position,
+            f"{speed:.0f} m/s",
+            color="white",
+            ha="left" if dy else "center",
+            va="center",
+            fontsize=8,
+            bbox={"facecolor": DARK, "edgecolor": "none", "pad": 1.5},
+        )
     map_axes.set(
         xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", xlabel="x, m", ylabel="y, m"
     )
     figure.colorbar(
-        points, ax=map_axes, label="radial velocity, m/s: blue comes nearer", location="bottom",
-        shrink=0.85, pad=0.02, aspect=40,
-    )  # fmt: skip
+        points,
+        ax=map_axes,
+        label="radial velocity, m/s: blue comes nearer",
+        location="bottom",
+        shrink=0.85,
+        pad=0.02,
+        aspect=40,
+    )
     level = np.cos(np.radians(batch.elevation))
     shown = np.flatnonzero((np.abs(batch.elevation) < 6) & ~moving)[::3]
     chart.scatter(azimuth[shown], velocity[shown], s=1, color=theme.MUTED, linewidths=0)
@@ -118,19 +134,29 @@ def picture(path: Path) -> None:
         if of_car.any():
             middle = azimuth[of_car].mean(), velocity[of_car].mean()
             chart.annotate(
-                f"car, {speed:.0f} m/s", middle, (6, 8), textcoords="offset points", fontsize=8,
+                f"car, {speed:.0f} m/s",
+                middle,
+                (6, 8),
+                textcoords="offset points",
+                fontsize=8,
                 color=colour,
-            )  # fmt: skip
+            )
     angle = np.linspace(-180, 180, 361)
     chart.plot(
-        angle, -SPEED * np.cos(np.radians(angle)), "--", color=theme.SENSOR, lw=1.2,
+        angle,
+        -SPEED * np.cos(np.radians(angle)),
+        "--",
+        color=theme.SENSOR,
+        lw=1.2,
         label="$-v\\,\\cos\\,$azimuth: what stands still",
-    )  # fmt: skip
+    )
     residual = velocity[~moving] + SPEED * np.cos(np.radians(azimuth[~moving])) * level[~moving]
     chart.set(
-        xlim=(-180, 180), xticks=range(-180, 181, 60), xlabel="azimuth, degrees",
+        xlim=(-180, 180),
+        xticks=range(-180, 181, 60),
+        xlabel="azimuth, degrees",
         ylabel="radial velocity, m/s",
-    )  # fmt: skip
+    )
     chart.set_title(
         f"less than 6° above or below; about the curve of what stands: {residual.std():.3f} m/s",
         fontsize=8.5,

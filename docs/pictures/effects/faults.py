@@ -66,9 +66,14 @@ def picture(path: Path) -> None:
     ):
         values = image(replace(bare, faults=faults))
         axes.imshow(
-            np.log10(values), cmap="viridis", vmin=-2.5, vmax=0.5, aspect="auto", origin="lower",
+            np.log10(values),
+            cmap="viridis",
+            vmin=-2.5,
+            vmax=0.5,
+            aspect="auto",
+            origin="lower",
             interpolation="nearest",
-        )  # fmt: skip
+        )
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_yticks([0, 32, 63])
         axes.tick_params(labelsize=7)

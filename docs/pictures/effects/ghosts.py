@@ -43,15 +43,24 @@ def picture(path: Path) -> None:
                                   ("Van", (2.0, 2.0, 3), (-4.5, 3.5, -1.5)))
     )  # fmt: skip
     meshes = [
-        upright("Window", (-8, 7.5), (8, 7.5)), upright("Shop", (-8, 11), (8, 11)),
-        upright("Street", (-9, -6), (9, -6)), car, van,
-    ]  # fmt: skip
+        upright("Window", (-8, 7.5), (8, 7.5)),
+        upright("Shop", (-8, 11), (8, 11)),
+        upright("Street", (-9, -6), (9, -6)),
+        car,
+        van,
+    ]
     glass = Material("Window", DIRT, transparent="pass", specular_reflectance="fresnel")
     turning = Sensor(Beams(np.radians([-4, 0, 4])), Spin(1800, 360), 0.5, 60.0)
     survey = Survey(
-        turning, poses=[(0, 0, 0)], steps=1, materials=[glass, Material("*", 0.5)],
-        returns=Returns("all"), columns=("cause",), keep_every=1, precision_m=0.001,
-    )  # fmt: skip
+        turning,
+        poses=[(0, 0, 0)],
+        steps=1,
+        materials=[glass, Material("*", 0.5)],
+        returns=Returns("all"),
+        columns=("cause",),
+        keep_every=1,
+        precision_m=0.001,
+    )
     columns = cloud(Scene.from_meshes(meshes), survey)
     ghost = columns["cause"] == 5
     for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
@@ -59,10 +68,15 @@ def picture(path: Path) -> None:
         above.plot(columns["y"][which], -columns["x"][which], ".", ms=3, color=colour, label=name)
     above.plot(0, 0, ">", color=BLUE, ms=8, label="sensor")
     labels = {
-        (6.6, 8.3): "window", (11.3, 7): "shop", (-5.7, 6.5): "street", (-4.2, -5): "car",
-        (2.6, 5.7): "van", (11.7, 3.9): "its ghost", (18, -5): "its ghost",
+        (6.6, 8.3): "window",
+        (11.3, 7): "shop",
+        (-5.7, 6.5): "street",
+        (-4.2, -5): "car",
+        (2.6, 5.7): "van",
+        (11.7, 3.9): "its ghost",
+        (18, -5): "its ghost",
         (16.4, 6.2): "ghost of the street",
-    }  # fmt: skip
+    }
     for offset, name in labels.items():
         above.annotate(name, offset, fontsize=8)
     above.set(aspect="equal", xlim=(-7, 22), ylim=(-9, 9.5), xlabel="ahead (m)", ylabel="left (m)")
@@ -80,9 +94,13 @@ def picture(path: Path) -> None:
         )
         room = [glazing, beside, upright("Behind", (40, 1), (40, -1))]
         scan = cast_scan(
-            room, Sensor(Beams(np.zeros(1)), Spin(1, 360), 0), Noise(), returns=Returns("all"),
-            materials=[glass, Material("*", 1.0)], columns=("object", "reflectance"),
-        )  # fmt: skip
+            room,
+            Sensor(Beams(np.zeros(1)), Spin(1, 360), 0),
+            Noise(),
+            returns=Returns("all"),
+            materials=[glass, Material("*", 1.0)],
+            columns=("object", "reflectance"),
+        )
         for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
             reflectances = scan["reflectance"][scan["object"] == number]
             right.plot(

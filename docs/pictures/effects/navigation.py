@@ -99,13 +99,20 @@ def picture(path: Path) -> None:
     gyroscopes.loglog(tau, total * to_hour, color=theme.INK, lw=1.2, label="closed form, all three")
     one_sigma = deviations / np.sqrt(2 * np.maximum(clusters - 3, 1)) * to_hour
     gyroscopes.errorbar(
-        tau, deviations * to_hour, one_sigma, fmt="o", ms=3.2, color=theme.SENSOR, lw=0.9,
+        tau,
+        deviations * to_hour,
+        one_sigma,
+        fmt="o",
+        ms=3.2,
+        color=theme.SENSOR,
+        lw=0.9,
         label=f"simulated, {HOURS} h at {IMU.rate_hz:.0f} Hz, 3 axes, 1 σ",
-    )  # fmt: skip
+    )
     gyroscopes.set(
-        xlabel="averaging time τ, s", ylabel="Allan deviation of angular velocity, °/h",
+        xlabel="averaging time τ, s",
+        ylabel="Allan deviation of angular velocity, °/h",
         ylim=(total.min() * to_hour / 6, None),
-    )  # fmt: skip
+    )
     gyroscopes.set_title("gyroscopes of a carrier that stands", fontsize=9)
     position_errors = np.concatenate([block.positions for block in fixes(still)])
     hours = np.arange(len(position_errors)) / GNSS.rate_hz / 3600

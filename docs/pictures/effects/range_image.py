@@ -75,20 +75,28 @@ def picture(path: Path) -> None:
         lost = hits & np.isnan(ranges)
         axes.set_facecolor(SKY)
         axes.imshow(
-            ranges, cmap="viridis_r", norm=norm, extent=extent, aspect="auto",
+            ranges,
+            cmap="viridis_r",
+            norm=norm,
+            extent=extent,
+            aspect="auto",
             interpolation="nearest",
-        )  # fmt: skip
+        )
         axes.imshow(
-            np.where(lost, 1.0, np.nan), cmap=ListedColormap([LOST]), extent=extent,
-            aspect="auto", interpolation="nearest",
-        )  # fmt: skip
+            np.where(lost, 1.0, np.nan),
+            cmap=ListedColormap([LOST]),
+            extent=extent,
+            aspect="auto",
+            interpolation="nearest",
+        )
         rays = ranges.size
         returned = int(np.isfinite(ranges).sum())
         axes.set_title(
             f"{title}: {rays:,} rays, {returned:,} returns, {int((~hits).sum()):,} hit nothing"
             + (f", {int(lost.sum()):,} lost" if lost.any() else ""),
-            fontsize=9.5, loc="left",
-        )  # fmt: skip
+            fontsize=9.5,
+            loc="left",
+        )
         axes.set_xticks(range(0, 361, 45))
         axes.set_yticks((-20, -10, 0, 10, 20))
         axes.set_ylabel("elevation (°)", fontsize=9)

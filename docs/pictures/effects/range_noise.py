@@ -56,8 +56,14 @@ def picture(path: Path) -> None:
     scatter.minorticks_off()
     scatter.legend(frameon=False, fontsize=8)
     scatter.set_title("noise: walls at 4 to 250 m", fontsize=10)
-    walk.plot(ratio, -100 * range_walk(WALK, ratio * WALK.threshold), "k-", lw=1, zorder=0,
-              label="−2 cm · √(2 ln E / T)")  # fmt: skip
+    walk.plot(
+        ratio,
+        -100 * range_walk(WALK, ratio * WALK.threshold),
+        "k-",
+        lw=1,
+        zorder=0,
+        label="−2 cm · √(2 ln E / T)",
+    )
     walk.plot([1, 1e6], [0, 0], "k:", lw=1, zorder=0, label="without")
     walk.set(xscale="log", ylabel="mean range − true range, cm")
     walk.legend(frameon=False, fontsize=8)

@@ -60,9 +60,12 @@ def pool() -> list[SceneMesh]:
 def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Real]:
     """Return x and z of points, and angles and energies of their beams."""
     survey = Survey(
-        SCANNER, poses=[(0, 0, HEIGHT)], steps=1, columns=["intensity", "ray"],
+        SCANNER,
+        poses=[(0, 0, HEIGHT)],
+        steps=1,
+        columns=["intensity", "ray"],
         materials=[water, Material("*", FLOOR)],
-    )  # fmt: skip
+    )
     (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
     points = batch  # a survey with water is cast by the host
     ray = points.found.ray  # type: ignore[union-attr]
@@ -96,8 +99,11 @@ def picture(path: Path) -> None:
         section.plot(
             side * (apparent_range * np.sin(angles))[visible_side],
             (HEIGHT - apparent_range * np.cos(angles))[visible_side],
-            color=INK, lw=1, zorder=6, label="floor by Snell's law" if side > 0 else None,
-        )  # fmt: skip
+            color=INK,
+            lw=1,
+            zorder=6,
+            label="floor by Snell's law" if side > 0 else None,
+        )
     for nadir in np.radians([-20, -40]):
         down = np.arcsin(np.sin(nadir) / INDEX)
         top = HEIGHT * np.tan(nadir)
@@ -126,9 +132,14 @@ def picture(path: Path) -> None:
         _, _, nadir, energy = cast(plain, material)
         shown = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
         energies.plot(
-            np.degrees(nadir[shown]), energy[shown], "o", ms=4, mfc="none", color=colour,
+            np.degrees(nadir[shown]),
+            energy[shown],
+            "o",
+            ms=4,
+            mfc="none",
+            color=colour,
             label=f"simulated, {name} refraction",
-        )  # fmt: skip
+        )
     energies.plot(np.degrees(angles), exact, color=INK, lw=1, label="Snell, Fresnel, Beer–Lambert")
     energies.set(xlabel="angle from nadir (°)", ylabel="energy of the floor", ylim=(0, None))
     energies.set_title("n = 1.33, attenuation 0.15 / m", fontsize=11, color=INK)

@@ -35,9 +35,15 @@ def with_effect(survey: Survey) -> Survey:
 def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
     """Return range and signal of the samples of a white wall's waveform."""
     survey = Survey(
-        fixed_beams(1), poses=[(0, 0, 0)], steps=1, materials=MATERIALS["W"], noise=noise,
-        columns=COLUMNS, returns=Returns(waveform="peaks", sample_ns=0.25), waveform_samples=160,
-    )  # fmt: skip
+        fixed_beams(1),
+        poses=[(0, 0, 0)],
+        steps=1,
+        materials=MATERIALS["W"],
+        noise=noise,
+        columns=COLUMNS,
+        returns=Returns(waveform="peaks", sample_ns=0.25),
+        waveform_samples=160,
+    )
     part = columns_of(list(Rig(Scene.from_meshes([wall("W", wall_m)]), survey, "numpy").cast(0, 1)))
     table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
     waves = part.cloud(table, survey.precision_m, np.zeros(3)).waveforms
@@ -69,8 +75,12 @@ def picture(path: Path) -> None:
         pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=1.5, label=label)
         range_m, signal = _waveform(wall_m, replace(NOISE, saturation=None))
         pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=0.8, ls="--")
-    pulse.set(ylim=(-0.1, 2.2), xlim=(-1.5, 1.5), xlabel="range − true range, m",
-              ylabel="signal / saturation")  # fmt: skip
+    pulse.set(
+        ylim=(-0.1, 2.2),
+        xlim=(-1.5, 1.5),
+        xlabel="range − true range, m",
+        ylabel="signal / saturation",
+    )
     pulse.legend(frameon=False, fontsize=8, loc="upper right")
     pulse.set_title("recorded pulses (dashed: without)", fontsize=10)
 
@@ -97,12 +107,16 @@ def picture(path: Path) -> None:
     shift.set(ylim=(-1.5, 1.0), ylabel="range − true range in waveforms, m (open)")
     widths.set_title("5 ns pulses on walls and signs", fontsize=10)
 
-    separable = [(_separable_distance(name, wall_m), colour) for name, colour, ranges_m in kinds
-                for wall_m in ranges_m[3:]]  # fmt: skip
+    separable = [
+        (_separable_distance(name, wall_m), colour)
+        for name, colour, ranges_m in kinds
+        for wall_m in ranges_m[3:]
+    ]
     for (over_saturation, behind), colour in separable:
         apart.plot(over_saturation, behind, "o", ms=5, color=colour)
-    apart.plot(ratio, LIGHT_M_NS / 4 * (closed + PULSE_NS), "k-", lw=1, zorder=0,
-               label="wall not clipped")  # fmt: skip
+    apart.plot(
+        ratio, LIGHT_M_NS / 4 * (closed + PULSE_NS), "k-", lw=1, zorder=0, label="wall not clipped"
+    )
     apart.plot(
         ratio, LIGHT_M_NS / 2 * closed, "k--", lw=1, zorder=0, label="wall as strong as the plate"
     )

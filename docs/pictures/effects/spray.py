@@ -66,9 +66,14 @@ def picture(path: Path) -> None:
     for name, axis in (("above", "y"), ("aside", "z")):
         for which, colour, label in ((~wet, GREY, "surfaces"), (wet, RED, "spray")):
             views[name].plot(
-                columns["x"][which], columns[axis][which], ".", ms=2.5, mew=0, color=colour,
+                columns["x"][which],
+                columns[axis][which],
+                ".",
+                ms=2.5,
+                mew=0,
+                color=colour,
                 label=f"{label}: {which.sum():,}",
-            )  # fmt: skip
+            )
         views[name].plot(-8, 0 if axis == "y" else 1.9, "^", color=BLUE, ms=7)
         limits = (-8, 3) if axis == "y" else (-0.3, 4)
         views[name].set(xlim=(-25, 18), ylim=limits, xlabel="x (m)", ylabel=f"{axis} (m)")
@@ -80,8 +85,13 @@ def picture(path: Path) -> None:
     count = 4000
     behind = np.arange(0.5, 28, 0.75)
     shares = []
-    ahead = Sensor(Beams(np.zeros(count), np.full(count, math.pi / 2)), Spin(1, 360), 0.5, 60.0,
-                   optics=Optics(divergence_mrad=3.0))  # fmt: skip
+    ahead = Sensor(
+        Beams(np.zeros(count), np.full(count, math.pi / 2)),
+        Spin(1, 360),
+        0.5,
+        60.0,
+        optics=Optics(divergence_mrad=3.0),
+    )
     rear = replace(scene, actors=(lorry("Lorry", (4.5, 8), -1.5),))
     for x in behind:
         across = Survey(

@@ -72,16 +72,24 @@ def _panel(
     heights = _HEIGHT_M - waves.times_ns[0] * LIGHT_M_NS / 2
     top = waves.samples[0].max()
     axes.vlines(
-        _HEIGHT_M - hits["range"], 0, hits["intensity"] / top, color="#9ecf9e", lw=1.2,
-        label="hits of sub-rays", zorder=1,
-    )  # fmt: skip
+        _HEIGHT_M - hits["range"],
+        0,
+        hits["intensity"] / top,
+        color="#9ecf9e",
+        lw=1.2,
+        label="hits of sub-rays",
+        zorder=1,
+    )
     axes.plot(heights, waves.samples[0] / top, ".", color="black", ms=4, zorder=4, label="samples")
     fine = np.linspace(*span, 800)
     finer = _pulse_points(scene, position, 1600, waveform="peaks", sample_ns=0.1).waveforms
     axes.plot(
-        _HEIGHT_M - finer.times_ns[0] * LIGHT_M_NS / 2, finer.samples[0] / top, color="black", lw=1,
+        _HEIGHT_M - finer.times_ns[0] * LIGHT_M_NS / 2,
+        finer.samples[0] / top,
+        color="black",
+        lw=1,
         label="waveform",
-    )  # fmt: skip
+    )
     parts = clouds["gaussian"]
     for row in range(len(parts)):
         sigma_m = parts["pulse_width"][row] / FWHM * LIGHT_M_NS / 2
@@ -121,9 +129,14 @@ def picture(path: Path) -> None:
         for lane, (label, colour, _) in enumerate(_LANES.values()):
             left_limit = axes.get_xlim()[0]
             axes.annotate(
-                label, (left_limit, -0.10 - 0.11 * lane), color=colour, fontsize=8, va="bottom",
-                xytext=(2, 1), textcoords="offset points",
-            )  # fmt: skip
+                label,
+                (left_limit, -0.10 - 0.11 * lane),
+                color=colour,
+                fontsize=8,
+                va="bottom",
+                xytext=(2, 1),
+                textcoords="offset points",
+            )
     tree_axes.legend(fontsize=8, frameon=False)
     figure.suptitle(
         "One pulse of 5 ns (FWHM) from 300 m, 0.75 m wide on the ground, and its returns",

@@ -32,11 +32,16 @@ def picture(path: Path) -> None:
     scene = Scene.from_meshes([road, sign, house])
     beams = Beams(np.radians(np.arange(-60, 8.5, 0.2)))
     survey = Survey(
-        Sensor(beams, Spin(3600, 1), 0.5, 90.0), poses=[(0, 0, 0)], steps=1,
-        materials=[Material("Road", ROAD), Material("*", 0.8)], noise=Noise(detection_range_m=100),
-        returns=Returns("all"), columns=("cause", "reflectance", "elevation"), keep_every=1,
+        Sensor(beams, Spin(3600, 1), 0.5, 90.0),
+        poses=[(0, 0, 0)],
+        steps=1,
+        materials=[Material("Road", ROAD), Material("*", 0.8)],
+        noise=Noise(detection_range_m=100),
+        returns=Returns("all"),
+        columns=("cause", "reflectance", "elevation"),
+        keep_every=1,
         precision_m=0.001,
-    )  # fmt: skip
+    )
     for name, share in (("dry", 0.0), ("wet", 1.0)):
         columns = cloud(scene, replace(survey, wet=share))
         axes = views[name]

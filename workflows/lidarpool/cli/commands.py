@@ -85,10 +85,17 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def prepared(
-        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None,
-        only: str | None, strict: bool, pictures: bool = False, timeline: Path | None = None,
+        *,
+        quiet: bool,
+        verbose: bool,
+        as_json: bool,
+        cluster: Path | None = None,
+        only: str | None,
+        strict: bool,
+        pictures: bool = False,
+        timeline: Path | None = None,
         **settings: Any,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
         settings["extent"] = "pictures" if pictures else only

@@ -45,16 +45,29 @@ class Sweep:
 
     @classmethod
     def from_points(
-        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns,
-        boxes: Boxes | None, index: int | EllipsisType = ...,
-    ) -> Sweep:  # fmt: skip
+        cls,
+        job: JobRow,
+        sweeps: Sweeps,
+        number: int,
+        points: PointColumns,
+        boxes: Boxes | None,
+        index: int | EllipsisType = ...,
+    ) -> Sweep:
         """Return a sweep by its number in the job; boxes and index as of `SweepBoxes.select`."""
         return cls(
-            job.name, job.number, job.split, job.values,
-            sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
-            round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
-            sweeps.all_names, sweeps.faults_in(number), (sweeps, boxes, index),
-        )  # fmt: skip
+            job.name,
+            job.number,
+            job.split,
+            job.values,
+            sweeps.sensors[sweeps.sensor[number]],
+            int(sweeps.numbers[number]),
+            round(sweeps.begins_ns[number]),
+            *points,
+            sweeps.pose.matrix(number),
+            sweeps.all_names,
+            sweeps.faults_in(number),
+            (sweeps, boxes, index),
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_boxes": self.boxes}  # without the boxes of further sweeps

@@ -235,10 +235,15 @@ class _Tables:
         sweeps = self.sweeps
         count = int((sweeps.sensor == 0).sum())
         self._add(
-            "scene", self._scene, name=self._scene, description=COMPENSATED, nbr_samples=count,
-            log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
+            "scene",
+            self._scene,
+            name=self._scene,
+            description=COMPENSATED,
+            nbr_samples=count,
+            log_token=self._token("log", _LOG),
+            first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
-        )  # fmt: skip
+        )
         # nuscenes-devkit sorts scenes by time, and fails where two have the same.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
@@ -248,9 +253,13 @@ class _Tables:
         for sensor, channel in enumerate(channels):
             self._add("sensor", channel, channel=channel, modality="lidar")
             self._add(
-                "calibrated_sensor", channel, sensor_token=self._token("sensor", channel),
-                translation=[0.0] * 3, rotation=[1.0, 0.0, 0.0, 0.0], camera_intrinsic=[],
-            )  # fmt: skip
+                "calibrated_sensor",
+                channel,
+                sensor_token=self._token("sensor", channel),
+                translation=[0.0] * 3,
+                rotation=[1.0, 0.0, 0.0, 0.0],
+                camera_intrinsic=[],
+            )
             sweeps_of_sensor = np.flatnonzero(sweeps.sensor == sensor).tolist()
             for sweep, neighbours in zip(
                 sweeps_of_sensor, self._chain("sample_data", sweeps_of_sensor), strict=True
@@ -266,12 +275,19 @@ class _Tables:
                     translation=position,
                 )
                 self._add(
-                    "sample_data", sweep, sample_token=self._token("sample", sample[sweep]),
+                    "sample_data",
+                    sweep,
+                    sample_token=self._token("sample", sample[sweep]),
                     ego_pose_token=self._token("ego_pose", sweep),
                     calibrated_sensor_token=self._token("calibrated_sensor", channel),
-                    timestamp=timestamp, fileformat="pcd", height=0, width=0, filename=names[sweep],
-                    is_key_frame=names[sweep].startswith("samples/"), **neighbours,
-                )  # fmt: skip
+                    timestamp=timestamp,
+                    fileformat="pcd",
+                    height=0,
+                    width=0,
+                    filename=names[sweep],
+                    is_key_frame=names[sweep].startswith("samples/"),
+                    **neighbours,
+                )
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
         """Add the actors, and their boxes in the key frames of each sample."""
@@ -285,11 +301,13 @@ class _Tables:
                 continue
             annotation_keys = [(actor, number) for number in samples]
             self._add(
-                "instance", actor, category_token=self._token("category", kind),
+                "instance",
+                actor,
+                category_token=self._token("category", kind),
                 nbr_annotations=len(samples),
                 first_annotation_token=self._token("sample_annotation", annotation_keys[0]),
                 last_annotation_token=self._token("sample_annotation", annotation_keys[-1]),
-            )  # fmt: skip
+            )
             chain = self._chain("sample_annotation", annotation_keys)
             for number, beside in zip(samples, chain, strict=True):
                 box = max(boxes[number], key=lambda candidate: candidate.points[actor])
@@ -299,10 +317,16 @@ class _Tables:
                 x, y, z, w = box.quaternions[actor].tolist()
                 length, width, height = box.sizes[actor].tolist()
                 self._add(
-                    "sample_annotation", (actor, number),
+                    "sample_annotation",
+                    (actor, number),
                     sample_token=self._token("sample", number),
-                    instance_token=self._token("instance", actor), visibility_token="",
-                    attribute_tokens=[], translation=centre.tolist(),
-                    size=[width, length, height], rotation=[w, x, y, z],
-                    num_lidar_pts=int(sum(counts)), num_radar_pts=0, **beside,
-                )  # fmt: skip
+                    instance_token=self._token("instance", actor),
+                    visibility_token="",
+                    attribute_tokens=[],
+                    translation=centre.tolist(),
+                    size=[width, length, height],
+                    rotation=[w, x, y, z],
+                    num_lidar_pts=int(sum(counts)),
+                    num_radar_pts=0,
+                    **beside,
+                )

@@ -168,12 +168,14 @@ class PointLayout:
         if self.name in _COMPENSATED:
             return np.dtype(_COMPENSATED[self.name])
         kinds = {name: kind for name, kind in (row.fields or {}).items() if name not in _TIMES}
-        return np.dtype({
-            "names": [*kinds],
-            "formats": [kind for kind, *_ in kinds.values()],
-            "offsets": [offset for _, offset, *_ in kinds.values()],
-            "itemsize": row.itemsize,
-        })  # fmt: skip
+        return np.dtype(
+            {
+                "names": [*kinds],
+                "formats": [kind for kind, *_ in kinds.values()],
+                "offsets": [offset for _, offset, *_ in kinds.values()],
+                "itemsize": row.itemsize,
+            }
+        )
 
     def row(self, extra: Sequence[str]) -> np.dtype[np.void]:
         """Return the type of a point in the layout, followed by additional fields."""
@@ -290,9 +292,16 @@ class _SweepMessages:
         rows = _rows(self._layout, self._row, points, self._sweeps, sweep)
         (message,) = self.make.types_of("sensor_msgs", "PointCloud2")
         return message(
-            header, 1, len(rows), self._fields, False, self._row.itemsize,
-            rows.nbytes, rows.view(np.uint8).ravel(), True,
-        )  # fmt: skip
+            header,
+            1,
+            len(rows),
+            self._fields,
+            False,
+            self._row.itemsize,
+            rows.nbytes,
+            rows.view(np.uint8).ravel(),
+            True,
+        )
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
@@ -512,16 +521,19 @@ class _Messages:
         """Return frames in their parents: (parent, name, poses, index of the pose)."""
         vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
         transform, stamped = self.types_of("geometry_msgs", "Transform", "TransformStamped")
-        return self._types["tf2_msgs/msg/TFMessage"]([
-            stamped(
-                self.header(parent, time_ns), name,
-                transform(
-                    vector(*placed.positions[index].tolist()),
-                    quaternion(*placed.quaternions[index].tolist()),
-                ),
-            )
-            for parent, name, placed, index in frames
-        ])  # fmt: skip
+        return self._types["tf2_msgs/msg/TFMessage"](
+            [
+                stamped(
+                    self.header(parent, time_ns),
+                    name,
+                    transform(
+                        vector(*placed.positions[index].tolist()),
+                        quaternion(*placed.quaternions[index].tolist()),
+                    ),
+                )
+                for parent, name, placed, index in frames
+            ]
+        )
 
     def instrument_messages(self, sweeps: Sweeps, start_ns: int) -> Iterator[Sent]:
         """Return the messages of IMU and GNSS receiver, in order of time."""
@@ -546,9 +558,14 @@ class _Messages:
             time_ns = start_ns + int(time)
             values = [*map(float, numbers)]
             message = imu(
-                self.header(frame, time_ns), quaternion(0.0, 0.0, 0.0, 1.0), unknown,
-                vector(*values[:3]), rate, vector(*values[3:]), force,
-            )  # fmt: skip
+                self.header(frame, time_ns),
+                quaternion(0.0, 0.0, 0.0, 1.0),
+                unknown,
+                vector(*values[:3]),
+                rate,
+                vector(*values[3:]),
+                force,
+            )
             yield "/imu/data_raw", message, time_ns
 
     def _gnss(self, instruments: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
@@ -564,8 +581,10 @@ class _Messages:
                 message = fix(
                     self.header(frame, time_ns),
                     status(status.STATUS_FIX, status.SERVICE_GPS),
-                    *map(float, geodetic), np.diag(variances).ravel(), covariance_type,
-                )  # fmt: skip
+                    *map(float, geodetic),
+                    np.diag(variances).ravel(),
+                    covariance_type,
+                )
                 yield "/gnss/fix", message, time_ns
             else:
                 message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
@@ -577,10 +596,16 @@ class _Messages:
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")
         return scan(
-            self.header(frame, time_ns), first, last, (last - first) / (len(rays.angles) - 1),
-            rays.time_increment_s, rays.scan_time_s, *rays.range_limits_m, rays.ranges,
+            self.header(frame, time_ns),
+            first,
+            last,
+            (last - first) / (len(rays.angles) - 1),
+            rays.time_increment_s,
+            rays.scan_time_s,
+            *rays.range_limits_m,
+            rays.ranges,
             rays.intensities,
-        )  # fmt: skip
+        )
 
     def image(self, values: Floats32, frame: str, time_ns: int) -> Any:
         """Return an image of numbers (height, width)."""
@@ -601,14 +626,32 @@ class _Messages:
         none = np.empty(0, np.uint8)
         orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
         always = types["builtin_interfaces/msg/Duration"](0, 0)
-        return types["visualization_msgs/msg/MarkerArray"]([
-            marker(
-                header, "actors", number, marker.CUBE,
-                marker.ADD if boxes.present[number] else marker.DELETE,
-                pose(point(*boxes.centres[number].tolist()),
-                     quaternion(*boxes.quaternions[number].tolist())),
-                vector(*boxes.sizes[number].tolist()), orange, always, False, [], [], "",
-                image(header, "", none), [], name, "", mesh("", none), False,
-            )
-            for number, name in enumerate(actors)
-        ])  # fmt: skip
+        return types["visualization_msgs/msg/MarkerArray"](
+            [
+                marker(
+                    header,
+                    "actors",
+                    number,
+                    marker.CUBE,
+                    marker.ADD if boxes.present[number] else marker.DELETE,
+                    pose(
+                        point(*boxes.centres[number].tolist()),
+                        quaternion(*boxes.quaternions[number].tolist()),
+                    ),
+                    vector(*boxes.sizes[number].tolist()),
+                    orange,
+                    always,
+                    False,
+                    [],
+                    [],
+                    "",
+                    image(header, "", none),
+                    [],
+                    name,
+                    "",
+                    mesh("", none),
+                    False,
+                )
+                for number, name in enumerate(actors)
+            ]
+        )

@@ -96,8 +96,11 @@ class Planning(Search):
             array.setflags(write=False)
         _check_outside({"start": start, "target": target}, centres, radii)
         for name, value in (
-            ("start", start), ("target", target), ("centres", centres), ("radii", radii)
-        ):  # fmt: skip
+            ("start", start),
+            ("target", target),
+            ("centres", centres),
+            ("radii", radii),
+        ):
             object.__setattr__(self, name, value)
 
 

@@ -259,17 +259,30 @@ def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
     size = float(np.clip(300 / np.sqrt(max(len(drawn), 1)), 4, 30)) * unit**2
     alpha = float(np.clip(16 / np.sqrt(max(len(drawn), 1)), 0.25, 0.85))
     axes.scatter(
-        x[drawn], dots.points[drawn], s=size, c=dots.colours[drawn], alpha=alpha, linewidths=0,
-        clip_on=False, rasterized=True,
-    )  # fmt: skip
+        x[drawn],
+        dots.points[drawn],
+        s=size,
+        c=dots.colours[drawn],
+        alpha=alpha,
+        linewidths=0,
+        clip_on=False,
+        rasterized=True,
+    )
     _draw_percentiles(axes, scale, x, dots.points, done_jobs, 1.6 * unit)
     failed = np.flatnonzero(is_known & dots.failures)
     failed = failed[even_indices(len(failed), MAX_DOTS)]
     axes.scatter(
-        x[failed], np.zeros(len(failed)), marker="x", s=18 * unit**2, color=theme.SENSOR,
-        linewidths=0.9 * unit, clip_on=False, zorder=5, rasterized=len(failed) > 200,
+        x[failed],
+        np.zeros(len(failed)),
+        marker="x",
+        s=18 * unit**2,
+        color=theme.SENSOR,
+        linewidths=0.9 * unit,
+        clip_on=False,
+        zorder=5,
+        rasterized=len(failed) > 200,
         transform=axes.get_xaxis_transform(),
-    )  # fmt: skip
+    )
 
 
 def _draw_percentiles(

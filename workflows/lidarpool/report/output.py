@@ -203,9 +203,13 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         return report
 
     def _report(
-        self, result: RunResult, report: dict[str, Any], cloud: CountedCloud, staged: Path,
+        self,
+        result: RunResult,
+        report: dict[str, Any],
+        cloud: CountedCloud,
+        staged: Path,
         show: WritingProgress,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Write the page, the content of pictures, and the pictures if in the extent."""
         from .page.rendering import write_page  # jinja2
 

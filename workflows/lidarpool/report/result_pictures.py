@@ -182,8 +182,10 @@ def draw_path(
     circles = zip(planning.centres, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
-        facecolor=theme.UNSEEN, edgecolor=theme.MUTED, linewidth=0.6 * unit,
-    )  # fmt: skip
+        facecolor=theme.UNSEEN,
+        edgecolor=theme.MUTED,
+        linewidth=0.6 * unit,
+    )
     axes.add_collection(discs)
     alpha = float(np.clip(6 / max(len(drawn_trials), 1), 0.08, 0.6))
     axes.add_collection(
@@ -220,9 +222,18 @@ def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Lin
         handles.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
     if obstacle_count:
         handles.append(
-            Line2D([], [], ls="", marker="o", color=theme.UNSEEN, mec=theme.MUTED,
-                   mew=0.6 * unit, ms=7 * unit, label="Obstacle")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                ls="",
+                marker="o",
+                color=theme.UNSEEN,
+                mec=theme.MUTED,
+                mew=0.6 * unit,
+                ms=7 * unit,
+                label="Obstacle",
+            )
+        )
     return handles
 
 
@@ -264,15 +275,28 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
         ("target", planning.target, "*", 10),
     ):
         axes.plot(
-            *position, marker, color=theme.INK, ms=size * page.unit, mec=theme.GROUND,
-            mew=0.8 * page.unit, zorder=6,
-        )  # fmt: skip
+            *position,
+            marker,
+            color=theme.INK,
+            ms=size * page.unit,
+            mec=theme.GROUND,
+            mew=0.8 * page.unit,
+            zorder=6,
+        )
         is_right = position[0] > middle  # names are towards the middle, inside the plot
         axes.annotate(
-            name, position, xytext=(-8 * page.unit if is_right else 8 * page.unit, 0),
-            textcoords="offset points", ha="right" if is_right else "left", va="center",
-            fontsize=7.6 * page.unit, color=theme.INK, family=FONT, path_effects=halo, zorder=7,
-        )  # fmt: skip
+            name,
+            position,
+            xytext=(-8 * page.unit if is_right else 8 * page.unit, 0),
+            textcoords="offset points",
+            ha="right" if is_right else "left",
+            va="center",
+            fontsize=7.6 * page.unit,
+            color=theme.INK,
+            family=FONT,
+            path_effects=halo,
+            zorder=7,
+        )
 
 
 def draw_stations(scene: Scene, plan: StationPlan) -> Page:

@@ -273,12 +273,17 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
         firings = sensor.firings(steps - 1)[1]
         rate_hz = getattr(sensor.head, "rate_hz", None)
         on_ns = sensor.begins_ns(np.array([firings])).item() - sensor.start_ns
-        sensors.append({
-            "name": carried.name, "model": sensor.model, "cycle": sensor.cycle,
-            "scans": steps * survey.path.stations, "firings": firings * survey.path.stations,
-            "turns": rate_hz and on_ns / 1e9 * rate_hz,
-            "metres_a_turn": rate_hz and metres / seconds / rate_hz,
-        })  # fmt: skip
+        sensors.append(
+            {
+                "name": carried.name,
+                "model": sensor.model,
+                "cycle": sensor.cycle,
+                "scans": steps * survey.path.stations,
+                "firings": firings * survey.path.stations,
+                "turns": rate_hz and on_ns / 1e9 * rate_hz,
+                "metres_a_turn": rate_hz and metres / seconds / rate_hz,
+            }
+        )
     return {"seconds": seconds, "metres": metres, "sensors": sensors}
 
 

@@ -694,18 +694,20 @@ def main(path: str, request: dict[str, Any]) -> None:
         del layers
         missing = _missing_files(stage)
         animation = _select_animation(stage, request)
-        write({
-            "what": "stage",
-            "files": _stage_files(stage),
-            "missing": [name for name in missing if not name.endswith(".mtlx")],
-            "materialx": request["colours"] and any(name.endswith(".mtlx") for name in missing),
-            "unit_m": UsdGeom.GetStageMetersPerUnit(stage),
-            "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
-            "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),
-            "up_stated": stage.HasAuthoredMetadata("upAxis"),
-            "animations": animation.animations,
-            "times_s": (np.array(animation.codes) / stage.GetTimeCodesPerSecond()).tolist(),
-        })  # fmt: skip
+        write(
+            {
+                "what": "stage",
+                "files": _stage_files(stage),
+                "missing": [name for name in missing if not name.endswith(".mtlx")],
+                "materialx": request["colours"] and any(name.endswith(".mtlx") for name in missing),
+                "unit_m": UsdGeom.GetStageMetersPerUnit(stage),
+                "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
+                "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),
+                "up_stated": stage.HasAuthoredMetadata("upAxis"),
+                "animations": animation.animations,
+                "times_s": (np.array(animation.codes) / stage.GetTimeCodesPerSecond()).tolist(),
+            }
+        )
         looks = Looks(request, write)
         for code in animation.codes:
             stage.GetSessionLayer().Clear()  # of the pose before
@@ -717,16 +719,21 @@ def main(path: str, request: dict[str, Any]) -> None:
             looks.time = Usd.TimeCode(code)
             nodes = StageNodes(stage, request["most"].copy(), looks, write)
             nodes.read()
-            write({
-                "what": "nodes",
-                "files": _stage_files(stage),  # with the files of value clips
-                "roots": nodes.roots,
-                "nodes": nodes.nodes,
-                "counts": nodes.counts,
-                "moving": nodes.moving,
-                "start": nodes.start,
-                "rate_hz": stage.GetTimeCodesPerSecond(),
-            }, np.array(nodes.matrices), *nodes.motions, *nodes.copies)  # fmt: skip
+            write(
+                {
+                    "what": "nodes",
+                    "files": _stage_files(stage),  # with the files of value clips
+                    "roots": nodes.roots,
+                    "nodes": nodes.nodes,
+                    "counts": nodes.counts,
+                    "moving": nodes.moving,
+                    "start": nodes.start,
+                    "rate_hz": stage.GetTimeCodesPerSecond(),
+                },
+                np.array(nodes.matrices),
+                *nodes.motions,
+                *nodes.copies,
+            )
     except TooManyError as error:
         write({"what": "too many", "of": str(error)})
     except Exception as error:  # of any type, as readers of broken files are

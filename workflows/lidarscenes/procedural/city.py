@@ -250,14 +250,16 @@ class _CityBlocks:
         """Return all objects by block, in random order after the pavement of the block."""
         n = len(self._middle)
         slab = np.column_stack([self._size, np.ones(n)])
-        objects = np.concatenate([
-            self._rows(PAVEMENT, "pavement", 0, np.arange(n), self._middle, 0.0, slab, z=0.0),
-            *self._lots(),
-            self._park_trees(),
-            self._along_streets(TREE, inwards=1.6, spacing=9.0, chance=0.55),
-            self._along_streets(CAR, inwards=-1.3, spacing=6.5, chance=0.35),
-            self._along_streets(LAMP, inwards=0.6, spacing=26.0, chance=0.95),
-        ])  # fmt: skip
+        objects = np.concatenate(
+            [
+                self._rows(PAVEMENT, "pavement", 0, np.arange(n), self._middle, 0.0, slab, z=0.0),
+                *self._lots(),
+                self._park_trees(),
+                self._along_streets(TREE, inwards=1.6, spacing=9.0, chance=0.55),
+                self._along_streets(CAR, inwards=-1.3, spacing=6.5, chance=0.35),
+                self._along_streets(LAMP, inwards=0.6, spacing=26.0, chance=0.95),
+            ]
+        )
         order = np.where(objects["owner"] == PAVEMENT, -1.0, self._rng.random(len(objects)))
         return objects[np.lexsort((order, objects["block"]))]
 
@@ -326,11 +328,13 @@ class _CityBlocks:
         shapes = 4
         floors = (height * (self._count["tower"] // shapes)).astype(np.int64)
         kind = floors * shapes + rng.integers(shapes, size=n)
-        scale = np.column_stack([
-            (lots.size[rows, 0] - 1.5) / 19 * rng.uniform(0.85, 1, n),
-            rng.uniform(0.95, 1.25, n),
-            rng.uniform(0.92, 1.08, n),
-        ])  # fmt: skip
+        scale = np.column_stack(
+            [
+                (lots.size[rows, 0] - 1.5) / 19 * rng.uniform(0.85, 1, n),
+                rng.uniform(0.95, 1.25, n),
+                rng.uniform(0.92, 1.08, n),
+            ]
+        )
         y = lots.edge[rows] - lots.side[rows] * (1 + 8.7 * scale[:, 1])
         xy = np.column_stack([lots.x[rows], y])
         return self._rows(BUILDING, "tower", kind, lots.block[rows], xy, lots.yaw[rows], scale)
@@ -351,10 +355,12 @@ class _CityBlocks:
         rng = self._rng
         n = len(rows)
         depth = rng.uniform(0.72, 0.95, n) * lots.size[rows, 1]
-        xy = np.column_stack([
-            lots.x[rows] + rng.uniform(-0.4, 0.4, n) * lots.size[rows, 0],
-            lots.edge[rows] - lots.side[rows] * depth,
-        ])  # fmt: skip
+        xy = np.column_stack(
+            [
+                lots.x[rows] + rng.uniform(-0.4, 0.4, n) * lots.size[rows, 0],
+                lots.edge[rows] - lots.side[rows] * depth,
+            ]
+        )
         return self._trees(lots.block[rows], xy)
 
     def _park_trees(self) -> AnyArray:

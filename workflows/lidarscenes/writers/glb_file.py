@@ -173,9 +173,14 @@ class _Writer:
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self._put(
             "accessors",
-            {"bufferView": view, "componentType": _TYPES[rows.dtype.kind], "count": len(rows),
-             "type": kind, **limits},
-        )  # fmt: skip
+            {
+                "bufferView": view,
+                "componentType": _TYPES[rows.dtype.kind],
+                "count": len(rows),
+                "type": kind,
+                **limits,
+            },
+        )
 
     def _view(self, data: bytes, **fields: Any) -> int:
         """Add a view of data in the buffer; return its number."""

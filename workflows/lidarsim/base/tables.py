@@ -472,9 +472,13 @@ def _numbers(
         return np.empty((len(rows), 0))
     try:
         values = np.loadtxt(
-            rows, ndmin=2, delimiter=header.separator, quotechar='"', comments=None,
+            rows,
+            ndmin=2,
+            delimiter=header.separator,
+            quotechar='"',
+            comments=None,
             usecols=[*names.values()],
-        )  # fmt: skip
+        )
         if not np.isfinite(values).all():
             raise ValueError("it has a nan or inf")
     except ValueError as error:

@@ -83,12 +83,14 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     kinds = {number: kind for kind, number in POINT_FIELDS.items()}
     order = ">" if message.is_bigendian else "<"
     fields = [field for field in message.fields if field.count == 1]
-    row = np.dtype({
-        "names": [field.name for field in fields],
-        "formats": [order + kinds[field.datatype] for field in fields],
-        "offsets": [field.offset for field in fields],
-        "itemsize": message.point_step,
-    })  # fmt: skip
+    row = np.dtype(
+        {
+            "names": [field.name for field in fields],
+            "formats": [order + kinds[field.datatype] for field in fields],
+            "offsets": [field.offset for field in fields],
+            "itemsize": message.point_step,
+        }
+    )
     lines = message.data.reshape(message.height, message.row_step)
     used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
     rows = used.reshape(-1).view(row)

@@ -206,8 +206,13 @@ def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
     indices = []
     for mesh in (actor.mesh for actor in actors):
         arrays = (
-            mesh.vertices, mesh.faces, mesh.colours, mesh.materials, mesh.animation, *mesh.cutouts,
-        )  # fmt: skip
+            mesh.vertices,
+            mesh.faces,
+            mesh.colours,
+            mesh.materials,
+            mesh.animation,
+            *mesh.cutouts,
+        )
         index = mesh_indices.setdefault(tuple(map(id, arrays)), len(meshes))
         if index == len(meshes):
             meshes.append(mesh)

@@ -327,9 +327,11 @@ def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colou
         )
     if any(part.corners is not None for part in coloured):
         corners = np.concatenate(
-            [np.full((len(p), 3, 3), 255, np.uint8) if p.corners is None else p.corners
-             for p in coloured]
-        )  # fmt: skip
+            [
+                np.full((len(p), 3, 3), 255, np.uint8) if p.corners is None else p.corners
+                for p in coloured
+            ]
+        )
     return Colours(tuple(images), np.concatenate(image_indices), uv, corners)
 
 

@@ -266,8 +266,9 @@ class MaskNotes:
             files = _listed(self.missing_files)
             notes.append(f"names materials in {files}, which cannot be read: all is solid")
         for reasons, kind, consequence in (
-            (self.mask_errors, "masks", "are solid"), (self.colour_errors, "colours", "lack them")
-        ):  # fmt: skip
+            (self.mask_errors, "masks", "are solid"),
+            (self.colour_errors, "colours", "lack them"),
+        ):
             if reasons:
                 shown = _listed([f"{name} ({why})" for name, why in reasons.items()])
                 notes.append(

@@ -92,9 +92,13 @@ class WeatherStep(PulseStep):
     writes = *RETURN_COLUMNS, "velocity"
     causes = (AIR,)
     purposes = (
-        FOG_CELL, FOG_PLACE, PARTICLES, PARTICLE_RANGE,
-        PARTICLE_SUBRAY, PARTICLE_DIAMETER,
-    )  # fmt: skip
+        FOG_CELL,
+        FOG_PLACE,
+        PARTICLES,
+        PARTICLE_RANGE,
+        PARTICLE_SUBRAY,
+        PARTICLE_DIAMETER,
+    )
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)

@@ -159,9 +159,13 @@ class CastStep(PulseStep):
 
     role = Role.FRAME
     effects = (
-        "Ghosts", "Wet ground", "Gaussian and oval beams", "Refraction", "Vegetation",
+        "Ghosts",
+        "Wet ground",
+        "Gaussian and oval beams",
+        "Refraction",
+        "Vegetation",
         "Rays without a return",
-    )  # fmt: skip
+    )
     writes = *RETURN_COLUMNS, "velocity"
     causes = (GHOST,)
     purposes = LEAF, CROWN

@@ -143,9 +143,13 @@ class Page:
             ]
             pixels, _ = shot.camera.project(points)
             axes.plot(
-                *pixels.T, color=theme.SENSOR, lw=0.9 * self.unit, alpha=0.35, zorder=4,
+                *pixels.T,
+                color=theme.SENSOR,
+                lw=0.9 * self.unit,
+                alpha=0.35,
+                zorder=4,
                 solid_capstyle="round",
-            )  # fmt: skip
+            )
             self.lines(axes, shot, np.stack([points[:-1], points[1:]], axis=1), 1.8, 0.9)
         poses = shot.sensors
         is_crowded = len(shot.sensors) > MAX_LARGE_MARKERS
@@ -159,9 +163,14 @@ class Page:
             (~is_visible, "none", theme.SENSOR),
         ):
             axes.scatter(
-                pixels[chosen, 0], pixels[chosen, 1], s=size * self.unit**2, facecolors=face,
-                edgecolors=edge, linewidths=edge_width * self.unit, zorder=5,
-            )  # fmt: skip
+                pixels[chosen, 0],
+                pixels[chosen, 1],
+                s=size * self.unit**2,
+                facecolors=face,
+                edgecolors=edge,
+                linewidths=edge_width * self.unit,
+                zorder=5,
+            )
 
     def _name_actors(self, axes: Axes, shot: SurfaceView) -> None:
         """Name the actors, if there are not too many, above their positions; paler if hidden.
@@ -197,9 +206,12 @@ class Page:
                 position = position - (0, NAME_SIZE[1] * self.unit)
             label_positions = np.vstack([label_positions, position])
             axes.plot(
-                *np.stack([pixel, position]).T, color=colour, lw=0.7 * self.unit, zorder=6,
+                *np.stack([pixel, position]).T,
+                color=colour,
+                lw=0.7 * self.unit,
+                zorder=6,
                 path_effects=halo,
-            )  # fmt: skip
+            )
             ink = theme.INK if is_visible[k] else theme.MUTED
             style = {"va": "bottom", "path_effects": halo, "zorder": 7}
             self._text(axes, position, shortened(name), 6.6, ink, **style)
@@ -213,9 +225,14 @@ class Page:
             above = 8 + rank / len(pixels)
             face, ink = (theme.SENSOR, theme.PAGE) if is_visible[k] else (theme.PAGE, theme.SENSOR)
             axes.scatter(
-                [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
-                linewidths=0.7 * self.unit, zorder=above,
-            )  # fmt: skip
+                [x],
+                [y],
+                s=62 * self.unit**2,
+                facecolors=face,
+                edgecolors=ink,
+                linewidths=0.7 * self.unit,
+                zorder=above,
+            )
             style = {"va": "center_baseline", "weight": "bold", "zorder": above}
             self._text(axes, (x, y), str(k + 1), 5.6 if k < 99 else 4.4, ink, **style)
 
@@ -240,9 +257,13 @@ class Page:
         for side in (axes.xaxis, axes.yaxis):
             side.label.set(fontsize=7.6 * self.unit, color=theme.INK, family=FONT)
         axes.tick_params(
-            labelsize=6.8 * self.unit, labelcolor=theme.MUTED, color=theme.LINE,
-            length=2.5 * self.unit, width=small, labelfontfamily=FONT,
-        )  # fmt: skip
+            labelsize=6.8 * self.unit,
+            labelcolor=theme.MUTED,
+            color=theme.LINE,
+            length=2.5 * self.unit,
+            width=small,
+            labelfontfamily=FONT,
+        )
         return axes
 
     def title(self, text: str, *details: str) -> None:
@@ -272,12 +293,20 @@ class Page:
         size = min(7.4, 175 / len(rows))
         self.key(
             [
-                Line2D([], [], ls="", marker=marker, color=colour, ms=0.85 * size * self.unit,
-                       mec="none", label=shortened(name))
+                Line2D(
+                    [],
+                    [],
+                    ls="",
+                    marker=marker,
+                    color=colour,
+                    ms=0.85 * size * self.unit,
+                    mec="none",
+                    label=shortened(name),
+                )
                 for marker, name, colour in rows
             ],
             size,
-        )  # fmt: skip
+        )
 
     def key(
         self,
@@ -290,9 +319,14 @@ class Page:
         style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
         legend = (parent or self.figure).legend(
-            handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
-            prop={"family": FONT, "size": size * self.unit}, **style,
-        )  # fmt: skip
+            handles,
+            ["x"] * len(handles),
+            frameon=False,
+            labelcolor=theme.INK,
+            labelspacing=0.55,
+            prop={"family": FONT, "size": size * self.unit},
+            **style,
+        )
         # Names come from files: matplotlib leaves out names that start with an underscore,
         # and fails on texts that only look like a formula ("$\\frac{x$").
         for text, handle in zip(legend.get_texts(), handles, strict=True):
@@ -314,9 +348,14 @@ class Page:
             title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT, parse_math=False
         )
         axes.tick_params(
-            which="both", labelsize=6.6 * self.unit, color=theme.MUTED, width=0.6 * self.unit,
-            labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,
-        )  # fmt: skip
+            which="both",
+            labelsize=6.6 * self.unit,
+            color=theme.MUTED,
+            width=0.6 * self.unit,
+            labelcolor=theme.MUTED,
+            labelfontfamily=FONT,
+            length=2.5 * self.unit,
+        )
         if isinstance(norm, LogNorm):
             is_narrow = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
             label_logarithms(axes.yaxis, is_narrow)

@@ -52,10 +52,13 @@ class Samples:
     def scattered(self, which: Ints, count: int) -> Samples:
         """Return `count` samples, with these samples at indices `which` (n,) and sky elsewhere."""
         result = Samples(
-            np.full(count, SKY), np.full(count, np.inf, np.float32),
-            np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.nan, np.float32),
-            np.ones(count, np.float32), np.zeros((count, 3), np.float32),
-        )  # fmt: skip
+            np.full(count, SKY),
+            np.full(count, np.inf, np.float32),
+            np.full((count, 3), np.nan, np.float32),
+            np.full((count, 3), np.nan, np.float32),
+            np.ones(count, np.float32),
+            np.zeros((count, 3), np.float32),
+        )
         for field in fields(self):
             getattr(result, field.name)[which] = getattr(self, field.name)
         return result

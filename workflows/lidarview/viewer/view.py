@@ -279,8 +279,12 @@ class View:
             "version": self.version,
             "points": len(self.points),
             "columns": [
-                {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
-                 "meaning": column.meaning} for name, column in self.columns.items()
+                {
+                    "name": name,
+                    "unit": "s" if column.unit == "ns" else column.unit,
+                    "meaning": column.meaning,
+                }
+                for name, column in self.columns.items()
             ],
             "colours": [*self._coloured],
             "origin": self.origin.tolist(),
@@ -304,7 +308,7 @@ class View:
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
-        }  # fmt: skip
+        }
         return header, arrays
 
     def _actor_arrays(self) -> dict[str, AnyArray]:

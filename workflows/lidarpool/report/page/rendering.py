@@ -133,10 +133,19 @@ def _template(name: str) -> Template:
         finalize=lambda value: escaped(value) if type(value) is str else value,  # not of Markup
     )
     for filter_ in (
-        duration, rate, large, share, excess,
-        numbers, formatted, code, markdown, millimetres,
-        ratio, plural,
-    ):  # fmt: skip
+        duration,
+        rate,
+        large,
+        share,
+        excess,
+        numbers,
+        formatted,
+        code,
+        markdown,
+        millimetres,
+        ratio,
+        plural,
+    ):
         environment.filters[filter_.__name__] = filter_
     environment.filters["shortened"] = lambda name, length=60: shortened(name, length)
     environment.filters["one_line"] = lambda text: type(text)(re.sub("[ \n]+", " ", text).strip())
