@@ -786,7 +786,7 @@ def _check_motion(stack: SweepStack, name: str, period_ns: float | None) -> None
     count = stack.sweep_count
     starts = even_indices(count - 1, _SWEEP_PAIRS).tolist()
     steps = [sensor_motion(stack, k, k + 1) for k in starts]
-    overall = [sensor_motion(stack, 0, k) for k in {count // 2, count - 1}]
+    overall = [sensor_motion(stack, 0, k) for k in sorted({count // 2, count - 1})]
     motions = [step for step in steps if step.moves]
     sweeps = 1
     if len(motions) <= len(steps) / 2:
