@@ -161,6 +161,14 @@ def test_a_sensor_that_moves_is_refused_with_its_speed(block):
         fit(drive(block, 1.8, 0.0, 2.0))
 
 
+def test_a_slow_sensor_is_refused_with_its_speed(block):
+    """Steps of 15 mm are not told from noise; nine of these are."""
+    with pytest.raises(LidarError, match="is of a sensor that moves") as raised:
+        fit(drive(block, 1.8, 0.015, sweeps=10))
+    speed = float(str(raised.value).partition("(")[2].partition(" m/s")[0])
+    assert speed == pytest.approx(0.3, rel=0.15)
+
+
 def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
     stands = drive(block, 1.8, 0.0)
 
