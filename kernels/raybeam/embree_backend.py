@@ -53,7 +53,7 @@ class _RayGrouping(NamedTuple):
     ----------
     step
         Difference of the numbers of neighbouring rays of a ring: 1 where consecutive rays form a
-        ring, or for example the rays of a firing.
+        ring; elsewhere for example the number of rays of a firing.
     rays_along, rays_across
         Rays of each ring in a group, and rings of a group; their product is 16.
     coherence
@@ -185,7 +185,10 @@ class EmbreeBackend(Backend):
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
+        """Cast pairs of a ray and a body on this scene, the shape that the bodies share.
+
+        Hits nearer than those in `nearest` replace these.
+        """
         from .embree_bodies import cast_crossing
 
         record = self._base.copy()

@@ -1,5 +1,7 @@
 """Which triangle a ray hits: Embree proposes in float32, compiled code decides in float64.
 
+Local coordinates are centred on the scene and scaled by a power of two, see `Frame` of mesh.py.
+
 A filter function, which Embree calls for each triangle that it finds in float32, notes the closest
 and another that float32 cannot tell from it (`propose`); both then pass the watertight test of
 triangle.py. Embree receives a distance that is a little farther than the closest, so it goes on to

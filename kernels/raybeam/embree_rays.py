@@ -129,8 +129,9 @@ def _look_up_subrays(scratch, shares, offsets, directions, rows, subrays):  # ty
     """Write the beam direction of each sub-ray of a group, and the sub-ray's components.
 
     The components, from `SubRays.loop_table` at `shares`, are of the sub-ray's direction along the
-    beam, across and up, and of its start across and up. `offsets`, 0 for none, change the angles of
-    each beam's sub-rays. Rows in the pattern become rows of the `rows` beams.
+    beam, across and up, and of its start across and up. With `offsets` (2, rows) of the
+    beams, radians, rows across and up of the table are tangents of angles, to which the offsets are
+    added; 0 for none. Rows in the pattern become rows of the `rows` beams.
     """
     numbers = int64s(scratch)
     floats = float64s(scratch)

@@ -36,7 +36,7 @@ class Frame:
         float64 (3,), metres: subtracted from points.
     scale
         Local units in a metre, a power of two.
-    low, high
+    lower, upper
         float64 (3,): corners of the box around the triangles, local, padded as in the tree.
     """
 

@@ -33,7 +33,7 @@ class BinaryTree:
 
     Attributes
     ----------
-    low, high
+    lower, upper
         float32 (3, 2n-1): boxes.
     left, right
         int32 (2n-1,): children; -1 for boxes.

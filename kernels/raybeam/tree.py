@@ -29,7 +29,7 @@ class WideTree:
 
     Attributes
     ----------
-    low, high
+    lower, upper
         float32 (m, 3, width): the children's boxes, padded by `PAD`; an empty slot has an
         inverted box, which no ray hits.
     child

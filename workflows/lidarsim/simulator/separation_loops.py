@@ -22,9 +22,9 @@ class SubrayHits(NamedTuple):
 
     ray: Ints  # sub-ray
     distance: Floats  # metres
-    energy: Floats
+    energy: Floats  # as if all of the beam were in the hit's sub-ray
     velocity: Floats  # radial, m/s; empty if returns have none
-    solid: Bools  # whether a surface was hit; empty in the air
+    solid: Bools  # False for hits of no surface; empty for the table of hits in the air
 
 
 class Receiver(NamedTuple):
@@ -43,10 +43,10 @@ class Receiver(NamedTuple):
 class ReturnArrays(NamedTuple):
     """Arrays to which returns are written: (k,) each."""
 
-    beam: Ints
+    beam: Ints  # number of the ray of the scans, from 0 at sub-ray 0
     row: Ints  # of the strongest hit; of hits in the air -1, -2, …
     distance: Floats  # metres
-    energy: Floats
+    energy: Floats  # of the whole beam
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:

@@ -25,7 +25,9 @@ class TriangleNumbers(NamedTuple):
     """Numbers of triangles: faces of the scene, then of instances, then of actors."""
 
     instance_starts: Ints  # (i + 1,): first triangle of each instance, and of actors
-    owners: Ints32  # (f + a + 1,): objects of the triangles of faces and actors; the last is -1
+    owners: (
+        Ints32  # (f + a + 1,): objects of the triangles of faces and actors; -1 for no triangle, -1
+    )
     instance_objects: Ints32  # (i,)
     instance_rows: Ints  # (i,): stored row of the first triangle of each instance
     actor_shifts: Ints  # (actors,): from numbers of an actor's triangles to stored rows
@@ -44,7 +46,7 @@ class HitSurfaces(NamedTuple):
     """Surfaces of hits: (n,) each."""
 
     row: Ints  # of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
-    kind: Ints32  # of the surface
+    kind: Ints32  # number of a material of an object, see `Scene.surface_kinds`
     instance: Ints  # or -1
     run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
 
@@ -54,7 +56,7 @@ class NormalTables(NamedTuple):
 
     stored: Floats32  # (f, 3): unit normals of stored triangles
     deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
-    instances: Floats  # (i, 3, 3): from normals of parts to normals of instances, of any length
+    instances: Floats  # (i, 3, 3): from normals of an instance's mesh to normals in the scene, of any length
     # (12, m): poses of actors, position and rotation by rows; a column for each run of hits that
     # have equal actors and times.
     poses: Floats
@@ -359,7 +361,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of sub-rays `ray` (n,) to `times`.
+    """Write the firing times of sub-rays `ray` (n,) to `times`; all times are nanoseconds.
 
     Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
     times of firings, and `delays` the times of the beams of a firing after its start.

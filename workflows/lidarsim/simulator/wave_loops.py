@@ -189,7 +189,7 @@ def _is_peak(samples, s, top):
 
 @inlined
 def _vertex(samples, peak):
-    """Return the shift, samples, and the height of the Gaussian through three samples."""
+    """Return the shift (in samples) and the height of the Gaussian through three samples."""
     if not (samples[peak - 1] > 0 and samples[peak + 1] > 0):
         return 0.0, samples[peak]
     log_before = log(samples[peak - 1])
