@@ -1,4 +1,4 @@
-// Columns of kept hits on a CUDA device, with the bits of `BatchReturns` (returns.py).
+// Columns of kept hits on a CUDA device, with the bits of `BatchPoints` (points.py).
 //
 // One thread a hit. CuPy compiles it without fused multiply-adds; the tests compile it for the CPU.
 // `wanted` has a bit for each column, in the order in which device.py lists them; what is not wanted

@@ -99,7 +99,10 @@ class DevicePoints:
         return np.full(len(self), value, column.dtype)
 
     def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of points `rows` (k,), metres, rounded to the precision: (k, 3)."""
+        """Return the positions of points `rows` (k,), metres: (k, 3).
+
+        Positions are rounded to the precision unless NumPy computes columns.
+        """
         if self.returns is not None:
             return self.returns.positions_of(rows)
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
@@ -133,14 +136,14 @@ class DeviceColumns:
         self.bodies, _ = surfaces.bodies()
         self._counters = caster.counters()
         self._surface_tables: tuple[Any, ...] | None = None
-        self._rotations: Any = None
+        self._normal_matrices: Any = None
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
         """Return a copy for a scene with moved instances; unchanged tables stay on the device."""
         moved_columns = copy(self)
         moved_columns._scene = scene
         moved_columns._surfaces = surfaces
-        moved_columns._rotations = None
+        moved_columns._normal_matrices = None
         return moved_columns
 
     def returns(
@@ -220,9 +223,9 @@ class DeviceColumns:
                 materials.semantic_class,
             )
             self._surface_tables = tuple(to_device(cupy, table) for table in tables)
-        if self._rotations is None:
-            self._rotations = to_device(cupy, self._surfaces.bodies()[1])
-        return *self._surface_tables, self._rotations
+        if self._normal_matrices is None:
+            self._normal_matrices = to_device(cupy, self._surfaces.bodies()[1])
+        return *self._surface_tables, self._normal_matrices
 
 
 class _ColumnTransfer:
@@ -302,7 +305,10 @@ class _ColumnTransfer:
         return np.concatenate([rows for rows, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for the values; return {column name: values}, and the hits for NumPy, as `_HITS`."""
+        """Wait for the values; return {column name: values}, and the hits that NumPy needs.
+
+        Hits are rays, distances and triangles: of all hits, of those on actors, or of none.
+        """
         if self._buffers is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
         self._buffers.outbox.wait()
@@ -337,7 +343,7 @@ class _ColumnTransfer:
         maker = self._maker
         specs = self._specs
         sensor = maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, reflectance, retro, classes, rotations = maker.tables(cupy)
+        bodies, owners, normals, reflectance, retro, classes, normal_matrices = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return (
             np.float64(maker.survey.precision_m),
@@ -350,7 +356,7 @@ class _ColumnTransfer:
             bodies,
             owners,
             normals,
-            rotations,
+            normal_matrices,
             reflectance,
             retro,
             np.float64(RETRO_GAIN),

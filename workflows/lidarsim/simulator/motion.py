@@ -167,7 +167,9 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions (n, 3) of rays (n,) of a pattern, in the scene frame.
+        """Return origins and directions of rays (n,) of a pattern, in the scene frame: (n, 3) each.
+
+        Origins are (1, 3) if all rays share one.
 
         Ray k is row ``start + k`` of the pattern, which repeats, see `raybeam.pattern_rays`.
         """
@@ -250,7 +252,7 @@ def poses_of_firings(
 
 
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
-    """Return the rotations (k, 3, 3) from the head frame to the scene frame.
+    """Return the rotations (k, 3, 3) from the head, turned to its azimuths, to the scene frame.
 
     `rotations` (k, 3, 3) are those from the carrier frame; `spins` (2, k) are the cosines and sines
     of the head's azimuths.

@@ -207,7 +207,10 @@ class CastStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of sub-rays and hits, which is more if light continues or is bent."""
+        """Return the bytes of sub-rays and hits, more if light continues or is bent.
+
+        The bytes are those while rays are cast and while returns are counted, see `Memory`.
+        """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
         casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
         return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
@@ -306,7 +309,7 @@ class CastStep(PulseStep):
     def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
         """Return the hits of light on surfaces, or on leaves before the surfaces.
 
-        Moves the media of `cast.light` to the hits.
+        Advances `cast.light.in_media`, the state of the light in media, to the hits.
         """
         surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories

@@ -180,7 +180,8 @@ class SceneCaster:
         The arguments are those of `RayCaster.scan`; if there are actors, `poses` have a clock.
         `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
         `t_min` to `t_max`, metres; of each group of rays every n-th is returned, by `keep_every`.
-        `groups` are the first rays of the groups. `room` is output for all rays.
+        `groups` are the first rays of the groups. `room` (6, n) receives origins and
+        directions of all rays; without actors also (3, n), directions alone.
 
         Returns
         -------

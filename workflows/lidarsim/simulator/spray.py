@@ -68,6 +68,7 @@ class SprayStep(PulseStep):
         air = survey.air(setup.number)
         range_limits_m = reach(sensor.min_range_m, sensor.max_range_m)
         clump_kind = spray(survey.spray_g_m3)
+        # 1/m: cross-sections of clumps, of whose extinction half is diffraction.
         self._extinction = clump_kind.extinction / LARGE
         self._step_mm = 1 / clump_kind.slope
         self._clump_distribution = seen_by_range(

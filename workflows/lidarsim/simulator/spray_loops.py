@@ -34,7 +34,7 @@ class SprayBoxes(NamedTuple):
     boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, metres
     # (b, 2): first and last time of each box; the last is `lasts_ns` after the box is left behind.
     presence_ns: Floats
-    # (b,): when the box is left behind, as a multiple of the density of `ClumpTables`.
+    # (b,): when the box is left behind, as a multiple of `Survey.spray_g_m3`.
     density: Floats
     lasts_ns: float  # time after which a box is gone
     decay_ns: float  # time in which exp(-1) of the density is left
@@ -45,14 +45,14 @@ class Crossings(NamedTuple):
 
     beam: Ints  # (k,): number of the beam in the batch
     # (3, k): ranges at which the beam enters and leaves the box, metres, and the density of the box
-    # at that time, as a multiple of the density of `ClumpTables`.
+    # at that time, as a multiple of `Survey.spray_g_m3`.
     spans: Floats
 
 
 class ClumpTables(NamedTuple):
     """Tables of clumps of spray that may be detected, see `air.DetectableParticles`."""
 
-    mean: float  # detectable clumps that a beam would meet if all the air had a density of 1
+    mean: float  # detectable clumps that a beam would meet in air of density `Survey.spray_g_m3`
     by_range: Floats  # (5, shares): columns, ascending in range, that hold equal shares of `mean`
     step_mm: float  # diameter that exp(-1) of the drops exceed
     exponential: Floats  # quantiles of the exponential distribution

@@ -56,7 +56,8 @@ class NormalTables(NamedTuple):
 
     stored: Floats32  # (f, 3): unit normals of stored triangles
     deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
-    instances: Floats  # (i, 3, 3): from normals of an instance's mesh to normals in the scene, of any length
+    # (i, 3, 3): from normals of an instance's mesh to normals in the scene, of any length.
+    instances: Floats
     # (12, m): poses of actors, position and rotation by rows; a column for each run of hits that
     # have equal actors and times.
     poses: Floats

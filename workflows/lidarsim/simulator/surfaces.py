@@ -208,7 +208,8 @@ class Surfaces:
         """Return the incidence of rays on triangles (n,), and the kinds of their surfaces (n,).
 
         `directions` (n, 3) are in the scene frame, and `times` (n,) are nanoseconds, for the poses
-        of actors. `Incidence.back` assumes surfaces that are neither textured nor rough.
+        of actors. `Incidence.back`, the energy received from 10 m, assumes surfaces that
+        are neither textured nor rough.
         """
         from . import surface_loops  # not before: numba takes half a second to import
 
@@ -566,8 +567,9 @@ class Surfaces:
         """Return the received energy of rays that end on triangles (n,), at distances in metres.
 
         ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
-        retro-reflector, a gain replaces the cosine. Where materials are `textured`, the colours
-        (n,) are needed.
+        retro-reflector, a gain replaces the cosine; rough surfaces add gloss; distances below
+        `NEAREST_M` count as `NEAREST_M`. Where materials are `textured`, the colours (n,) are
+        needed.
         """
         table = self.at_wavelength(light.wavelength_nm)
         bright = luminance(colours) if table.textured and colours is not None else None
@@ -632,7 +634,7 @@ class Surfaces:
 
     @cached_property
     def media(self) -> tuple[int, ...]:
-        """Kinds of surfaces of the scene's faces that hold a medium within a closed surface."""
+        """Kinds of surfaces of closed static objects, also in instances, that hold a medium."""
         table = self.materials
         closed, _ = self.solids
         holds_medium = (table.leafy | table.refracts) & closed
