@@ -215,7 +215,8 @@ class Steward(SchedulerPlugin):
     def _give_up(self, seat: Seat) -> None:
         """Remove the seat of a worker that has not returned in time, and fill its place by rule.
 
-        Members of the remainder that joined by rule are assigned again.
+        Also of a present worker that cannot declare resources. Members of the remainder that joined
+        by rule are assigned again.
         """
         seat.removed = True
         del self.seats[seat.key]

@@ -11,6 +11,7 @@ import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
+from lidarpool.compare.fit import Estimate, _with_performance
 from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
 from lidarscenes.procedural.city import city
@@ -87,6 +88,16 @@ def test_a_model_keeps_what_the_recording_does_not_tell():
     assert "note: the recorded rings are not those of Livox Mid-40: check --model" in repr(
         fit(recorded(NOISE), model="mid40")
     )
+
+
+def test_range_noise_of_a_model_stays_if_none_was_fitted():
+    """Private, since no recording of a simulation lacks figures of range noise alone."""
+    model = read_model("ouster/os1-64")
+    dropout = {"dropout": Estimate(0.1, 0.05, 0.15)}
+    fitted = _with_performance(model, dropout, "a recording").performance
+    assert fitted.dropout == 0.1
+    assert fitted.precision == model.performance.precision is not None
+    assert fitted.detection == model.performance.detection
 
 
 def test_bias_of_channels_against_planes_and_against_the_scene():

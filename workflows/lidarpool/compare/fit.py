@@ -364,12 +364,16 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor with estimates in its performance; figures without estimates stay."""
+    """Return a sensor with estimates in its performance; figures without estimates stay.
+
+    The figures of range noise go together: an estimate of one replaces all of these, and
+    `precision`.
+    """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()
-    stated = performance.model_dump(
-        exclude_defaults=True, exclude={"precision", *_RANGE_NOISE_FIELDS}
-    )
+    has_range_noise = any(name in values for name in _RANGE_NOISE_FIELDS)
+    replaced = {"precision", *_RANGE_NOISE_FIELDS} if has_range_noise else set()
+    stated = performance.model_dump(exclude_defaults=True, exclude=replaced)
     if range_m := values.get("detection_range_m"):
         stated["detection"] = {"range_m": range_m, "reflectance": 0.1, "probability": 0.5}
     names = [*_RANGE_NOISE_FIELDS, "angle_deg", "dropout"]

@@ -138,7 +138,7 @@ class Job:
 
     @cached_property
     def sweeps(self) -> Sweeps:
-        """Sweeps of the survey with poses and boxes of actors; seconds for thousands of poses."""
+        """Sweeps with poses and boxes of actors; takes seconds for thousands of poses."""
         return Sweeps.from_survey(self.survey, self.scene)
 
 

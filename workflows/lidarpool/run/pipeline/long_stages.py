@@ -361,7 +361,7 @@ class LongStages:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Let all stages end after everything is committed."""
+        """End the stages; call once everything is committed."""
         # Stage 1 may still describe a survey that has failed.
         for pipe in self._pipes:
             if pipe is not self._news:

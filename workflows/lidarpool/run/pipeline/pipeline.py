@@ -162,7 +162,7 @@ class Pipeline:
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
-        # The sorter forgets a job once the last scan is framed. This message says so of the first.
+        # The sorter forgets a job once the last scan is framed: `until=1, framed=1`.
         if error is not None and job.has_frames:
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._ended.append((job, error))
@@ -362,7 +362,7 @@ class Pipeline:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Let all stages end after everything is committed."""
+        """End the stages; call once everything is committed."""
         self.workers.want(0)  # the partition may shrink
         self.stages.close()
 
