@@ -96,7 +96,7 @@ def test_range_noise_of_a_model_stays_if_none_was_fitted():
     dropout = {"dropout": Estimate(0.1, 0.05, 0.15)}
     fitted = _with_performance(model, dropout, "a recording").performance
     assert fitted.dropout == 0.1
-    assert fitted.precision == model.performance.precision is not None
+    assert (fitted.range_m, fitted.range_per_m) == (0.0005, 0.000444)
     assert fitted.detection == model.performance.detection
 
 

@@ -188,8 +188,9 @@ class Dispatcher:
         """Update the batches of casting tasks that have ended; return True if there are any.
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
-        casting has failed, and the task had batches of several jobs, they are offered again, too, each in a task with
-        batches of its own job only (`Outcome.DIVIDE`); with batches of a single job, the job fails.
+        casting has failed, and the task had batches of several jobs, they are offered again, too,
+        each in a task with batches of its own job only (`Outcome.DIVIDE`); with batches of a single
+        job, the job fails.
         """
         moved = False
         for key, task_batches in [*self._tasks.items()]:
