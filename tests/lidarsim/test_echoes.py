@@ -182,7 +182,7 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
     pane.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
     meshes = [solid("Pane", pane, (away_m + 30, 0, 0)), wall("Behind", away_m + 60)]
     materials = [Material("Pane", transparent="pass"), Material("Behind", 0.5)]
-    found = cast(meshes, position=(away_m, 0.01, 0.02), backend=backend, materials=materials)
+    found = cast(meshes, at=(away_m, 0.01, 0.02), backend=backend, materials=materials)
     through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
     assert found["range"] == pytest.approx([60], abs=1e-3)
     assert found["reflectance"] == pytest.approx(0.5 * through, rel=1e-4)
