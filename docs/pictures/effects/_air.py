@@ -38,8 +38,11 @@ def points(scene: Scene, survey: Survey) -> dict[str, Real]:
     """Positions, range, intensity and cause of its points."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     columns = {
-        "cause": [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in batches],
-        "range": [b.found.distance for b in batches],
+        "cause": [
+            np.zeros(len(b)) if b.pulse_returns.cause is None else b.pulse_returns.cause
+            for b in batches
+        ],
+        "range": [b.pulse_returns.distance for b in batches],
         "intensity": [b.intensity for b in batches],
         "x": [b.positions[:, 0] for b in batches],
         "y": [b.positions[:, 1] for b in batches],

@@ -49,7 +49,10 @@ def spinning_beam(firings: int, rate_hz: float = 10.0, clockwise: bool = False) 
 def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
     """Causes and positions of all points of a survey."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
-    causes = [np.zeros(len(b)) if b.found.cause is None else b.found.cause for b in batches]
+    causes = [
+        np.zeros(len(b)) if b.pulse_returns.cause is None else b.pulse_returns.cause
+        for b in batches
+    ]
     positions = np.concatenate([b.positions for b in batches])
     return {"cause": np.concatenate(causes), **dict(zip("xyz", positions.T, strict=True))}
 

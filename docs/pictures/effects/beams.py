@@ -44,7 +44,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     """Return where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
-    beams = rig.pulse_casters[0].emitter.divided(rig.pattern(0, 0, 1))
+    beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
     starts, directions = pattern_rays(beams, np.arange(len(beams)), (0, 0, 0))
     hits = rig.scene_caster.caster.cast(starts, directions)
     points = starts + hits.distance[:, None] * directions

@@ -68,7 +68,7 @@ def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Re
     )
     (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
     points = batch  # a survey with water is cast by the host
-    ray = points.found.ray  # type: ignore[union-attr]
+    ray = points.pulse_returns.ray  # type: ignore[union-attr]
     positions = points.positions  # type: ignore[union-attr]
     return positions[:, 0], positions[:, 2], NADIRS[ray], points.intensity  # type: ignore[union-attr]
 
