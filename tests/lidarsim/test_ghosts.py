@@ -101,9 +101,7 @@ def test_water_is_passed_and_mirrors():
     assert found["reflectance"][0] == pytest.approx(share**2, rel=1e-6)
     floor = [level("Pool", 1.0), level("Floor", -2.0)]
     water = Material("Pool", **WATER, specular_reflectance="fresnel")
-    found = cast(
-        floor, fan(30, 31), materials=[water, Material("*", 1.0)], at=(0, 0, 0), **ALL
-    )
+    found = cast(floor, fan(30, 31), materials=[water, Material("*", 1.0)], at=(0, 0, 0), **ALL)
     assert found["object"].tolist() == [1, 1] and (found["cause"] == GHOST).all()
     assert found["range"] == pytest.approx(4 * 1.33 / np.sin(np.radians([30, 31])), rel=1e-5)
 

@@ -72,7 +72,7 @@ def test_bytes_of_batches(capsys):
 
 
 def test_effects(capsys):
-    toy = ["--rounds", "1", "--triangles", "500"]
+    toy = ["--rounds", "1", "--triangles", "2000"]
     assert effects.main(["--only", "rain", "spray", *toy]).keys() == {"rain", "spray"}
     assert capsys.readouterr().out.startswith("rain ")
 
