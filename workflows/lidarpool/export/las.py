@@ -23,7 +23,7 @@ from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordin
 from lidarsim.base.errors import LidarError
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.columns.table import COLOURS, NORMAL, TABLE
+from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
@@ -71,6 +71,12 @@ _ETRS89 = _Geodetic(
 )
 
 
+def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
+    """Return the extra bytes of a column, with its unit and meaning in 32 letters."""
+    description = shorten(f"{column.unit} {column.meaning}", 32, placeholder="")
+    return laspy.ExtraBytesParams(_name(column.in_files), column.dtype, description)
+
+
 def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
     """Write a cloud: columns to fields of the format, further columns to extra bytes.
 
@@ -91,14 +97,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     _set_grid(header, cloud, sweeps.precision_m, path.suffix[1:].upper())
     format_fields = (*_FORMAT_FIELDS, *COLOURS) if {*COLOURS} <= columns else _FORMAT_FIELDS
     extra = [column for column in cloud.table if column.name not in format_fields]
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(
-                _name(c.in_files), c.dtype, shorten(f"{c.unit} {c.meaning}", 32, placeholder="")
-            )
-            for c in extra
-        ]
-    )
+    header.add_extra_dims([_extra_bytes(column) for column in extra])
     names = [column.name for column in extra]
     try:
         with (

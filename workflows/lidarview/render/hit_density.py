@@ -54,24 +54,31 @@ def hit_colours(
     is_counted = np.isfinite(point_density)
     density = triangle_density[owner]
     if point_density[is_counted].any():
-        hits_per_point = (density * areas)[is_counted].sum() / (point_density * areas)[
-            is_counted
-        ].sum()
-        density[is_counted] = hits_per_point * point_density[is_counted]
+        hit_count = (density * areas)[is_counted].sum()
+        point_count = (point_density * areas)[is_counted].sum()
+        density[is_counted] = hit_count / point_count * point_density[is_counted]
     limits = _density_range(density, areas)
     density = np.repeat(density[:, None], 3, axis=1)
     if is_counted.any():
-        # The mean of all pieces around a corner, for smooth transitions.
-        corner_keys = np.ascontiguousarray(pieces[is_counted]).view("V12").ravel()
-        _, corner = np.unique(corner_keys, return_inverse=True)
-        corner_areas = np.repeat(areas[is_counted], 3)
-        means = np.bincount(corner, corner_areas * density[is_counted].ravel()) / np.bincount(
-            corner, corner_areas
+        density[is_counted] = _corner_means(
+            pieces[is_counted], areas[is_counted], density[is_counted]
         )
-        density[is_counted] = means[corner].reshape(-1, 3)
     # Where points were counted, none are grey; elsewhere the hits are known.
     colours = _density_colours(density, (~is_counted & (hits[owner] > 0))[:, None], limits)
     return pieces, owner, colours, limits
+
+
+def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
+    """Return the mean density of all pieces around each corner, for smooth transitions: (k, 3).
+
+    `pieces` (k, 3, 3) are corners, `areas` (k,) square metres, `density` (k, 3) at the corners.
+    """
+    corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
+    _, corner = np.unique(corner_keys, return_inverse=True)
+    corner_areas = np.repeat(areas, 3)
+    corner_hits = np.bincount(corner, corner_areas * density.ravel())
+    means = corner_hits / np.bincount(corner, corner_areas)
+    return means[corner].reshape(-1, 3)
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
