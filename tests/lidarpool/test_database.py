@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -302,6 +303,27 @@ def test_a_damaged_file_is_refused_and_left_alone(db, job, damage):
     ):
         read(opened)
     assert db.path.read_bytes() == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no interval timers")
+def test_an_interrupt_during_a_commit_does_not_look_like_damage(db, job):
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGALRM, interrupt)
+    interrupts = 0
+    try:
+        for delay_s in np.linspace(0.0002, 0.005, 60):
+            with pytest.raises(KeyboardInterrupt):
+                signal.setitimer(signal.ITIMER_REAL, float(delay_s))
+                while True:
+                    db.end_jobs((number, False, {"name": "x"}) for number in range(200))
+            interrupts += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+    assert interrupts == 60
+    assert commit(db, job, receipt(0, 4)) == [receipt(0, 4)]  # no transaction is left open
 
 
 def test_a_file_that_cannot_be_made(tmp_path):

@@ -721,7 +721,7 @@ def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
         wait_until(lambda: [*(files / "ds" / ".jobs").glob("*")])
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=300)
-    assert run.returncode == 130
+    assert run.returncode == 130, err
     assert err.startswith("\nlidarpool: interrupted; everything was stopped")  # behind the ^C
     assert re.search(r" of 100 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
 

@@ -90,7 +90,6 @@ class RunDatabase:
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
             )
-            self._sql.create_function("crc32", -1, _crc32, deterministic=True)
             try:
                 self._open({"format": str(FORMAT), "mark": secrets.token_hex(8)} | values)
             except BaseException:
@@ -106,7 +105,7 @@ class RunDatabase:
         if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
-            self._sql.executemany(_insert("meta"), values.items())
+            self._insert("meta", values.items())
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (version := self.meta.get("format")) != str(FORMAT):
@@ -117,11 +116,13 @@ class RunDatabase:
         (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # of pages and indices
         if state != "ok":
             raise sqlite3.DatabaseError(" ".join(state.split()))
-        for table, columns in _COLUMNS.items():
-            query = f"SELECT count(*) FROM {table} WHERE crc IS NOT crc32({', '.join(columns)})"
-            if count := self._sql.execute(query).fetchone()[0]:
-                raise sqlite3.DatabaseError(f"{count:,} rows of {table} have another checksum")
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
+        for table, columns in _COLUMNS.items():
+            query = f"SELECT {', '.join(columns)}, crc FROM {table}"
+            with closing(self._sql.execute(query)) as rows:
+                count = sum(crc != _crc32(*values) for *values, crc in rows)
+            if count:
+                raise sqlite3.DatabaseError(f"{count:,} rows of {table} have another checksum")
         with closing(self._sql.execute("SELECT number FROM jobs")) as rows:
             for (number,) in rows:
                 self._mark_ended(number)
@@ -198,7 +199,7 @@ class RunDatabase:
     def set(self, **values: str) -> None:
         """Store values of the `meta` table."""
         with self._transaction():
-            self._sql.executemany(_insert("meta", "OR REPLACE"), values.items())
+            self._insert("meta", values.items(), "OR REPLACE")
         self.meta |= values
 
     def commit(self, receipts: Iterable[tuple[J, Receipt]]) -> list[tuple[J, Receipt]]:
@@ -221,7 +222,7 @@ class RunDatabase:
         ]
         try:
             with self._transaction():
-                self._sql.executemany(_insert("parts"), rows)
+                self._insert("parts", rows)
                 self._write_frames(job for job, _ in new)
         except BaseException:
             for job, part in new:
@@ -233,7 +234,7 @@ class RunDatabase:
     def set_hash(self, number: int, text: str) -> None:
         """Store the hash of the inputs of a job under way."""
         with self._transaction():
-            self._sql.execute(_insert("made_of", "OR REPLACE"), (number, text))
+            self._insert("made_of", [(number, text)], "OR REPLACE")
 
     def drop(self, job: CommittedJob, receipts: Sequence[Receipt]) -> None:
         """Remove parts that are missing in storage, so that their scans are offered again."""
@@ -248,14 +249,12 @@ class RunDatabase:
     def add_trials(self, job: CommittedJob, trials: Sequence[Trial]) -> None:
         """Commit planning trials of a job."""
         with self._transaction():
-            self._sql.executemany(
-                _insert("trials", "OR IGNORE"),
-                # To the bit: a float is written with the digits that identify it.
-                [
-                    (job.number, trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist))
-                    for trial in trials
-                ],
-            )
+            # To the bit: a float is written with the digits that identify it.
+            rows = [
+                (job.number, trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist))
+                for trial in trials
+            ]
+            self._insert("trials", rows, "OR IGNORE")
         self.begun.add(job.number)
         job.trials += trials
 
@@ -264,10 +263,10 @@ class RunDatabase:
 
         A job may have ended before.
         """
-        ended = {number: (failed, json.dumps(data)) for number, failed, data in jobs}
+        ended = {number: (int(failed), json.dumps(data)) for number, failed, data in jobs}
         rows = [(number, *row) for number, row in ended.items()]
         with self._transaction():
-            self._sql.executemany(_insert("jobs", "OR REPLACE"), rows)
+            self._insert("jobs", rows, "OR REPLACE")
             self._delete(ended)
         self.begun -= ended.keys()
         for number in ended:
@@ -323,14 +322,23 @@ class RunDatabase:
         for job in jobs:
             if job.frames != job.frames_written:
                 row = (job.number, job.frames)
-                self._sql.execute(_insert("frames", "OR REPLACE"), row)
+                self._insert("frames", [row], "OR REPLACE")
                 job.frames_written = job.frames
+
+    def _insert(self, table: str, rows: Iterable[Sequence[Any]], conflict: str = "") -> None:
+        """Insert rows with their CRC-32; `conflict` is a clause such as ``OR REPLACE``."""
+        # Not by a function that SQLite calls: an interrupt in it would look like damage.
+        sealed_rows = [(*row, _crc32(*row)) for row in rows]
+        placeholders = ", ".join("?" * (len(_COLUMNS[table]) + 1))
+        self._sql.executemany(
+            f"INSERT {conflict} INTO {table} VALUES ({placeholders})", sealed_rows
+        )
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         with _explained(self.path):
-            self._sql.execute("BEGIN IMMEDIATE")
             try:
+                self._sql.execute("BEGIN IMMEDIATE")
                 yield
                 self._sql.execute("COMMIT")
             except BaseException:
@@ -365,12 +373,6 @@ def _crc32(*values: Any) -> int:
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)
     return crc
-
-
-def _insert(table: str, conflict: str = "") -> str:
-    """Return the statement that inserts a row of a table and its CRC-32."""
-    placeholders = ", ".join(f"?{number}" for number, _ in enumerate(_COLUMNS[table], 1))
-    return f"INSERT {conflict} INTO {table} VALUES ({placeholders}, crc32({placeholders}))"
 
 
 def parts_folder(mark: str) -> str:
