@@ -12,6 +12,7 @@ def main() -> NoReturn:
     """Run the command, see `cli.main`."""
     end_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
+    from .base import rare_collections  # noqa: F401
     from .base.streams import TolerantStream
     from .cli.commands import main as command
 

@@ -32,7 +32,9 @@ def start_fork_server() -> bool:
     server: Any = forkserver._forkserver
     preload = server._preload_modules
     environment = dict(os.environ)
-    server.set_forkserver_preload(["lidarpool.run.pipeline.forked"])
+    server.set_forkserver_preload(
+        ["lidarpool.base.rare_collections", "lidarpool.run.pipeline.forked"]
+    )
     os.environ.update(_ENVIRONMENT)
     try:
         with children_spared():

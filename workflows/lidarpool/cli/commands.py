@@ -28,14 +28,14 @@ from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from lidarsim.base.words import plural
 
+from ..base.logs import set_logs
 from ..base.shard import ALL
 from . import shared_options as shared
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
-from .shared_options import set_logs
 
 if TYPE_CHECKING:
-    from ..run.cluster.connection import TlsFiles
+    from ..base.tls_files import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
 

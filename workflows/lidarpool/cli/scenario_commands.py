@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from lidarsim.scene.scene import Scene
     from lidarsim.sensor.models import SensorModel
 
+    from ..base.tls_files import TlsFiles
     from ..plan.stations import StationPlan
-    from ..run.cluster.connection import TlsFiles
     from ..scenario.scenario import Scenario
 
 MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles

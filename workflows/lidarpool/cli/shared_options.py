@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
-import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial, reduce, wraps
 from itertools import chain
@@ -19,6 +16,7 @@ from lidarsim.base.storage import Storage, is_url
 from lidarsim.base.vocabulary import BACKENDS, UNITS_M
 
 from ..base.shard import Shard
+from ..base.tls_files import TlsFiles
 
 Command = Callable[..., None]
 
@@ -149,8 +147,6 @@ def scheduler(command: Command) -> Command:
     def with_files(*arguments: Any, **settings: Any) -> None:
         from lidarsim.base.input_files import input_size
 
-        from ..run.cluster.connection import TlsFiles
-
         if settings.get("cluster") is not None and settings["scheduler"] is not None:
             raise click.UsageError(
                 "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
@@ -191,18 +187,3 @@ def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> Non
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:
         click.echo(line)
-
-
-def set_logs(shown: bool) -> None:
-    """Show or drop log messages and warnings of libraries in this process.
-
-    The command itself tells users what matters. For a log file, redirect the output of `-v`. This
-    is also called in workers that share the terminal: the driver reports a failed task once, and
-    Dask's worker would log the task as well, with a traceback.
-    """
-    logging.disable(logging.NOTSET if shown else logging.CRITICAL)
-    if shown:
-        for handler in logging.getLogger("distributed").handlers:
-            handler.setLevel(logging.INFO)  # a local cluster has raised the level
-    elif not sys.warnoptions:
-        warnings.simplefilter("ignore")

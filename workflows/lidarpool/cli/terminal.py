@@ -16,9 +16,10 @@ from rich.console import Console
 
 from lidarsim.base.writing_progress import WritingProgress
 
+from ..base.logs import set_logs
 from ..base.streams import TolerantStream
 from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
-from .shared_options import WARNED, set_logs
+from .shared_options import WARNED
 
 # Plain lines follow after a tenth of the elapsed time, within these bounds, so that a survey of
 # hours does not fill a log.

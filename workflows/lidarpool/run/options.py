@@ -17,9 +17,9 @@ from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
 from lidarsim.base.words import did_you_mean
 
+from ..base.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster.cluster_file import ClusterFile
-from .cluster.connection import TlsFiles
 
 
 @dataclass(frozen=True, kw_only=True)

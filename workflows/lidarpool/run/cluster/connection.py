@@ -15,8 +15,7 @@ from contextlib import (
     suppress,
 )
 from multiprocessing import current_process
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 import dask
@@ -33,6 +32,7 @@ from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
 from ...base.fork_server import start_fork_server
+from ...base.tls_files import TlsFiles
 from ..pipeline.names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
@@ -46,18 +46,12 @@ _UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # a hos
 # have: an idle worker took 3 % of a core, and takes a fifth of that with these settings.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
+    "distributed.scheduler.http.routes": [],  # nobody knows the address of these pages
+    "distributed.worker.http.routes": [],
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.admin.low-level-log-length": 100,  # messages to workers that are kept: 1,000
 }
-
-
-class TlsFiles(NamedTuple):
-    """PEM files for an encrypted cluster: certificates of authority and client, and a key."""
-
-    ca: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:

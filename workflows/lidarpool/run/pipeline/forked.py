@@ -1,23 +1,40 @@
-"""Imports of the fork server, which workers of a local cluster inherit."""
+"""Imports of the fork server, which workers of a local cluster inherit.
+
+Each worker would import the same modules itself while the run waits for it.
+"""
 
 from __future__ import annotations
 
+import gc
 import logging
+import multiprocessing.popen_forkserver  # noqa: F401
+import multiprocessing.synchronize  # noqa: F401
 import sys
 from contextlib import suppress
 
 import distributed.nanny  # noqa: F401
+import distributed.versions
+import numpy.ma  # noqa: F401 - numba asks for it with the first array
+import tornado.platform.asyncio  # noqa: F401
 
+import poolpart.deploy.local  # noqa: F401
+
+from ...base import logs, software  # noqa: F401
 from ...base.fork_server import keep_freed_memory
 from ...plan import trial  # noqa: F401
-from . import stages  # noqa: F401
+from . import casting_workers, stages  # noqa: F401
 
 keep_freed_memory()
 # A starting worker removes the folders of ended workers, at the same time as their nannies, and
 # would log each missing folder as an error.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # if it cannot be loaded, a check says why
+    from lidarsim.base import elementary_loops  # noqa: F401
     from raybeam import embree_bodies, embree_packets, moving_loops  # noqa: F401
 
     if embree_packets.COMPILED:
         print("note: compiled the ray caster for this processor, once", file=sys.stderr)  # noqa: T201
+# What each worker would read from many files: versions of packages, and a hash of the sources.
+distributed.versions.get_versions()
+software.sources()
+gc.freeze()  # a collection in a worker would copy the memory that it shares with the others
