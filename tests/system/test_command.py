@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -292,13 +293,28 @@ def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
     assert (tmp_path / "lidarpool-out" / "cloud.ply").exists() == (arguments[0] == "run")
 
 
-def test_a_timeline_says_when_each_step_ended(tmp_path):
+def processes_with(variable: str) -> list[str]:
+    """Command lines of the processes that have inherited a variable of the environment."""
+    commands = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if variable in process.environ() and process.status() != psutil.STATUS_ZOMBIE:
+                commands.append(" ".join(process.cmdline()))
+    return commands
+
+
+def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
+    mark = f"LIDARPOOL_TEST_{os.getpid()}"
     (tmp_path / "scenario.yaml").write_text(SHORT)
     page = tmp_path / "timeline.html"
     arguments = ["run", "scenario.yaml", "-q", "--only", "cloud", "--timeline", page]
+    environment = {**os.environ, mark: "1"}
     ended = subprocess.run(
-        [*COMMAND, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+        [*COMMAND, *arguments],
+        cwd=tmp_path, capture_output=True, text=True, check=True, env=environment,
+    )  # fmt: skip
+    time.sleep(1)
+    assert processes_with(mark) == []
     table = re.search(r"^step +takes +ends at\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
     lines = table[1].splitlines()
     rows = [re.fullmatch(r"(\D+?) +([\d.]+) s +([\d.]+) s", line).groups() for line in lines]

@@ -68,9 +68,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """Lock the folder while the body runs."""
         for output_format in self.formats:
             output_format.check_installed()
-        load_open3d()  # which writes the cloud in the end
         with result_folder(self.target) as self._folder:
             yield
+
+    def prepare(self) -> None:
+        """Load Open3D, which writes the cloud in the end."""
+        load_open3d()
 
     def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""

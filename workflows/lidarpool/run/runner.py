@@ -19,7 +19,8 @@ from ..datasets.job_table import JobRow
 from ..plan import best
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
-from .cluster.cluster import Cluster
+from .cluster.cluster import Cluster, start_local
+from .cluster.connection import StartedAhead
 from .job_source import JobMaker, Jobs
 from .options import RunOptions
 from .pipeline.messages import ScanFrame
@@ -46,6 +47,9 @@ class Output(Generic[R]):
     def begin(self, run: Run[R]) -> R | None:
         """Refuse files that must not be replaced; return the result if no work is left."""
         return None
+
+    def prepare(self) -> None:
+        """Load what writes the results, so that a missing library is reported at the start."""
 
     def look(self, run: Run[R]) -> None:
         """Compare the files of the output with the jobs that the store calls done."""
@@ -100,6 +104,7 @@ class Run(Generic[R]):
         self.stack = ExitStack()
         self.cluster_stack = ExitStack()  # leaves the cluster
         self.store: RunStore
+        self._local: StartedAhead | None = None  # workers of this machine, for this run
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.loop: RunLoop | None = None
         self._maker: JobMaker | None = None  # makes all jobs after the first
@@ -110,7 +115,11 @@ class Run(Generic[R]):
             self._lock_output()
             if (result := self.output.begin(self)) is not None:
                 return result
+            # Workers start while this process prepares the run, unless nothing may be left to cast.
+            if self.output.casts and not self.resume:
+                self._start_local()
             self._open_store()
+            self.output.prepare()
             if (first := self._first_job()) is not None:
                 self._cast(first)
             return self.output.finish(self)
@@ -138,6 +147,14 @@ class Run(Generic[R]):
     def resume(self) -> bool:
         """True if this run may continue an earlier run."""
         return self.options.resume or self.options.retry_failed or self.options.verify
+
+    def _start_local(self) -> None:
+        """Begin to start the workers of this machine, if the run has any and they are not begun."""
+        if self._local is None and self.options.starts_workers:
+            job = self.jobs.only_job
+            planning = job is not None and job.planning is not None
+            self._local = start_local(self.options, planning=planning, writing=job is None)
+            self.stack.push(self._local)
 
     def _lock_output(self) -> None:
         if (self.options.fresh or self.options.overwrite) and self.resume:
@@ -189,7 +206,8 @@ class Run(Generic[R]):
         enter = self.cluster_stack.enter_context
         if options.starts_workers:
             check_backend_here(store.backend or options.backend, store.advice)
-        self.cluster = Cluster(first, store, options, self.screen, enter)
+        self._start_local()
+        self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)
         self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, self._frame)

@@ -22,7 +22,13 @@ from ..pipeline.names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
 from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
-from .connection import check_starts_workers, connected, local_client, started_client
+from .connection import (
+    StartedAhead,
+    check_starts_workers,
+    connected,
+    local_client,
+    started_client,
+)
 from .tasks import Tasks
 from .watch import Waiting, Watch
 
@@ -32,10 +38,28 @@ LOST_S = 0.5  # for a client to notice that its scheduler is gone
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
+def start_local(options: RunOptions, *, planning: bool, writing: bool) -> StartedAhead:
+    """Begin to start the workers of a run on this machine.
+
+    `planning` and `writing` are True if paths are planned, and if LIDAR workers write jobs.
+    """
+    check_starts_workers()
+    required_slots = slots_needed(options, planning=planning, writing=writing)
+    workers = options.gpu_workers, options.other_workers
+    return StartedAhead(local_client(required_slots, *workers, tls=options.tls))
+
+
 def client_of(
-    options: RunOptions, required_slots: Mapping[str, int], waiting: Waiting, screen: Screen
+    options: RunOptions,
+    required_slots: Mapping[str, int],
+    waiting: Waiting,
+    screen: Screen,
+    local: StartedAhead | None,
 ) -> AbstractContextManager[Client]:
-    """Return a client of an existing cluster, or of a new cluster with `required_slots`."""
+    """Return a client of an existing cluster, or of a new cluster with `required_slots`.
+
+    `local` is the cluster of this machine, if the run starts its workers there.
+    """
     if options.client is not None:
         return nullcontext(options.client)
     if options.scheduler is not None:
@@ -46,9 +70,7 @@ def client_of(
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
-    check_starts_workers()
-    workers = options.gpu_workers, options.other_workers
-    local = local_client(required_slots, *workers, tls=options.tls)
+    assert local is not None, "the run starts workers"
     return screen.starting(local, "starting the workers", shares_terminal=True)
 
 
@@ -56,8 +78,8 @@ class Cluster:
     """The cluster of a run, checked for jobs such as `first`.
 
     `store` lists the remaining jobs, and the software of earlier runs. `enter` enters the context
-    of the client, and its caller leaves that context in the end. LidarError if workers, memory or
-    software are missing.
+    of the client, and its caller leaves that context in the end. `local` as of `client_of`.
+    LidarError if workers, memory or software are missing.
     """
 
     def __init__(
@@ -67,13 +89,14 @@ class Cluster:
         options: RunOptions,
         screen: Screen,
         enter: Callable[[AbstractContextManager[Client]], Client],
+        local: StartedAhead | None,
     ) -> None:
         writing = store.only_job is None
         required_slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(required_slots)
         waiting = Waiting(options.wait_s, screen.tell)
-        self.client = client = enter(client_of(options, required_slots, waiting, screen))
+        self.client = client = enter(client_of(options, required_slots, waiting, screen, local))
         timeline.mark(timeline.WORKERS)
         self.options = options
         self._screen = screen

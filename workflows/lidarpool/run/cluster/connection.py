@@ -6,6 +6,7 @@ import asyncio
 import errno
 import socket
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import (
     AbstractContextManager,
     ExitStack,
@@ -122,12 +123,13 @@ def local_client(
     OTHER unless it has required slots. `tls` encrypts the traffic, with a certificate of its own;
     PoolError if no certificate can be made, or the workers do not start.
     """
+    forks = start_fork_server()  # here, for it changes the environment of this process
 
     @contextmanager
     def started() -> Iterator[SpecCluster]:
         with (
             dask.config.set(_QUIET),
-            forked_workers() if start_fork_server() else nullcontext(),
+            forked_workers() if forks else nullcontext(),
             closing(
                 local_cluster(
                     gpu_workers=gpu_workers,
@@ -141,6 +143,29 @@ def local_client(
             yield cluster
 
     return _client_of(started())
+
+
+class StartedAhead(AbstractContextManager[Client]):
+    """The context of a client, entered by a thread while the caller does something else.
+
+    The context can be left before it is entered, and left again.
+    """
+
+    def __init__(self, context: AbstractContextManager[Client]) -> None:
+        self._context = context
+        self._left = False
+        executor = ThreadPoolExecutor(1, "start")
+        self._client = executor.submit(context.__enter__)
+        executor.shutdown(wait=False)
+
+    def __enter__(self) -> Client:
+        return self._client.result()
+
+    def __exit__(self, *error: object) -> None:
+        with deferred_interrupts():
+            if not self._left and self._client.exception() is None:
+                self._context.__exit__(None, None, None)
+            self._left = True
 
 
 @contextmanager
