@@ -11,6 +11,7 @@ import pytest
 from tests.shapes import Cart, cast_between, tally_of
 
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
+from lidarpool.base.shared_memory import Pickled
 from lidarpool.columns.parts import pack
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
@@ -186,11 +187,11 @@ def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):
         rigs, "get_worker", lambda: SimpleNamespace(state=SimpleNamespace(nthreads=1))
     )
     monkeypatch.setattr(rigs, "own_device", lambda: None)
-    scene = pickle.dumps(Scene.from_meshes([box("Room", (8, 6, 3))]))
+    scene = Pickled.from_value(Scene.from_meshes([box("Room", (8, 6, 3))]))
     packed = pickle.dumps(survey(poses=TURNED))
 
     def made(run):
-        plan = pickle.dumps((f"{run}.scene-1", (), packed, "numpy"))
+        plan = Pickled.from_value((f"{run}.scene-1", (), packed, "numpy"))
         return rigs.rig_of(f"{run}.0-2", plan, scene)
 
     assert made("a") is rigs.rig_of("a.0-2")

@@ -10,9 +10,12 @@ from collections import Counter
 import numpy as np
 import pytest
 from distributed import Client, Queue, Variable
+from tests.clusters import thread_cluster
 from tests.shapes import room
 
-from lidarpool import LidarError, Planning, ScanSpec, Sensor, Survey, simulate
+from lidarpool import LidarError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
+from lidarpool.base.shared_memory import SharedHandle
+from lidarpool.run.pipeline.casting_workers import INLINE_BYTES
 from lidarpool.run.pipeline.messages import ScanRange
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -43,6 +46,32 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     # 60 steps of 7 degrees are more than one revolution, so sectors wrap around.
     rays = np.concatenate([np.arange(spec.ray_count) % SENSOR.channels for spec in survey.scans()])
     assert np.array_equal(cloud.channel, rays)
+
+
+def test_a_scene_comes_to_workers_that_see_the_drivers_memory_and_to_others(monkeypatch):
+    load = SharedHandle.load
+    seen: list[object] = []
+
+    def load_or_fail(handle):
+        if not seen:
+            raise FileNotFoundError(handle.path)
+        seen.append(handle)
+        return load(handle)
+
+    monkeypatch.setattr(SharedHandle, "load", load_or_fail)
+    scene = Scene.seed()
+    assert scene.vertices.nbytes > INLINE_BYTES
+    clouds = []
+    survey = Survey(SENSOR, [(0, 0, 1)], 9)
+    with (
+        thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        for _ in range(2):
+            clouds.append(simulate(scene, survey, client=client).cloud)
+            seen.append("from now on")
+    assert sum(isinstance(handle, SharedHandle) for handle in seen) == 1  # the worker loaded it
+    assert len(clouds[0]) and np.array_equal(clouds[0].positions, clouds[1].positions)
 
 
 def test_planning_runs_beside_the_survey(client):

@@ -9,9 +9,11 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from typing import Any
+from urllib.parse import urlsplit
 
 import cloudpickle
 from distributed import Future
+from distributed.utils import get_ip
 
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.scene import Scene
@@ -21,12 +23,13 @@ from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
+from ...base.shared_memory import Pickled, SharedHandle, SharedValue
 from ...base.software import difference, software_query
 from .batches import Outcome
 from .failures import JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .messages import BatchRange
 from .names import INTERSECT
-from .rigs import CastWork, RigFailed, RigMissing, drop_all, intersect
+from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
 
 LOOK_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
@@ -41,18 +44,27 @@ PREPARING = "preparing the scene on the casting workers"
 
 @dataclass(eq=False)
 class _Payload:
-    """Bytes that casting tasks bring to workers without a copy, or a future of large bytes."""
+    """A value that casting tasks bring to workers without a copy.
+
+    A small value is sent with each task. A large value lies in memory of this process, which
+    workers of this machine map; other workers get a future of its bytes.
+    """
 
     name: str  # on the workers
-    pack: Callable[[], bytes]  # makes the data, again if the future is lost
-    data: bytes | Future
+    make: Callable[[], object]  # returns the value, again if the future is lost
+    small: Pickled | None  # of a small value
+    shared: SharedValue | None = None
+    future: Future | None = None  # None until a worker needs it
     recipients: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
     holders: set[str] = field(default_factory=set)  # addresses of workers that have received it
+    blind: set[str] = field(default_factory=set)  # addresses of workers that do not see `shared`
 
     def release(self) -> None:
-        """Release the future now: the traceback of an error may keep this object for a while."""
-        if isinstance(self.data, Future):
-            self.data.release()
+        """Release the memory now: the traceback of an error may keep this object for a while."""
+        if self.shared is not None:
+            self.shared.close()
+        if self.future is not None:
+            self.future.release()
 
 
 class CastingWorkers:
@@ -79,7 +91,7 @@ class CastingWorkers:
         self._software = dict(software)
         # {job: (plan of its rig, static part of its scene, which other jobs may share)}
         self._jobs: dict[int, tuple[_Payload, _Payload]] = {}
-        # {ids of the fields of a scene: its static part}, last used last. `_Payload.pack` holds the
+        # {ids of the fields of a scene: its static part}, last used last. `_Payload.make` holds the
         # scene, so that the ids stay valid.
         self._scenes: dict[tuple[int, ...], _Payload] = {}
         self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
@@ -110,7 +122,7 @@ class CastingWorkers:
     @property
     def futures(self) -> list[Future]:
         """Futures of all casting tasks, checks of workers and shared payloads."""
-        shared = [payload.data for payload in self._payloads if isinstance(payload.data, Future)]
+        shared = [payload.future for payload in self._payloads if payload.future is not None]
         return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *shared]
 
     @property
@@ -131,15 +143,15 @@ class CastingWorkers:
         JobError if the job cannot be pickled.
         """
         try:
-            packed = _pickled(survey)
+            packed: bytes = cloudpickle.dumps(survey, protocol=5)
             # Identifies the static part while the scene exists: its jobs share their trees.
             key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
             static_scene = self._scenes.pop(key, None)
             if static_scene is None:
-                static_scene = self._payload("scene", lambda: _pickled(scene.with_actors(())))
+                static_scene = self._payload("scene", lambda: scene.with_actors(()))
             self._scenes[key] = static_scene  # the last used
             plan = static_scene.name, scene.actors, packed, self._backend
-            self._jobs[job] = self._payload(str(job), lambda: _pickled(plan)), static_scene
+            self._jobs[job] = self._payload(str(job), lambda: plan), static_scene
         except _UNSENT as error:  # raised by pickling classes of the user
             raise JobError(f"The survey cannot be sent to the workers: {error}") from error
         return packed, static_scene.name
@@ -162,28 +174,38 @@ class CastingWorkers:
             for address in payload.recipients & self._checked.keys():
                 self._unneeded.setdefault(address, []).append(payload.name)
 
-    def _payload(self, label: str, pack: Callable[[], bytes]) -> _Payload:
-        data = pack()
+    def _payload(self, label: str, make: Callable[[], object]) -> _Payload:
         self._name_count += 1
         name = f"{self.run}.{label}-{self._name_count}"
-        return _Payload(name, pack, data if len(data) <= INLINE_BYTES else self._share(name, data))
+        pickled = Pickled.from_value(make())
+        if pickled.nbytes <= INLINE_BYTES:
+            return _Payload(name, make, pickled.copy())
+        shared = None
+        with suppress(OSError):  # this system has no shared memory, or too little
+            shared = SharedValue(pickled)
+        return _Payload(name, make, None, shared)
 
-    def _share(self, name: str, data: bytes) -> Future:
+    def _share(self, payload: _Payload) -> Future:
         self._name_count += 1
-        return share(self._partition, data, key=f"{name}-packed-{self._name_count}", priority=10)
+        key = f"{payload.name}-packed-{self._name_count}"
+        return share(
+            self._partition, Pickled.from_value(payload.make()).copy(), key=key, priority=10
+        )
 
-    def _payload_for(self, payload: _Payload, worker: str) -> bytes | Future | None:
+    def _payload_for(
+        self, payload: _Payload, worker: str
+    ) -> Pickled | SharedHandle | Future | None:
         """Return the argument that brings a payload to a worker; None if the worker has a copy."""
         if worker in payload.holders:
             return None
         payload.recipients.add(worker)
-        if isinstance(payload.data, Future) and payload.data.status in (
-            "lost",
-            "cancelled",
-            "error",
-        ):
-            payload.data = self._share(payload.name, payload.pack())
-        return payload.data
+        if payload.small is not None:
+            return payload.small
+        if payload.shared is not None and worker not in payload.blind and _is_here(worker):
+            return payload.shared.handle
+        if payload.future is None or payload.future.status in ("lost", "cancelled", "error"):
+            payload.future = self._share(payload)
+        return payload.future
 
     # -- casting ---------------------------------------------------------------------------
 
@@ -231,6 +253,8 @@ class CastingWorkers:
         if isinstance(error, RigMissing):
             for payload in payloads:
                 payload.holders.discard(worker)
+                if isinstance(error, MemoryUnseen):
+                    payload.blind.add(worker)
             return Outcome.NO_RIG
         if was_killed(future):
             return Outcome.DIED
@@ -365,9 +389,9 @@ class CastingWorkers:
             )
 
 
-def _pickled(value: object) -> bytes:
-    data: bytes = cloudpickle.dumps(value, protocol=5)
-    return data
+def _is_here(address: str) -> bool:
+    """Return True if a worker is probably on this machine."""
+    return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 
 def share(partition: Partition, value: Any, **options: Any) -> Future:

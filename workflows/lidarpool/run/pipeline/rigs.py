@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from distributed import get_worker
@@ -29,17 +30,24 @@ from lidarsim.simulator.points import BatchPoints
 from lidarsim.simulator.rig import Rig
 from poolpart import own_device
 
+from ...base.shared_memory import Pickled, SharedHandle
 from ...base.tracing import trace
 from .failures import naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
 from .placement import Recorder, TaskRecord
 
+Packed = Pickled | SharedHandle  # a plan or a scene, as it comes from the driver
+
 UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
     """Error for a rig or scene that a worker lacks, after a restart or because it was dropped."""
+
+
+class MemoryUnseen(RigMissing):
+    """Error for a scene in memory of the driver that a worker cannot map."""
 
 
 class RigFailed(RuntimeError):  # noqa: N818
@@ -61,7 +69,7 @@ _ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cac
 _lock = threading.Lock()
 
 
-def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -> Rig:
+def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None) -> Rig:
     """Return a rig of this process, built of a plan and scene if the rig is not cached.
 
     Raises
@@ -84,11 +92,11 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
     return cached.rig
 
 
-def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
+def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig:
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
-        name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
+        name, actors, packed, backend = _unpickled(plan)
         survey: Survey = pickle.loads(packed)  # noqa: S301
         now_s = time.monotonic()
         unused = [h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S]
@@ -96,7 +104,7 @@ def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
         if (cached_scene := cached_rigs.get(name)) is not None:
             rig = cached_scene.rig.with_survey(cached_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
-            static_scene: Scene = pickle.loads(scene)  # noqa: S301
+            static_scene: Scene = _unpickled(scene)
             threads = get_worker().state.nthreads
             rig = Rig(static_scene.with_actors(actors), survey, backend, threads, own_device())
         else:
@@ -108,6 +116,16 @@ def _build(handle: str, plan: bytes | None, scene: bytes | None) -> _CachedRig:
     cached_rigs[name] = _CachedRig(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _CachedRig(rig, name, time.monotonic())
+
+
+def _unpickled(data: Packed) -> Any:
+    """Return a value of the run's own driver; MemoryUnseen if its memory is not of this machine."""
+    if isinstance(data, SharedHandle):
+        try:
+            return data.load()
+        except OSError as error:
+            raise MemoryUnseen(f"This worker does not see the driver's memory: {error}") from error
+    return data.load()
 
 
 def drop(handles: Collection[str]) -> None:
@@ -144,8 +162,8 @@ class CastBatch:
 def intersect(
     works: Sequence[CastWork],
     unneeded: Collection[str] = (),
-    scene: bytes | None = None,
-    *plans: bytes | None,
+    scene: Packed | None = None,
+    *plans: Packed | None,
 ) -> list[CastBatch]:
     """Cast the rays of batches and make their columns; runs on a GPU worker.
 
