@@ -19,6 +19,7 @@ from ..datasets.job_table import JobRow
 from ..plan import best
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason, empty_jobs_warning
+from .cluster.checks import slots_needed
 from .cluster.cluster import Cluster, start_local
 from .cluster.connection import StartedAhead
 from .job_source import JobMaker, Jobs
@@ -149,11 +150,12 @@ class Run(Generic[R]):
         return self.options.resume or self.options.retry_failed or self.options.verify
 
     def _start_local(self) -> None:
-        """Begin to start the workers of this machine, if the run has any and they are not begun."""
-        if self._local is None and self.options.starts_workers:
+        """Begin to start workers on this machine, if the options say so."""
+        if self.options.starts_workers:
             job = self.jobs.only_job
             planning = job is not None and job.planning is not None
-            self._local = start_local(self.options, planning=planning, writing=job is None)
+            slots = slots_needed(self.options, planning=planning, writing=job is None)
+            self._local = start_local(self.options, slots)
             self.stack.push(self._local)
 
     def _lock_output(self) -> None:
@@ -206,7 +208,6 @@ class Run(Generic[R]):
         enter = self.cluster_stack.enter_context
         if options.starts_workers:
             check_backend_here(store.backend or options.backend, store.advice)
-        self._start_local()
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)

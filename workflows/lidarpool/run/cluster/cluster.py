@@ -38,13 +38,9 @@ LOST_S = 0.5  # for a client to notice that its scheduler is gone
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
-def start_local(options: RunOptions, *, planning: bool, writing: bool) -> StartedAhead:
-    """Begin to start the workers of a run on this machine.
-
-    `planning` and `writing` are True if paths are planned, and if LIDAR workers write jobs.
-    """
+def start_local(options: RunOptions, required_slots: Mapping[str, int]) -> StartedAhead:
+    """Begin to start the workers of a run on this machine."""
     check_starts_workers()
-    required_slots = slots_needed(options, planning=planning, writing=writing)
     workers = options.gpu_workers, options.other_workers
     return StartedAhead(local_client(required_slots, *workers, tls=options.tls))
 
@@ -54,11 +50,11 @@ def client_of(
     required_slots: Mapping[str, int],
     waiting: Waiting,
     screen: Screen,
-    local: StartedAhead | None,
+    local: StartedAhead | None = None,
 ) -> AbstractContextManager[Client]:
     """Return a client of an existing cluster, or of a new cluster with `required_slots`.
 
-    `local` is the cluster of this machine, if the run starts its workers there.
+    `local` is the new cluster, if it is on this machine and has been begun.
     """
     if options.client is not None:
         return nullcontext(options.client)
@@ -70,7 +66,7 @@ def client_of(
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
-    assert local is not None, "the run starts workers"
+    local = local or start_local(options, required_slots)
     return screen.starting(local, "starting the workers", shares_terminal=True)
 
 
