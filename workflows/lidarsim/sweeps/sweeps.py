@@ -21,6 +21,7 @@ from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
+from ..sensor.optics import TWO_RETURNS
 from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
@@ -515,7 +516,7 @@ def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
     """Return all rays of a survey; None unless the survey keeps every return with its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
-    max_returns = tuple(2 if returns.mode == "dual" else 1 for returns in survey.returns_each)
+    max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)
     sensors = tuple(carried.sensor for carried in survey.carried)
     return FiredRays(sensors, max_returns, np.concatenate(first_steps))
 
