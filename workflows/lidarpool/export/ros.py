@@ -32,11 +32,11 @@ from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.lidar_traits import LidarTraits
+from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
 
 from . import reading
 from .boxes import Boxes
-from .images import Image
 from .laser_scan import ScanRays
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds

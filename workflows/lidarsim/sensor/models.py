@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
 from ..base.elementary import log1p
 from ..base.errors import LidarError, message_of
@@ -29,6 +29,7 @@ from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
 from .calibrations import UNUSABLE, Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
+from .packet_settings import Identifier, PacketSettings, laser_order
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
@@ -190,6 +191,18 @@ class Performance(_ModelSection):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
+class PacketPart(_ModelSection):
+    """Packets of the maker, as in `PacketSettings`; identifiers are defined by the format."""
+
+    format: str
+    ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
+    identifiers: dict[str, Identifier] = {}
+
+    def settings(self, lasers: Ints) -> PacketSettings:
+        """Return the settings of a sensor, `lasers` being the maker's number of each channel."""
+        return PacketSettings(self.format, self.ports, self.identifiers, lasers)
+
+
 class SensorModel(_ModelSection):
     """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
 
@@ -211,6 +224,7 @@ class SensorModel(_ModelSection):
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
+    packets: PacketPart | None = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
@@ -499,6 +513,8 @@ def load_sensor(
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
+    if sensor_model.packets is not None:
+        common_fields["packets"] = sensor_model.packets.settings(laser_order(beams.elevation))
     return kind(beams.lowest_first(), head, **common_fields)
 
 

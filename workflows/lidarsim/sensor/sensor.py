@@ -20,6 +20,7 @@ from ..base.vectors import turned
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
+from .packet_settings import PacketSettings
 
 RaysPerRevolution = Annotated[
     int, about("for a grid: azimuths in a revolution", ge=1, le=10_000_000)
@@ -60,6 +61,9 @@ class Sensor:
         Start of the head, nanoseconds after the start of the survey or station.
     noise, returns
         Defaults for surveys with this sensor; not part of its fingerprint.
+    packets
+        Packets of the maker that recordings of this sensor are written in; not part of its
+        fingerprint either.
 
     Raises
     ------
@@ -82,6 +86,7 @@ class Sensor:
     start_ns: Annotated[float, Field(ge=0)] = 0.0
     noise: Noise | None = field(default=None, kw_only=True, compare=False)
     returns: Returns | None = field(default=None, kw_only=True, compare=False)
+    packets: PacketSettings | None = field(default=None, kw_only=True, compare=False)
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:
