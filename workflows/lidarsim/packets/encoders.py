@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import ClassVar
 
 import numpy as np
 
-from ..base.arrays import Bools, Bytes, Ints
+from ..base.arrays import Bools, Bytes, Floats, Ints
 from ..base.errors import LidarError
 from ..base.plugins import find_plugin, plugins_of
 from ..base.words import did_you_mean
@@ -53,6 +53,7 @@ class PacketSource:
     name: str = ""  # of the sensor in its survey
     start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
     instruments: Instruments | None = None  # of the carrier
+    mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the carrier
 
     @property
     def settings(self) -> PacketSettings:
@@ -78,6 +79,7 @@ class PacketSource:
             sweeps.sensors[number],
             START_NS if sweeps.start_ns is None else sweeps.start_ns,
             sweeps.instruments,
+            sweeps.mounts.matrix(number),
         )
 
 
@@ -90,6 +92,7 @@ class PacketEncoder(ABC):
 
     columns: ClassVar[tuple[str, ...]] = ("reflectivity",)  # of the cloud, beside ray and range
     identifiers: ClassVar[tuple[str, ...]] = ()  # that the data file must state
+    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
     address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
     destination: ClassVar[str] = "255.255.255.255"
 
@@ -98,8 +101,9 @@ class PacketEncoder(ABC):
         stated = source.settings.identifiers
         if missing := [name for name in self.identifiers if name not in stated]:
             raise self.unusable(f"lack the identifier {', '.join(missing)}")
-        if unknown := [name for name in stated if name not in self.identifiers]:
-            hint = did_you_mean(unknown[0], self.identifiers)
+        known = self.identifiers + self.optional_identifiers
+        if unknown := [name for name in stated if name not in known]:
+            hint = did_you_mean(unknown[0], known)
             raise self.unusable(f"have an unknown identifier {unknown[0]!r}.{hint}")
 
     @abstractmethod
@@ -135,6 +139,10 @@ class PacketEncoder(ABC):
             raise self.unusable(f"state {name} {value!r}: give a whole number")
         return value
 
+    def text(self, name: str) -> str:
+        """Return an identifier as text."""
+        return str(self.source.settings.identifiers[name])
+
     def decimal(self, name: str) -> float:
         """Return an identifier that is a number; LidarError for other values."""
         value: Identifier = self.source.settings.identifiers[name]
@@ -145,6 +153,7 @@ class PacketEncoder(ABC):
 
 # {format of packets: module and class of its encoder}
 ENCODERS = {
+    "ouster": "lidarsim.packets.ouster:OusterEncoder",
     "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
 }
 
