@@ -52,6 +52,7 @@ class PacketSource:
     mode: str  # of its returns, see `Returns`
     name: str = ""  # of the sensor in its survey
     start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
+    dated: bool = False  # whether the survey has a start, as of a clock that a receiver sets
     instruments: Instruments | None = None  # of the carrier
     mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the carrier
 
@@ -78,6 +79,7 @@ class PacketSource:
             sweeps.lidars[number].mode,
             sweeps.sensors[number],
             START_NS if sweeps.start_ns is None else sweeps.start_ns,
+            sweeps.start_ns is not None,
             sweeps.instruments,
             sweeps.mounts.matrix(number),
         )

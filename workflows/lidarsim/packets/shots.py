@@ -109,7 +109,7 @@ _OF_FIRINGS = tuple(
 def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bools:
     """Return whether firings (n,) of a sweep are in packets that are lost on their way."""
     sensor = int(sweeps.sensor[sweep])
-    sweeps_per_station = np.count_nonzero(sweeps.sensor == sensor) // sweeps.stations
+    sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
     seed = fired_of(sweeps).seeds[sensor]
     dropped = np.zeros(len(firings), np.bool_)

@@ -11,6 +11,7 @@ import numpy as np
 from ..base.arrays import AnyArray, Bools, Ints
 from .encoders import Datagrams, PacketEncoder, PacketSource
 from .shots import CarryOver, Shots
+from .velodyne_position import POSITION_PORT, PositionPackets
 
 DATA_PORT = 2368
 _BLOCKS = 12  # of a packet
@@ -33,7 +34,7 @@ _PACKET = np.dtype(
 
 
 class VelodyneEncoder(PacketEncoder):
-    """Data packets of 1,206 bytes.
+    """Data packets of 1,206 bytes, and position packets of 512.
 
     Azimuths are those of the head at the first firing of each block, clockwise from the sensor's
     x axis. In the mode dual, each block of last returns is followed by a block of strongest
@@ -59,11 +60,19 @@ class VelodyneEncoder(PacketEncoder):
         self._firings = _BLOCKS * _BLOCK_LASERS // (channels * self._planes)
         self._port = self.port("data", DATA_PORT)
         self._carry = CarryOver(self._firings)
+        self._positions = PositionPackets(source, self.port("position", POSITION_PORT))
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that the shots of a sweep fill."""
+        """Return the data packets that the shots of a sweep fill, and the position packets."""
         whole = self._carry.whole_packets(shots)
-        return [self._data(whole)] if len(whole) else []
+        if not len(whole):
+            return []
+        data = self._data(whole)
+        last = slice(self._firings - 1, None, self._firings)
+        stamps_ns = whole.stamps_ns[last] + self.firing_interval_ns
+        positions = self._positions.beside(data.due_ns, stamps_ns)
+        dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
+        return [data.without(np.asarray(dropped)), positions]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor sends no packet before its blocks are full."""
@@ -79,8 +88,7 @@ class VelodyneEncoder(PacketEncoder):
         self._fill_blocks(packets["blocks"], shots)
         last_ns = shots.starts_ns[firings[:, -1]]
         payloads = packets.view(np.uint8).reshape(len(packets), _PACKET.itemsize)
-        datagrams = Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
-        return datagrams.without(shots.dropped[firings].all(axis=1))
+        return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
         """Return stamps of packets whose first firings start at `first_ns` (n,): (n,)."""
