@@ -105,8 +105,8 @@ class PacketEncoder(ABC):
             raise self.unusable(f"lack the identifier {', '.join(missing)}")
         known = self.identifiers + self.optional_identifiers
         if unknown := [name for name in stated if name not in known]:
-            hint = did_you_mean(unknown[0], known)
-            raise self.unusable(f"have an unknown identifier {unknown[0]!r}.{hint}")
+            error = self.unusable(f"have an unknown identifier {unknown[0]!r}")
+            raise LidarError(f"{error}{did_you_mean(unknown[0], known)}")
 
     @abstractmethod
     def encode(self, shots: Shots) -> list[Datagrams]:

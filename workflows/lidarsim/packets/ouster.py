@@ -52,6 +52,8 @@ _UNUSED_CONFIGURATION = {
     "sync_pulse_out_polarity": "ACTIVE_HIGH",
     "sync_pulse_out_pulse_width": 10,
 }
+# {whether the survey has a start: timestamp_mode of the metadata}
+_CLOCKS = {True: "TIME_FROM_PTP_1588", False: "TIME_FROM_INTERNAL_OSC"}
 # {mode of returns: return_order of the metadata}
 _RETURN_ORDERS = {
     "strongest": "STRONGEST_TO_WEAKEST",
@@ -411,7 +413,7 @@ class OusterEncoder(PacketEncoder):
                 "columns_per_packet": COLUMNS_PER_PACKET,
                 "lidar_mode": f"{self._columns}x{rate_hz}",
                 "return_order": _RETURN_ORDERS[self.source.mode],
-                "timestamp_mode": "TIME_FROM_PTP_1588",
+                "timestamp_mode": _CLOCKS[self.source.dated],
                 "udp_dest": self.destination,
                 "udp_port_imu": self.port("imu", IMU_PORT),
                 "udp_port_lidar": self.port("lidar", LIDAR_PORT),
@@ -432,7 +434,7 @@ class OusterEncoder(PacketEncoder):
                 "beam_altitude_angles": _rounded(self._elevation_deg),
                 "beam_azimuth_angles": _rounded(azimuth_deg),
                 "beam_to_lidar_transform": _rounded(beam_pose),
-                "lidar_origin_to_beam_origin_mm": beam_pose[0, 3],
+                "lidar_origin_to_beam_origin_mm": round(float(self._origin_mm[0]), 9),
             },
             "lidar_intrinsics": {"lidar_to_sensor_transform": _rounded(self._lidar_pose())},
             "imu_intrinsics": {"imu_to_sensor_transform": _rounded(self._imu_pose())},

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, ClassVar
 
@@ -20,7 +21,7 @@ from ..base.vectors import turned
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
-from .packet_settings import PacketSettings
+from .packet_settings import Identifier, PacketSettings
 
 RaysPerRevolution = Annotated[
     int, about("for a grid: azimuths in a revolution", ge=1, le=10_000_000)
@@ -92,6 +93,25 @@ class Sensor:
     def __post_init__(self) -> None:
         if not self.max_range_m > self.min_range_m:
             raise LidarError(f"max_range_m is {self.max_range_m}; it must be above min_range_m.")
+
+    def with_packets(
+        self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
+    ) -> Sensor:
+        """Return the sensor with ports and identifiers of packets in place of the model's.
+
+        Raises
+        ------
+        LidarError
+            If the sensor has no packets.
+        """
+        if self.packets is None:
+            raise LidarError(f"{self.model} has no packets: leave packets out.")
+        packets = replace(
+            self.packets,
+            ports={**self.packets.ports, **ports},
+            identifiers={**self.packets.identifiers, **identifiers},
+        )
+        return replace(self, packets=packets)
 
     @property
     def model(self) -> str:
