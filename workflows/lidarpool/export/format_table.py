@@ -263,7 +263,7 @@ FORMATS = {
         "lidarpool.export.packets",
         "write_pcap",
         needs=("scan", *_ALL_RAYS),
-        holds=("scan", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
+        holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
     ),
     "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
