@@ -426,7 +426,7 @@ class SensorSection(Section):
         PacketSection | None,
         about(
             "packets of its maker, for pcap, in place of the model's",
-            {"identifiers": {"profile": "LEGACY"}},
+            {"ports": {}, "identifiers": {}},
         ),
     ] = None
 
@@ -477,7 +477,7 @@ class SensorSection(Section):
             states = file_states(file for file in (model, calibration) if isinstance(file, Path))
             options = self.model_dump(include={"columns", "step_deg", "performance"})
             sensor = _loaded(states, model=model, calibration=calibration, **options, **limits)
-        if self.packets is not None:
+        if self.packets is not None and (self.packets.ports or self.packets.identifiers):
             sensor = _with_packets(sensor, self.packets.model_dump_json())
         if sensor.noise is None or sensor.returns is None:
             return Mounted(sensor, mount, name)
