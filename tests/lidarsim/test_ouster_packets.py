@@ -29,6 +29,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
+from lidarpool.compare.recordings import open_recording
 from lidarpool.export.navigation_files import write_instruments
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
@@ -642,6 +643,13 @@ def test_ouster_sdk_reads_what_the_plain_reader_reads(profile, tmp_path):
     check_by_sdk(*encoded(*still("os1-32", profile)[1:]), tmp_path)
     encoder = encoder_of(random_source(profile))
     check_by_sdk(encoder.encode(random_shots(profile)), encoder.metadata(), tmp_path)
+
+
+def test_a_recording_has_the_times_of_the_sweeps(tmp_path):
+    case = still("os1-32", SINGLE)
+    sdk_frames(*encoded(*case[1:]), tmp_path)
+    recording = open_recording(tmp_path / "lidar.pcap")
+    assert list(recording.times()) == [START_NS + n * 1e8 for n in range(3)]
 
 
 @pytest.mark.slow  # all models and columns: a minute

@@ -39,7 +39,7 @@ def write_pixels(returns, valid, layout, units, pixels):
         if not valid[packet, column]:
             continue
         for c in range(channels):
-            first = 0
+            first = np.int64(0)
             if layout == DUAL and planes > 1 and range_m[1, n, c] > 0:
                 first = np.int64(returns.signal[1, n, c] > returns.signal[0, n, c])
             written = 0
