@@ -344,8 +344,8 @@ class OusterEncoder(PacketEncoder):
         last_shots = np.flatnonzero(np.diff(packets, append=-1))
         due_ns = shots.starts_ns[last_shots] + self.firing_interval_ns
         datagrams = Datagrams(payloads, due_ns, self.port("lidar", LIDAR_PORT))
-        lost = ~blocks.valid
-        return [datagrams.without(lost.reshape(-1, COLUMNS_PER_PACKET).all(axis=1))]
+        lost = ~blocks.valid.reshape(-1, COLUMNS_PER_PACKET)
+        return [datagrams.without(np.asarray(lost.all(axis=1)))]
 
     def _blocks(self, shots: Shots) -> MeasurementBlocks:
         """Return the measurement blocks of shots, with blocks that are not valid around them."""
