@@ -545,6 +545,14 @@ def test_imu_samples_have_the_jumps_of_the_sensors_clock(tmp_path):
     assert times_ms.tolist()[8:12] == [90, 100, 610, 620]
 
 
+def test_sensors_have_serial_numbers_of_their_own():
+    left, right = (
+        encoder_of(replace(random_source(SINGLE), name=name)).metadata()["sensor_info"]["prod_sn"]
+        for name in ("left", "right")
+    )
+    assert left != right and len(left) == len(right) == 12
+
+
 # -- refusals ------------------------------------------------------------------------------------
 
 
@@ -603,7 +611,8 @@ def sdk_frames(groups, metadata, tmp_path) -> tuple[Frames, np.ndarray]:
     (info,) = source.sensor_info
     packet_source = ouster.pcap.PcapPacketSource(str(tmp_path / "lidar.pcap"))
     for _, packet in packet_source:
-        assert packet.crc() in (None, packet.calculate_crc())
+        if isinstance(packet, ouster.core.LidarPacket):
+            assert packet.crc() in (None, packet.calculate_crc())
     assert packet_source.id_error_count == packet_source.size_error_count == 0
     frames = [frame_set[0] for frame_set in source]
     lookup = ouster.core.XYZLut(info)
@@ -644,6 +653,20 @@ def test_ouster_sdk_reads_what_the_plain_reader_reads(profile, tmp_path):
     check_by_sdk(*encoded(*still("os1-32", profile)[1:]), tmp_path)
     encoder = encoder_of(random_source(profile))
     check_by_sdk(encoder.encode(random_shots(profile)), encoder.metadata(), tmp_path)
+
+
+def test_ouster_sdk_reads_imu_packets(tmp_path):
+    ouster = sdk()
+    groups, metadata = encoded(*imu_case(tmp_path))
+    sdk_frames(groups, metadata, tmp_path)
+    source = ouster.pcap.PcapPacketSource(str(tmp_path / "lidar.pcap"))
+    packets = [packet for _, packet in source if isinstance(packet, ouster.core.ImuPacket)]
+    samples = np.loadtxt(tmp_path / "imu.csv", delimiter=",", skiprows=1)
+    assert [packet.sys_ts() for packet in packets] == (samples[:, 0] + START_NS).tolist()
+    gyro = np.concatenate([packet.gyro() for packet in packets])
+    np.testing.assert_allclose(gyro, samples[:, 1:4], atol=1e-6)
+    accel = np.concatenate([packet.accel() for packet in packets])
+    np.testing.assert_allclose(accel, samples[:, 4:], atol=1e-5)
 
 
 def test_a_recording_has_the_times_of_the_sweeps(tmp_path):
