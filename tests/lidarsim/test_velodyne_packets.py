@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ MODELS = {
         0xA1, 128, 0.004, 55.277, tuple(2.665 * (n // 8 + n // 64) for n in range(128)), 7.995
     ),
 }
-CASES = [(model, mode) for model in MODELS for mode in MODES]
+CASES = [(model, mode) for model in MODELS for mode in ("strongest", "dual")] + [("vlp16", "last")]
 
 
 class Row(NamedTuple):
@@ -74,6 +74,7 @@ class Row(NamedTuple):
     reflectivity: int
     azimuth_deg: float  # of the head when the laser fires, clockwise from x
     time_us: float  # past the hour
+    point: int = -1  # of the cloud
 
 
 def plain_rows(payloads, manual: Manual, mode: str) -> list[Row]:
@@ -136,10 +137,10 @@ def posts_before_walls() -> Scene:
 
 @cache
 def scanned(model: str, mode: str):
-    """Return a survey of a sixth of a revolution, its points and its sweeps."""
+    """Return a survey of some degrees, its points and its sweeps."""
     survey = Survey(
         sensor=load_sensor(f"velodyne/{model}"), poses=[Pose((0.0, 0.0, 0.0), 25.0)],
-        steps=2 if model == "vls128" else 5,
+        steps=1 if model == "vls128" else 3,
         columns=COLUMNS, keep_every=1, precision_m=1e-6, noise=Noise(range_m=0.02),
         returns=Returns(mode, subrays=7, divergence_mrad=20.0),
     )  # fmt: skip
@@ -196,6 +197,7 @@ def expected_rows(model: str, mode: str, packets: int) -> list[Row]:
                 int(cloud["reflectivity"][n]),
                 -float(cloud["azimuth"][n]) % 360,
                 (START_NS + int(cloud["time"][n])) / 1000 % 3.6e9,
+                int(n),
             )
         )
     return rows
@@ -286,6 +288,10 @@ def test_velodyne_decoder_reads_the_returns_of_the_cloud(model, mode, tmp_path):
         in_packet = firing % (1 if mode == "dual" else 3)
         since_start_us = np.array(manual.laser_us)[laser] + manual.firing_us * in_packet
         times_us += since_start_us - reader_us(in_packet, laser) - manual.stamped_us
+    in_sensor = sweeps.in_sensor(0, cloud.positions)[expected[:, 7].astype(int)]
+    assert np.linalg.norm(points[:, :3] - in_sensor, axis=1)[settled].max() <= (
+        manual.unit_m / 2 + np.radians(0.025 if is_128 else 0.0125) * ranges.max() + 1e-4
+    )
     assert abs(times_us - (expected[:, 6] - START_NS / 1000 % 3.6e9))[settled].max() < 1.5
 
 
@@ -448,3 +454,16 @@ def test_a_jump_of_the_clock_is_in_the_stamps():
     assert sorted(set(steps.tolist())) == [1327, 1328, 21327] or 21328 in steps
     due_ns = np.concatenate([group.due_ns for group in groups if group.port == 2368])
     assert np.ptp(np.diff(due_ns)) <= 1
+
+
+def test_ranges_that_a_packet_cannot_hold_are_no_returns():
+    sensor, shots = synthetic_shots("vlp16")
+    range_m = np.full_like(shots.range_m, np.nan)
+    range_m[0, :24] = 65_535 * 0.002
+    range_m[0, 4] = 65_535.6 * 0.002
+    range_m[0, 5] = 0.0009
+    encoder = encoder_of(PacketSource(sensor, "strongest"))
+    shots = replace(shots, range_m=range_m, columns={"reflectivity": np.uint8(7) + 0 * range_m})
+    rows = plain_rows(data_of(encoder.encode(shots)), MODELS["vlp16"], "strongest")
+    assert {row.firing for row in rows} == {*range(24)} - {4, 5}
+    assert {row.range_m for row in rows} == {65_535 * 0.002}

@@ -104,14 +104,13 @@ class VelodyneEncoder(PacketEncoder):
         """Write flags, azimuths and returns of shots into blocks (n, 12) of `_BLOCK`."""
         channels = shots.range_m.shape[2]
         used = self._firings * channels * self._planes // _BLOCK_LASERS
-        distances = np.where(shots.returned, np.rint(shots.range_m / self._unit_m), 0)
-        distances[distances > _MAX_UNITS] = 0  # too far for the packet
+        units = np.rint(shots.range_m / self._unit_m)
+        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        distances = np.where(fits, units, 0).astype("<u2")
+        reflectivities = shots.columns["reflectivity"] * fits
         shape = len(blocks), -1, 1, _BLOCK_LASERS
-        for name, values in (
-            ("distance", distances),
-            ("reflectivity", np.where(distances > 0, shots.columns["reflectivity"], 0)),
-        ):
-            planes = [plane.reshape(shape) for plane in self._planes_of(values, distances > 0)]
+        for name, values in (("distance", distances), ("reflectivity", reflectivities)):
+            planes = [plane.reshape(shape) for plane in self._planes_of(values, fits)]
             interleaved = np.concatenate(planes, axis=2)
             blocks["returns"][name][:, :used] = interleaved.reshape(len(blocks), used, -1)
         banks = max(1, channels // _BLOCK_LASERS)

@@ -7,12 +7,13 @@ valgur/velodyne_decoder, telemetry_packet.cpp.
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from math import atan2, cos, degrees, hypot, radians
 from typing import NamedTuple
 
 import numpy as np
 
 from ..base.arrays import Bytes, Floats, Ints, Records
+from ..base.elementary import arctan2, cos
+from ..base.vectors import hypot
 from ..sweeps.instruments import GNSS_FILE
 from .encoders import Datagrams, PacketSource
 
@@ -110,10 +111,11 @@ class _Fixes(NamedTuple):
         latitude = float(self.latitudes_deg[row])
         longitude = float(self.longitudes_deg[row])
         north_m = _DEGREE_M * float(np.diff(self.latitudes_deg[[first, second]])[0])
-        parallel_m = _DEGREE_M * cos(radians(latitude))
+        parallel_m = _DEGREE_M * float(cos(np.radians(latitude)))
         east_m = parallel_m * float(np.diff(self.longitudes_deg[[first, second]])[0])
-        course_deg = degrees(atan2(east_m, north_m)) % 360
-        return Fix(latitude, longitude, hypot(east_m, north_m) / seconds, course_deg)
+        course_deg = float(np.degrees(arctan2(east_m, north_m))) % 360
+        speed_m_s = float(hypot(east_m, north_m)) / seconds
+        return Fix(latitude, longitude, speed_m_s, course_deg)
 
 
 def gprmc(second: int, fix: Fix | None) -> bytes:

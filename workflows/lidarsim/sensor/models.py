@@ -18,7 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
-from ..base.elementary import log1p
+from ..base.elementary import log1p, sin_cos
 from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
 from ..base.plugins import Plugin, find_plugin, plugins_of
@@ -74,6 +74,7 @@ class BeamTable(_ModelSection):
     azimuth_deg: Numbers = ()
     time_us: Numbers = ()
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
+    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0  # see `origins`
 
     def beams(self) -> Beams:
         """Return the beams; a single beam straight ahead if the table has no elevations."""
@@ -88,7 +89,15 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins."""
+        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins.
+
+        Beams that cross in a point `crossing_m` ahead of the axis, at the height of the sensor's
+        centre, start on the axis, above or below the centre.
+        """
+        if self.crossing_m:
+            up, level = sin_cos(np.radians(self.elevation_deg))
+            heights_m = -self.crossing_m * up / level
+            return np.column_stack([np.zeros((count, 2)), heights_m])
         origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
@@ -237,6 +246,8 @@ class SensorModel(_ModelSection):
             )
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
+        if self.beams.crossing_m and self.beams.origin_m:
+            raise ValueError("beams.crossing_m and origin_m both state origins: give one")
         head_fields = {"axis", "clockwise", "mirror", "zero_deg"}
         unused = self.model_dump(include=head_fields, exclude_defaults=True)
         if self.prisms and unused:
