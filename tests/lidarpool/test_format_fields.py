@@ -635,6 +635,7 @@ def test_parquet_and_ply_are_in_the_world_and_their_columns_fit(tmp_path):
     rays = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
             np.sin(elevation)]  # fmt: skip
     inside = np.stack(rays, axis=1) * columns["range"][:, None]
+    inside += made.survey.carried[0].sensor.beams.origin[columns["ring"]]  # on the head's axis
     places, turns = made.survey.path.poses(0, columns["time"].astype(float))
     mount = made.survey.carried[0].mount
     placed = inside @ mount.rotation.T + mount.position

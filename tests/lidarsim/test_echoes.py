@@ -132,6 +132,7 @@ MODES = {
     "last": [9.0],
     "strongest": [7.0],
     "dual": [7.0, 9.0],
+    "two_strongest": [5.0, 7.0],
 }
 
 

@@ -213,8 +213,8 @@ def reported(returns: list[Return], mode: str) -> list[Return]:
     if mode == "all" or len(returns) < 2:
         return returns
     strongest, second, *_ = sorted(returns, key=lambda one: -one.energy)
-    if mode == "dual":
-        other = second if strongest is returns[-1] else returns[-1]
+    if mode in ("dual", "two_strongest"):
+        other = returns[-1] if mode == "dual" and strongest is not returns[-1] else second
         return [one for one in returns if one in (strongest, other)]
     return [{"first": returns[0], "last": returns[-1], "strongest": strongest}[mode]]
 

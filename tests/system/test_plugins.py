@@ -68,13 +68,19 @@ def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
 
     file = tmp_path / "walk" / "scenario.yaml"
     scenario = yaml.safe_load(file.read_text())
-    scenario |= {"scene": {"files": "../hall.boxes"}, "output": {"write": ["npy"]}, "steps": 36}
+    scenario |= {
+        "scene": {"files": "../hall.boxes"},
+        "output": {"write": ["npy", "pcap"]},
+        "steps": 36,
+    }
     file.write_text(yaml.safe_dump(scenario))
     lidarpool("run", "walk/scenario.yaml", "--out", "result", "--only", "cloud", "--quiet")
 
     cloud = read_cloud(tmp_path / "result" / "cloud.ply")
     [sweep] = sorted((tmp_path / "result" / "npy").iterdir())
     np.testing.assert_array_equal(np.load(sweep), cloud.positions.astype(np.float32))
+    packets = (tmp_path / "result" / "packets" / "lidar.pcap").read_bytes()
+    assert len(packets) == 24 + 1000 * (16 + 42 + 2 * 16)  # a datagram a firing
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert "export" in report["stages"]
     assert lidarpool("highest", "result") == f"{cloud.bounds[1, 2]:.2f} m\n"

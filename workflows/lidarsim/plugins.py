@@ -1,7 +1,20 @@
-"""What plug-ins that read mesh files import; docs/how-to/plugins.md has an example."""
+"""What plug-ins of mesh files and packets import; docs/how-to/plugins.md has examples."""
 
+from .packets.encoders import Datagrams, PacketEncoder, PacketSource
+from .packets.shots import CarryOver, Shots
 from .scene.files.mesh_formats import MeshFormat
 from .scene.files.scene_graph import Content, MeshFileError, ReadOptions
 from .scene.scene_mesh import SceneMesh
 
-__all__ = ["Content", "MeshFileError", "MeshFormat", "ReadOptions", "SceneMesh"]
+__all__ = [
+    "CarryOver",
+    "Content",
+    "Datagrams",
+    "MeshFileError",
+    "MeshFormat",
+    "PacketEncoder",
+    "PacketSource",
+    "ReadOptions",
+    "SceneMesh",
+    "Shots",
+]

@@ -430,7 +430,9 @@ def _open_ouster(path: Path, name: str, sensor: str | None, intensity: str | Non
         return compute_positions(scan)[ring, column], columns, None
 
     def times() -> Iterator[float]:
-        return (float(scan.timestamp[scan.timestamp > 0].min(initial=0)) for scan in scans())
+        for scan in scans():
+            stamps = scan.timestamp[scan.timestamp > 0]
+            yield float(stamps.min()) if len(stamps) else 0.0
 
     white = _WHITE_INTENSITY if intensity in (None, "reflectivity") else None
     return _open_stream(name, scans, points, intensity, white=white, times=times)

@@ -258,6 +258,14 @@ FORMATS = {
         data_set="webdataset",
         boxes=True,
     ),
+    "pcap": FormatRow(
+        "packets",
+        "lidarpool.export.packets",
+        "write_pcap",
+        needs=("scan", *_ALL_RAYS),
+        holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
+        inside=r"[^/]+\.(pcap|json)",
+    ),
     "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
     "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
 }

@@ -10,9 +10,8 @@ import numpy as np
 from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sensor import Sensor, Survey
+from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
-
-from .images import Image
 
 COLUMNS = "ray", "range"  # columns that a LaserScan needs, with every return
 _BAGS = frozenset({"mcap", "rosbag2"})

@@ -28,14 +28,15 @@ from lidarsim.columns.bags import POINT_FIELDS, message_types
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
 from lidarsim.scene.colours import as_float
+from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.lidar_traits import LidarTraits
+from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
 
 from . import reading
 from .boxes import Boxes
-from .images import Image
 from .laser_scan import ScanRays
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
@@ -483,7 +484,7 @@ def _return_types(points: Cloud, mode: str) -> AnyArray:
     types[number == 1] = FIRST
     types[number == returns] = LAST
     types[returns == 1] = IDENTICAL
-    if mode != "dual" or count < 2:
+    if mode not in TWO_RETURNS or count < 2:
         return types
     pairs = (number[:-1] == 1) & (returns[:-1] == 2) & (number[1:] == 2) & (returns[1:] == 2)
     first = np.flatnonzero(pairs)

@@ -36,6 +36,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ..export.format_table import check_whole
 from ..export.formats import Format
 from ..export.laser_scan import with_laser_scans
+from ..export.packets import with_packet_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import (
@@ -549,7 +550,8 @@ def _build_survey(
         **declared(scenario.weather, Weather),
         **cloud,
     )
-    return with_laser_scans(survey, [entry.format for entry in scenario.output.write])
+    formats = [entry.format for entry in scenario.output.write]
+    return with_packet_columns(with_laser_scans(survey, formats), formats)
 
 
 def _class_names(

@@ -37,6 +37,7 @@ from lidarsim.sensor import Mounted, Noise, Pose, Returns, Sensor
 from lidarsim.sensor.beams import Rate, Step
 from lidarsim.sensor.materials import SemanticClass
 from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor
+from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 
 from ..export.formats import Format
@@ -357,6 +358,19 @@ class SceneSection(Section):
         return self.preset == "seed" or (self.preset is None and not (self.files or self.copies))
 
 
+class PacketSection(Section):
+    """Packets of the sensor's maker: values in place of those of the sensor's data file."""
+
+    ports: Annotated[
+        dict[str, Annotated[int, Field(ge=1, le=65_535)]],
+        about("UDP port of each kind of packets", {"lidar": 7502}),
+    ] = {}
+    identifiers: Annotated[
+        dict[str, Identifier],
+        about("values that the format of the packets knows", {"profile": "LEGACY"}),
+    ] = {}
+
+
 class SensorSection(Section):
     """The lidar: a model, a calibrated unit, or a turning head with evenly spaced beams.
 
@@ -408,6 +422,14 @@ class SensorSection(Section):
         ),
     ] = None
 
+    packets: Annotated[
+        PacketSection | None,
+        about(
+            "packets of its maker, for pcap, in place of the model's",
+            {"ports": {}, "identifiers": {}},
+        ),
+    ] = None
+
     @model_validator(mode="after")
     def _check_source(self) -> SensorSection:
         """Raise ValueError if fields of the sensor contradict each other."""
@@ -455,6 +477,8 @@ class SensorSection(Section):
             states = file_states(file for file in (model, calibration) if isinstance(file, Path))
             options = self.model_dump(include={"columns", "step_deg", "performance"})
             sensor = _loaded(states, model=model, calibration=calibration, **options, **limits)
+        if self.packets is not None and (self.packets.ports or self.packets.identifiers):
+            sensor = _with_packets(sensor, self.packets.model_dump_json())
         if sensor.noise is None or sensor.returns is None:
             return Mounted(sensor, mount, name)
         sheet_returns = replace(sensor.returns, **returns.model_dump(exclude_unset=True))
@@ -479,6 +503,13 @@ _grid = lru_cache(Sensor.grid)
 def _loaded(_: object, **options: Any) -> Sensor:
     """Return the sensor of files in some states, cached by these states."""
     return load_sensor(**options)
+
+
+@lru_cache
+def _with_packets(sensor: Sensor, section: str) -> Sensor:
+    """Return a sensor with the ports and identifiers of a `PacketSection`, as JSON."""
+    values = PacketSection.model_validate_json(section)
+    return sensor.with_packets(values.ports, values.identifiers)
 
 
 class OutputSection(Section):

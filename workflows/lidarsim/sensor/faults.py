@@ -15,8 +15,10 @@ from ..base.declared import AngleDeg, MinMax, Several, Text, Two, UnitShare, abo
 from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields, without_numpy
 from ..base.words import did_you_mean
+from .random_numbers import Purpose, uniform
 from .sensor import Sensor
 
+PACKET = Purpose(61, "whether a packet is lost")
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
 Time = Annotated[float, Field(ge=0, le=1e9)]  # seconds since the survey's start
 Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
@@ -88,6 +90,14 @@ class Fault:
         stops_ns = starts_ns if stops_ns is None else stops_ns
         begin, end = self.span_ns
         return np.asarray((stops_ns >= begin) & (starts_ns < end))
+
+    def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
+        """Return whether firings (n,) are in dropped packets, at any time.
+
+        `number` is the number of this fault in its survey, `seed` that of the sensor's noise.
+        """
+        packets = firings // (self.packet or 1)
+        return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
         """Return the shift of stamps at times (n,), nanoseconds."""

@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from ..base.arrays import Floats
+from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
-from ..base.elementary import log1p
+from ..base.elementary import log1p, sin_cos
 from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
 from ..base.plugins import Plugin, find_plugin, plugins_of
@@ -29,6 +29,7 @@ from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
 from .calibrations import UNUSABLE, Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
+from .packet_settings import Identifier, PacketSettings, laser_order
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
@@ -73,6 +74,7 @@ class BeamTable(_ModelSection):
     azimuth_deg: Numbers = ()
     time_us: Numbers = ()
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
+    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0  # see `origins`
 
     def beams(self) -> Beams:
         """Return the beams; a single beam straight ahead if the table has no elevations."""
@@ -87,7 +89,15 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins."""
+        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins.
+
+        Beams that cross in a point `crossing_m` ahead of the axis, at the height of the sensor's
+        centre, start on the axis, above or below the centre.
+        """
+        if self.crossing_m:
+            up, level = sin_cos(np.radians(self.elevation_deg))
+            heights_m = -self.crossing_m * up / level
+            return np.column_stack([np.zeros((count, 2)), heights_m])
         origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
@@ -190,6 +200,18 @@ class Performance(_ModelSection):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
+class PacketPart(_ModelSection):
+    """Packets of the maker, as in `PacketSettings`; identifiers are defined by the format."""
+
+    format: str
+    ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
+    identifiers: dict[str, Identifier] = {}
+
+    def settings(self, lasers: Ints) -> PacketSettings:
+        """Return the settings of a sensor, `lasers` being the maker's number of each channel."""
+        return PacketSettings(self.format, self.ports, self.identifiers, lasers)
+
+
 class SensorModel(_ModelSection):
     """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
 
@@ -211,6 +233,7 @@ class SensorModel(_ModelSection):
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
+    packets: PacketPart | None = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
@@ -223,6 +246,8 @@ class SensorModel(_ModelSection):
             )
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
+        if self.beams.crossing_m and self.beams.origin_m:
+            raise ValueError("beams.crossing_m and origin_m both state origins: give one")
         head_fields = {"axis", "clockwise", "mirror", "zero_deg"}
         unused = self.model_dump(include=head_fields, exclude_defaults=True)
         if self.prisms and unused:
@@ -499,6 +524,8 @@ def load_sensor(
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
+    if sensor_model.packets is not None:
+        common_fields["packets"] = sensor_model.packets.settings(laser_order(beams.elevation))
     return kind(beams.lowest_first(), head, **common_fields)
 
 

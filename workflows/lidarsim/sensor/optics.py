@@ -26,7 +26,8 @@ CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, a
 _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 
 Processing = Literal["none", "peaks", "gaussian"]
-Mode = Literal["strongest", "first", "last", "dual", "all"]
+Mode = Literal["strongest", "first", "last", "dual", "two_strongest", "all"]
+TWO_RETURNS: tuple[Mode, ...] = ("dual", "two_strongest")  # modes that report two at most
 
 
 AngleMrad = Annotated[float, Field(ge=0, le=1000)]
@@ -78,7 +79,7 @@ class Returns:
     """Sub-rays of a beam, and the returns of a pulse that the sensor reports.
 
     "dual" reports the strongest and the last return, or the two strongest if the last return is
-    the strongest.
+    the strongest. "two_strongest" reports the two strongest returns.
 
     Raises
     ------

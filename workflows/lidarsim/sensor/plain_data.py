@@ -10,6 +10,7 @@ import numpy as np
 
 from ..base.arrays import AnyArray
 from .beams import Beams, Mirror, Spin
+from .packet_settings import PacketSettings
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, Sensor
 
@@ -26,6 +27,7 @@ _KINDS = {
         Mirror,
         Prism,
         TurningMirror,
+        PacketSettings,
     )
 }
 _LEFT_OUT = ("optics", "noise", "returns")
@@ -52,6 +54,8 @@ def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
         return [_to_plain_data(item, arrays) for item in value]
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, Mapping):
+        return {"mapping": {key: _to_plain_data(item, arrays) for key, item in value.items()}}
     if _KINDS.get(type(value).__name__) is type(value):
         names = [field.name for field in fields(value) if field.name not in _LEFT_OUT]
         of_fields = {name: _to_plain_data(getattr(value, name), arrays) for name in names}
@@ -75,6 +79,8 @@ def from_plain_data(data: Any, arrays: Mapping[str, AnyArray]) -> Any:
         return data
     if "array" in data:
         return arrays[data["array"]]
+    if "mapping" in data:
+        return {key: from_plain_data(item, arrays) for key, item in data["mapping"].items()}
     return _KINDS[data.pop("kind")](
         **{name: from_plain_data(item, arrays) for name, item in data.items()}
     )

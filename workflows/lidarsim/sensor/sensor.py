@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, ClassVar
 
@@ -20,6 +21,7 @@ from ..base.vectors import turned
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
+from .packet_settings import Identifier, PacketSettings
 
 RaysPerRevolution = Annotated[
     int, about("for a grid: azimuths in a revolution", ge=1, le=10_000_000)
@@ -60,6 +62,9 @@ class Sensor:
         Start of the head, nanoseconds after the start of the survey or station.
     noise, returns
         Defaults for surveys with this sensor; not part of its fingerprint.
+    packets
+        Packets of the maker that recordings of this sensor are written in; not part of its
+        fingerprint either.
 
     Raises
     ------
@@ -82,11 +87,31 @@ class Sensor:
     start_ns: Annotated[float, Field(ge=0)] = 0.0
     noise: Noise | None = field(default=None, kw_only=True, compare=False)
     returns: Returns | None = field(default=None, kw_only=True, compare=False)
+    packets: PacketSettings | None = field(default=None, kw_only=True, compare=False)
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:
         if not self.max_range_m > self.min_range_m:
             raise LidarError(f"max_range_m is {self.max_range_m}; it must be above min_range_m.")
+
+    def with_packets(
+        self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
+    ) -> Sensor:
+        """Return the sensor with ports and identifiers of packets in place of the model's.
+
+        Raises
+        ------
+        LidarError
+            If the sensor has no packets.
+        """
+        if self.packets is None:
+            raise LidarError(f"{self.model} has no packets: leave packets out.")
+        packets = replace(
+            self.packets,
+            ports={**self.packets.ports, **ports},
+            identifiers={**self.packets.identifiers, **identifiers},
+        )
+        return replace(self, packets=packets)
 
     @property
     def model(self) -> str:

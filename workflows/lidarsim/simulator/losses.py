@@ -8,11 +8,9 @@ from ..base.arrays import Bools, Floats, owned
 from ..base.elementary import sin_cos
 from ..base.vectors import hypot
 from ..sensor import Fault
-from ..sensor.random_numbers import Purpose, uniform
+from ..sensor.faults import PACKET
 from .returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
-
-PACKET = Purpose(61, "whether a packet is lost")
 
 
 class DirtStep(PulseStep):
@@ -92,9 +90,7 @@ class LossStep(PulseStep):
             if fault.packet is None:
                 lost_channels[row, required(fault.channels)] = True
             else:
-                packet = firings.numbers // fault.packet
-                uniform_numbers = uniform(seed, PACKET, spec.station, packet, fault_number)
-                lost_firings[row] = uniform_numbers < required(fault.share)
+                lost_firings[row] = fault.drops(firings.numbers, seed, spec.station, fault_number)
         rows = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(

@@ -10,6 +10,7 @@ import numpy as np
 from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..sensor.optics import TWO_RETURNS
 from .device import needs_hits
 from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
@@ -158,11 +159,13 @@ def _returns(setup: Setup) -> float:
     subrays = setup.reporting.subrays
     mode = setup.reporting.mode
     added_by_step = [step.added(setup) for step in steps_of(setup)]
-    added = {
-        "all": sum(added_by_step),
-        "dual": sum(min(count, 1.0) for count in added_by_step),
-    }.get(mode, 0.0)
-    if mode not in ("all", "dual") or not (subrays > 1 or setup.has_onward_light):
+    reports_two = mode in TWO_RETURNS
+    added = 0.0
+    if mode == "all":
+        added = sum(added_by_step)
+    elif reports_two:
+        added = sum(min(count, 1.0) for count in added_by_step)
+    if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added
     in_leaves = setup.leafy and subrays > 1 and mode == "all"
     return max(RETURNS_LEAFY if in_leaves else RETURNS, 1 + added)

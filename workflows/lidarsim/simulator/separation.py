@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .separation_loops import Receiver, ReturnArrays, SubrayHits
 
 # In the order of the numbers in `separation_loops`.
-MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"
+MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual", "two_strongest"
 _NO_VALUES = np.zeros(0)
 
 

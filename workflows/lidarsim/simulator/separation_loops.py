@@ -14,7 +14,8 @@ from ..base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes, in the order of `separation.MODES`
+# Modes, in the order of `separation.MODES`.
+ALL, FIRST, LAST, STRONGEST, DUAL, TWO_STRONGEST = range(6)
 
 
 class SubrayHits(NamedTuple):
@@ -326,22 +327,22 @@ def _mark(energy, begin, stop, mode, shown):
     """Mark which returns of a pulse a mode reports; the nearest of equally strong returns.
 
     "Dual" reports the strongest and the last return; if the strongest is the last, also the
-    strongest return before the last.
+    second strongest. "Two strongest" reports the strongest and the second strongest.
     """
     strongest = begin
-    strongest_before_last = -1
+    second_strongest = -1
     for k in range(begin + 1, stop):
         if energy[k] > energy[strongest]:
             strongest = k
-    if mode == DUAL and strongest == stop - 1:
-        for k in range(begin, stop - 1):
-            if strongest_before_last < 0 or energy[k] > energy[strongest_before_last]:
-                strongest_before_last = k
+    if mode == TWO_STRONGEST or (mode == DUAL and strongest == stop - 1):
+        for k in range(begin, stop):
+            if k != strongest and (second_strongest < 0 or energy[k] > energy[second_strongest]):
+                second_strongest = k
     for k in range(begin, stop):
-        shown[k] = mode == ALL or k == strongest_before_last
+        shown[k] = mode == ALL or k == second_strongest
     shown[begin] |= mode == FIRST
     shown[stop - 1] |= mode in (LAST, DUAL)
-    shown[strongest] |= mode in (STRONGEST, DUAL)
+    shown[strongest] |= mode in (STRONGEST, DUAL, TWO_STRONGEST)
 
 
 @inlined

@@ -21,6 +21,7 @@ from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Fault, Sensor, Survey
+from ..sensor.optics import TWO_RETURNS
 from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
@@ -38,7 +39,7 @@ COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is 
 AS_FIRED = "points in the sensor's axes at the firing of each: motion is not compensated"
 IN_WORLD = "points in the axes of the world"
 _PIECE = 250_000  # points that a thread or task reads at a time; several may read
-_FORMAT = 6
+_FORMAT = 7
 # Fields of `Sweeps` in a file, by their names: as arrays, and as JSON.
 _ARRAY_FIELDS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there", "knots")
 _JSON_FIELDS = (
@@ -83,6 +84,7 @@ class FiredRays:
     sensors: tuple[Sensor, ...]
     returns: tuple[int, ...]  # reported returns of a pulse of each sensor at most; 1 if unknown
     steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
+    seeds: tuple[int, ...]  # of each sensor's noise, on which dropped packets depend
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +378,7 @@ class Sweeps:
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
         if self.fired is not None and (sensors := to_plain_data(self.fired.sensors, arrays)):
-            rays = {"sensors": sensors, "returns": self.fired.returns}
+            rays = {"sensors": sensors, "returns": self.fired.returns, "seeds": self.fired.seeds}
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
         return packed(arrays)
@@ -406,7 +408,8 @@ class Sweeps:
             if "rays" in arrays:
                 rays = json.loads(arrays["rays"].tobytes())
                 sensors = from_plain_data(rays["sensors"], arrays)
-                fired = FiredRays(sensors, tuple(rays["returns"]), arrays["steps"])
+                returns, seeds = tuple(rays["returns"]), tuple(rays["seeds"])
+                fired = FiredRays(sensors, returns, arrays["steps"], seeds)
             return cls(
                 fired=fired,
                 pose=pose,
@@ -515,9 +518,10 @@ def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
     """Return all rays of a survey; None unless the survey keeps every return with its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
-    max_returns = tuple(2 if returns.mode == "dual" else 1 for returns in survey.returns_each)
+    max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)
     sensors = tuple(carried.sensor for carried in survey.carried)
-    return FiredRays(sensors, max_returns, np.concatenate(first_steps))
+    seeds = tuple(noise.seed for noise in survey.noise_each)
+    return FiredRays(sensors, max_returns, np.concatenate(first_steps), seeds)
 
 
 def _poses_of(positions: Floats, rotations: Floats) -> SweepPoses:

@@ -1,0 +1,196 @@
+"""Encoders of packets: a class for each maker, in the table or from plug-ins."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import ClassVar
+
+import numpy as np
+
+from ..base.arrays import Bools, Bytes, Floats, Ints
+from ..base.errors import LidarError
+from ..base.plugins import find_plugin, plugins_of
+from ..base.words import did_you_mean
+from ..sensor import Sensor
+from ..sensor.packet_settings import Identifier, PacketSettings
+from ..sweeps.instruments import Instruments
+from ..sweeps.sweeps import Sweeps
+from .shots import Shots, settings_of
+
+# Plug-ins are subclasses of `PacketEncoder`; the name of a plug-in is the `format` of data files.
+GROUP = "lidarpool.packets"
+# Start of a survey without a date, nanoseconds since 1970: as in bags, on 2001-09-09 at 01:46:40.
+START_NS = 1_000_000_000_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Datagrams:
+    """UDP datagrams of the same size to a port."""
+
+    payloads: Bytes  # (n, size)
+    due_ns: Ints  # (n,): when the sensor sends them, nanoseconds since the survey's start
+    port: int
+
+    def __len__(self) -> int:
+        return len(self.payloads)
+
+    def without(self, dropped: Bools) -> Datagrams:
+        """Return the datagrams without those that are lost: `dropped` (n,)."""
+        if not dropped.any():
+            return self
+        return Datagrams(self.payloads[~dropped], self.due_ns[~dropped], self.port)
+
+
+@dataclass(frozen=True, eq=False)
+class PacketSource:
+    """What packets depend on beside the shots: a sensor of a survey, and its times."""
+
+    sensor: Sensor
+    mode: str  # of its returns, see `Returns`
+    name: str = ""  # of the sensor in its survey
+    start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
+    dated: bool = False  # whether the survey has a start, as of a clock that a receiver sets
+    instruments: Instruments | None = None  # of the carrier
+    mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the carrier
+
+    @property
+    def settings(self) -> PacketSettings:
+        """Packets of the sensor; LidarError without packets."""
+        return settings_of(self.sensor)
+
+    @classmethod
+    def of_sensor(cls, sweeps: Sweeps, number: int) -> PacketSource:
+        """Return the source of the packets of the sensor `number` of a survey.
+
+        LidarError if the survey does not keep every return, or the sensor has no packets.
+        """
+        if sweeps.fired is None:
+            raise LidarError(
+                "Packets hold every ray and return of a survey: run it with keep_every 1 and the "
+                "column ray."
+            )
+        sensor = sweeps.fired.sensors[number]
+        settings_of(sensor)
+        return cls(
+            sensor,
+            sweeps.lidars[number].mode,
+            sweeps.sensors[number],
+            START_NS if sweeps.start_ns is None else sweeps.start_ns,
+            sweeps.start_ns is not None,
+            sweeps.instruments,
+            sweeps.mounts.matrix(number),
+        )
+
+
+class PacketEncoder(ABC):
+    """Makes the datagrams of a sensor from its shots, sweep by sweep.
+
+    A subclass checks the identifiers and the mode of the source when it is made, and keeps shots
+    that fill no packet for the next sweep (`CarryOver`).
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ("reflectivity",)  # of the cloud, beside ray and range
+    identifiers: ClassVar[tuple[str, ...]] = ()  # that the data file must state
+    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
+    address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
+    destination: ClassVar[str] = "255.255.255.255"
+
+    def __init__(self, source: PacketSource) -> None:
+        self.source = source
+        stated = source.settings.identifiers
+        if missing := [name for name in self.identifiers if name not in stated]:
+            raise self.unusable(f"lack the identifier {', '.join(missing)}")
+        known = self.identifiers + self.optional_identifiers
+        if unknown := [name for name in stated if name not in known]:
+            error = self.unusable(f"have an unknown identifier {unknown[0]!r}")
+            raise LidarError(f"{error}{did_you_mean(unknown[0], known)}")
+
+    @abstractmethod
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the datagrams that the shots of a sweep fill, a group for each port."""
+
+    @abstractmethod
+    def finish(self) -> list[Datagrams]:
+        """Return the datagrams of the shots that are left after the last sweep."""
+
+    def files(self) -> Mapping[str, bytes]:
+        """Return files that readers need beside the packets, {suffix: content}."""
+        return {}
+
+    @property
+    def firing_interval_ns(self) -> int:
+        """Time from a firing to the next, nanoseconds, rounded."""
+        firings = np.arange(2)
+        return int(np.rint(np.diff(self.source.sensor.begins_ns(firings))[0]))
+
+    def port(self, kind: str, default: int) -> int:
+        """Return the port of a kind of packets: that of the data file, else the default."""
+        return self.source.settings.ports.get(kind, default)
+
+    def unusable(self, reason: str) -> LidarError:
+        """Return the error of packets that cannot be made: «… {reason}»."""
+        return LidarError(f"The packets of {self.source.sensor.model} {reason}.")
+
+    def number(self, name: str) -> int:
+        """Return an identifier that is a whole number; LidarError for other values."""
+        value: Identifier = self.source.settings.identifiers[name]
+        if not isinstance(value, int):
+            raise self.unusable(f"state {name} {value!r}: give a whole number")
+        return value
+
+    def text(self, name: str) -> str:
+        """Return an identifier as text."""
+        return str(self.source.settings.identifiers[name])
+
+    def decimal(self, name: str) -> float:
+        """Return an identifier that is a number; LidarError for other values."""
+        value: Identifier = self.source.settings.identifiers[name]
+        if isinstance(value, str):
+            raise self.unusable(f"state {name} {value!r}: give a number")
+        return float(value)
+
+
+# {format of packets: module and class of its encoder}
+ENCODERS = {
+    "ouster": "lidarsim.packets.ouster:OusterEncoder",
+    "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
+}
+
+
+def encoder_class(name: str) -> type[PacketEncoder]:
+    """Return the encoder of a format of packets, of the table or of a plug-in.
+
+    Raises
+    ------
+    LidarError
+        If there is no format of that name, or its plug-in cannot be used.
+    """
+    if name in ENCODERS:
+        module, _, attribute = ENCODERS[name].partition(":")
+        encoder: type[PacketEncoder] = getattr(import_module(module), attribute)
+        return encoder
+    plugin = find_plugin(GROUP, name)
+    if plugin is None:
+        names = [*ENCODERS, *plugins_of(GROUP)]
+        raise LidarError(
+            f"{name!r} is not a format of packets; these are: {', '.join(names)}."
+            f"{did_you_mean(name, names)}"
+        )
+    encoder = plugin.load(type)
+    if not issubclass(encoder, PacketEncoder):
+        raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
+    return encoder
+
+
+def encoder_of(source: PacketSource) -> PacketEncoder:
+    """Return the encoder of a sensor.
+
+    Raises
+    ------
+    LidarError
+        If the sensor has no packets, or its format, identifiers or mode cannot be encoded.
+    """
+    return encoder_class(source.settings.format)(source)

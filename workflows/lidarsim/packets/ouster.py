@@ -1,0 +1,468 @@
+"""Packets of Ouster sensors: lidar and IMU packets, and the metadata beside them.
+
+Sources: firmware user manual, «Lidar Packet Format» and «IMU Data Format»; ouster-sdk 1.0.1,
+parsing.cpp, packet.cpp, xyzlut.cpp and metadata.cpp; recordings that come with ouster-sdk.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
+from ..base.elementary import sin_cos
+from ..scene.transform import affine
+from ..sensor.beams import Mirror, Spin
+from ..sensor.trajectory import matrices
+from ..sweeps.instruments import IMU_FILE
+from .encoders import Datagrams, PacketEncoder, PacketSource
+from .ouster_loops import DUAL, LOW_RATE, SINGLE
+from .shots import Shots
+
+LIDAR_PORT = 7502
+IMU_PORT = 7503
+COLUMNS_PER_PACKET = 16
+_COLUMNS = (512, 1024, 2048, 4096)  # of a revolution
+_ENCODER_TICKS = 90_112  # of a revolution
+_LIDAR_PACKET = 1  # type of packet
+_INITIALIZATION_ID = 1  # number of the sensor's start; the same in packets and metadata
+_STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
+# Settings of the sensor that do not change its packets, as a sensor leaves the factory.
+_UNUSED_CONFIGURATION = {
+    "azimuth_window": [0, 360_000],
+    "multipurpose_io_mode": "OFF",
+    "nmea_baud_rate": "BAUD_9600",
+    "nmea_ignore_valid_char": 0,
+    "nmea_in_polarity": "ACTIVE_HIGH",
+    "nmea_leap_seconds": 0,
+    "operating_mode": "NORMAL",
+    "phase_lock_enable": False,
+    "phase_lock_offset": 0,
+    "signal_multiplier": 1,
+    "sync_pulse_in_polarity": "ACTIVE_HIGH",
+    "sync_pulse_out_angle": 360,
+    "sync_pulse_out_frequency": 1,
+    "sync_pulse_out_polarity": "ACTIVE_HIGH",
+    "sync_pulse_out_pulse_width": 10,
+}
+# {whether the survey has a start: timestamp_mode of the metadata}
+_CLOCKS = {True: "TIME_FROM_PTP_1588", False: "TIME_FROM_INTERNAL_OSC"}
+# {mode of returns: return_order of the metadata}
+_RETURN_ORDERS = {
+    "strongest": "STRONGEST_TO_WEAKEST",
+    "first": "NEAREST_TO_FARTHEST",
+    "last": "FARTHEST_TO_NEAREST",
+    "two_strongest": "STRONGEST_TO_WEAKEST",
+}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A layout of lidar packets, by its name in the metadata (`udp_profile_lidar`)."""
+
+    name: str
+    layout: int  # of pixels, see `ouster_loops`
+    pixel_words: int  # of 32 bits
+    range_bits: int
+    unit_mm: int = 1
+
+    @property
+    def is_legacy(self) -> bool:
+        """Whether packets have the layout of the first firmware, without header and checksum."""
+        return self.name == "LEGACY"
+
+
+PROFILES = {
+    profile.name: profile
+    for profile in (
+        Profile("LEGACY", SINGLE, 3, 20),
+        Profile("RNG19_RFL8_SIG16_NIR16", SINGLE, 3, 19),
+        Profile("RNG19_RFL8_SIG16_NIR16_DUAL", DUAL, 4, 19),
+        Profile("RNG15_RFL8_NIR8", LOW_RATE, 1, 15, unit_mm=8),
+    )
+}
+
+
+class RangeUnits(NamedTuple):
+    """Units of ranges in packets, which count from the sensor's axis."""
+
+    offset_mm: float  # distance from the axis to the start of the beams
+    unit_mm: float
+    max_number: float  # longest range, in units
+
+
+class ReturnImages(NamedTuple):
+    """Returns of n columns of c beams: arrays (r, n, c) of up to r returns, the nearest first."""
+
+    range_m: AnyFloats  # from the beam's start; 0 or NaN without a return
+    reflectivity: Bytes
+    signal: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementBlocks:
+    """Columns as a sensor measures them: n, a whole number of packets, the highest beam first."""
+
+    frames: Ints  # (n,): number of the revolution
+    measurement_ids: Ints  # (n,): column of the revolution
+    times_ns: Ints  # (n,): by the sensor's clock, since 1970
+    valid: Bools  # (n,): whether the column was fired and reaches the receiver
+    returns: ReturnImages
+
+
+@cache
+def lidar_packet(profile: Profile, beams: int) -> np.dtype[np.void]:
+    """Return the type of a lidar packet."""
+    pixels = ("pixels", "<u4", (beams, profile.pixel_words))
+    if profile.is_legacy:
+        column = np.dtype(
+            [
+                ("time_ns", "<u8"),
+                ("measurement_id", "<u2"),
+                ("frame_id", "<u2"),
+                ("encoder_count", "<u4"),
+                pixels,
+                ("status", "<u4"),
+            ]
+        )
+        return np.dtype([("columns", column, (COLUMNS_PER_PACKET,))])
+    column = np.dtype([("time_ns", "<u8"), ("measurement_id", "<u2"), ("status", "<u2"), pixels])
+    return np.dtype(
+        [
+            ("type", "<u2"),
+            ("frame_id", "<u2"),
+            ("initialization_id", "u1", (3,)),
+            ("serial_number", "u1", (5,)),
+            ("alert_flags", "u1"),  # 0: no alert
+            ("reserved", "u1", (3,)),
+            ("countdowns", "u1", (2,)),  # to thermal shutdown and shot limiting, s; 0: none
+            ("states", "u1", (2,)),  # of thermal shutdown and shot limiting; 0: normal
+            ("reserved_of_header", "u1", (12,)),
+            ("columns", column, (COLUMNS_PER_PACKET,)),
+            ("reserved_of_footer", "u1", (24,)),
+            ("checksum", "<u8"),
+        ]
+    )
+
+
+def lidar_packets(
+    blocks: MeasurementBlocks, profile: Profile, offset_mm: float, columns: int, serial_number: int
+) -> Bytes:
+    """Return lidar packets, each with 16 measurement blocks: (n / 16, size).
+
+    Blocks that are not valid are zeros, except for their numbers. `offset_mm` is the distance from
+    the sensor's axis to the start of its beams; a revolution has `columns`.
+    """
+    from . import ouster_loops  # not before: numba takes half a second to import
+
+    channels = blocks.returns.range_m.shape[2]
+    packets = np.zeros(len(blocks.frames) // COLUMNS_PER_PACKET, lidar_packet(profile, channels))
+    rows = packets["columns"]
+    times_ns = np.where(blocks.valid, np.maximum(blocks.times_ns, 0), 0)
+    rows["time_ns"] = times_ns.reshape(rows.shape)
+    rows["measurement_id"] = blocks.measurement_ids.reshape(rows.shape)
+    frame_ids = (blocks.frames % 2**16).reshape(rows.shape)
+    valid = blocks.valid.reshape(rows.shape)
+    if profile.is_legacy:
+        rows["frame_id"] = frame_ids
+        rows["encoder_count"] = rows["measurement_id"] * np.uint32(_ENCODER_TICKS // columns)
+        rows["status"] = np.where(valid, 0xFFFF_FFFF, 0)
+    else:
+        packets["type"] = _LIDAR_PACKET
+        packets["frame_id"] = frame_ids[:, 0]
+        packets["initialization_id"] = _little_endian(_INITIALIZATION_ID, 3)
+        packets["serial_number"] = _little_endian(serial_number, 5)
+        rows["status"] = valid
+    units = RangeUnits(offset_mm, float(profile.unit_mm), 2.0**profile.range_bits - 1)
+    ouster_loops.write_pixels(blocks.returns, valid, profile.layout, units, rows["pixels"])
+    payloads = packets.view(np.uint8).reshape(len(packets), packets.itemsize)
+    if not profile.is_legacy:
+        words = payloads.view("<u8")
+        checksums = np.zeros(len(words), np.uint64)
+        ouster_loops.checksums(words[:, :-1], ouster_loops.remainders(), checksums)
+        words[:, -1] = checksums
+    return payloads
+
+
+def _little_endian(number: int, size: int) -> Bytes:
+    """Return a number as bytes (size,), the lowest first."""
+    return np.frombuffer(number.to_bytes(size, "little"), np.uint8)
+
+
+_IMU_PACKET = np.dtype(
+    [
+        ("system_ns", "<u8"),
+        ("accelerometer_ns", "<u8"),
+        ("gyroscope_ns", "<u8"),
+        ("acceleration", "<f4", (3,)),  # in units of standard gravity
+        ("angular_velocity", "<f4", (3,)),  # degrees a second
+    ]
+)
+
+
+def imu_packets(times_ns: Ints, rates: Floats, forces: Floats) -> Bytes:
+    """Return a packet for each sample of an IMU: (n, 48).
+
+    Parameters
+    ----------
+    times_ns
+        (n,): by the sensor's clock, since 1970.
+    rates
+        (n, 3): angular velocities, rad/s.
+    forces
+        (n, 3): specific forces, m/s².
+    """
+    packets = np.zeros(len(times_ns), _IMU_PACKET)
+    for name in ("system_ns", "accelerometer_ns", "gyroscope_ns"):
+        packets[name] = np.maximum(times_ns, 0)
+    packets["acceleration"] = forces / _STANDARD_GRAVITY
+    packets["angular_velocity"] = np.degrees(rates)
+    return packets.view(np.uint8).reshape(len(packets), packets.itemsize)
+
+
+class OusterEncoder(PacketEncoder):
+    """Lidar packets of 16 columns, and IMU packets where the carrier has an IMU.
+
+    The identifier `profile` selects the layout of lidar packets: by default RNG19_RFL8_SIG16_NIR16,
+    with `_DUAL` for the mode two_strongest. Reflectivity and signal are columns of the cloud; near
+    infrared, which the simulator does not measure, is 0, as are all values of a ray without a
+    return, or beyond the longest range of the profile. A packet without any column that reaches the
+    receiver is not sent.
+    """
+
+    columns = ("reflectivity", "signal")
+    identifiers = ("product_line",)
+    optional_identifiers = ("profile",)
+    address = "192.168.1.200"
+    destination = "192.168.1.100"
+
+    def __init__(self, source: PacketSource) -> None:
+        super().__init__(source)
+        self._profile = self._profile_of_mode()
+        self._check_sensor()
+        sensor = source.sensor
+        channels = source.settings.channels
+        self._elevation_deg = np.degrees(sensor.beams.elevation[channels])
+        self._azimuth_deg = np.degrees(sensor.beams.azimuth[channels])
+        self._origin_mm = 1000 * sensor.beams.origin[0]
+        self._columns = int(sensor.head.firings_per_turn)  # type: ignore[attr-defined]
+        self._serial_number = 122_000_000_000 + crc32(source.name.encode()) % 1_000_000_000
+        self._rest: Shots | None = None  # shots that fill no packet yet
+        self._next_firing = 0
+        self._repeated_frames = 0  # frames sent less revolutions made
+        self._clock_jumps: tuple[Ints, Ints] = (np.zeros(1, np.int64), np.zeros(1, np.int64))
+        instruments = source.instruments
+        self._imu_rows = iter(()) if instruments is None else instruments.rows(IMU_FILE)
+        self._next_imu_row: list[str] | None = next(self._imu_rows, None)
+
+    def _profile_of_mode(self) -> Profile:
+        """Return the profile that the identifiers or the mode state; LidarError if both differ."""
+        mode = self.source.mode
+        if mode not in _RETURN_ORDERS:
+            modes = ", ".join(_RETURN_ORDERS)
+            raise self.unusable(f"have the returns {modes}, not {mode}: set returns.mode")
+        two = mode == "two_strongest"
+        default = "RNG19_RFL8_SIG16_NIR16_DUAL" if two else "RNG19_RFL8_SIG16_NIR16"
+        name = self.source.settings.identifiers.get("profile", default)
+        if name not in PROFILES:
+            raise self.unusable(f"have the profiles {', '.join(PROFILES)}, not {name}")
+        profile = PROFILES[str(name)]
+        if (profile.layout == DUAL) != two:
+            needed = "two_strongest" if profile.layout == DUAL else "strongest, first or last"
+            raise self.unusable(
+                f"of the profile {name} hold the returns {needed}, not {mode}: set returns.mode"
+            )
+        return profile
+
+    def _check_sensor(self) -> None:
+        """Raise LidarError unless an Ouster could be the sensor."""
+        sensor = self.source.sensor
+        head = sensor.head
+        if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
+            raise self.unusable("need a head that spins clockwise")
+        if head.firings_per_turn not in _COLUMNS or head.rate_hz != int(head.rate_hz):
+            raise self.unusable(
+                f"hold {', '.join(map(str, _COLUMNS))} columns a turn at a whole number of turns a "
+                f"second, not {head.firings_per_turn:g} at {head.rate_hz:g}: set columns and "
+                "rate_hz"
+            )
+        origin = sensor.beams.origin
+        if sensor.beams.time_ns.any() or (origin != origin[0]).any() or origin[0, 1]:
+            raise self.unusable(
+                "need beams that fire at one time, from one point ahead of the axis"
+            )
+
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the lidar packets that the shots of a sweep fill, and IMU packets until then."""
+        if not len(shots):
+            return []
+        groups = []
+        first = int(shots.firings[0])
+        if first != self._next_firing:  # a station begins, or a frozen sweep is sent again
+            groups += self._rest_of_packets()
+            next_frame = -(-self._next_firing // self._columns) + self._repeated_frames
+            self._repeated_frames = next_frame - first // self._columns
+        self._next_firing = int(shots.firings[-1]) + 1
+        self._clock_jumps = (shots.starts_ns, shots.stamps_ns - shots.starts_ns)
+        joined = shots if self._rest is None else Shots.joined([self._rest, shots])
+        count = self._next_firing // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
+        count = max(count - int(joined.firings[0]), 0)
+        self._rest = joined[count:] if count < len(joined) else None
+        groups += self._lidar(joined[:count])
+        return [*groups, *self._imu(int(shots.starts_ns[-1]))]
+
+    def finish(self) -> list[Datagrams]:
+        """Return the packet of the last columns, and the IMU packets after them."""
+        return [*self._rest_of_packets(), *self._imu(None)]
+
+    def files(self) -> Mapping[str, bytes]:
+        """Return the metadata of the sensor as JSON, in the layout of its HTTP interface."""
+        return {".json": (json.dumps(self.metadata(), indent=1) + "\n").encode()}
+
+    def _rest_of_packets(self) -> list[Datagrams]:
+        """Return the packet of columns that wait for further columns, and forget them."""
+        rest = self._rest
+        self._rest = None
+        return [] if rest is None else self._lidar(rest)
+
+    def _lidar(self, shots: Shots) -> list[Datagrams]:
+        """Return the lidar packets of shots; the first and the last packet may lack columns."""
+        if not len(shots):
+            return []
+        blocks = self._blocks(shots)
+        payloads = lidar_packets(
+            blocks, self._profile, float(self._origin_mm[0]), self._columns, self._serial_number
+        )
+        packets = shots.firings // COLUMNS_PER_PACKET
+        last_shots = np.flatnonzero(np.diff(packets, append=-1))
+        due_ns = shots.starts_ns[last_shots] + self.firing_interval_ns
+        datagrams = Datagrams(payloads, due_ns, self.port("lidar", LIDAR_PORT))
+        lost = ~blocks.valid.reshape(-1, COLUMNS_PER_PACKET)
+        return [datagrams.without(np.asarray(lost.all(axis=1)))]
+
+    def _blocks(self, shots: Shots) -> MeasurementBlocks:
+        """Return the measurement blocks of shots, with blocks that are not valid around them."""
+        first = int(shots.firings[0]) // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
+        packets = -(-(int(shots.firings[-1]) + 1 - first) // COLUMNS_PER_PACKET)
+        firings = first + np.arange(packets * COLUMNS_PER_PACKET)
+        before = int(shots.firings[0]) - first
+        after = len(firings) - len(shots) - before
+        images = [shots.range_m, *(shots.columns[name] for name in self.columns)]
+        valid = ~shots.dropped
+        times_ns = shots.stamps_ns + self.source.start_ns
+        if before or after:
+            images = [np.pad(image, ((0, 0), (before, after), (0, 0))) for image in images]
+            valid = np.pad(valid, (before, after))
+            times_ns = np.pad(times_ns, (before, after))
+        revolutions, measurement_ids = np.divmod(firings, self._columns)
+        return MeasurementBlocks(
+            revolutions + self._repeated_frames,
+            measurement_ids,
+            times_ns,
+            valid,
+            ReturnImages(*images),
+        )
+
+    def _imu(self, until_ns: int | None) -> list[Datagrams]:
+        """Return the packets of the IMU's samples up to a time; of all further samples for None."""
+        rows = []
+        while self._next_imu_row is not None:
+            if until_ns is not None and int(self._next_imu_row[0]) > until_ns:
+                break
+            rows.append(self._next_imu_row)
+            self._next_imu_row = next(self._imu_rows, None)
+        if not rows:
+            return []
+        times_ns = np.array([int(row[0]) for row in rows])
+        samples = np.array([row[1:] for row in rows], np.float64)
+        starts_ns, jumps_ns = self._clock_jumps
+        firing = np.maximum(np.searchsorted(starts_ns, times_ns, "right") - 1, 0)
+        stamps_ns = times_ns + jumps_ns[firing] + self.source.start_ns
+        payloads = imu_packets(stamps_ns, samples[:, :3], samples[:, 3:])
+        return [Datagrams(payloads, times_ns, self.port("imu", IMU_PORT))]
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the metadata of the sensor, in the layout of firmware 3.1."""
+        profile = self._profile.name
+        rate_hz = int(self.source.sensor.head.rate_hz)  # type: ignore[attr-defined]
+        # Azimuths are clockwise here; rows are shifted by whole columns to look ahead.
+        azimuth_deg = -self._azimuth_deg
+        shifts = np.rint(azimuth_deg * self._columns / 360).astype(int).tolist()
+        beam_pose = np.eye(4)
+        beam_pose[0, 3] = self._origin_mm[0]
+        return {
+            "sensor_info": {
+                "build_date": "2024-03-01T00:00:00Z",
+                "build_rev": "v3.1.0",
+                "image_rev": "lidarpool",
+                "initialization_id": _INITIALIZATION_ID,
+                "prod_line": self.text("product_line"),
+                "prod_pn": "lidarpool",
+                "prod_sn": str(self._serial_number),
+                "status": "RUNNING",
+            },
+            "config_params": {
+                **_UNUSED_CONFIGURATION,
+                "columns_per_packet": COLUMNS_PER_PACKET,
+                "lidar_mode": f"{self._columns}x{rate_hz}",
+                "return_order": _RETURN_ORDERS[self.source.mode],
+                "timestamp_mode": _CLOCKS[self.source.dated],
+                "udp_dest": self.destination,
+                "udp_port_imu": self.port("imu", IMU_PORT),
+                "udp_port_lidar": self.port("lidar", LIDAR_PORT),
+                "udp_profile_imu": "LEGACY",
+                "udp_profile_lidar": profile,
+            },
+            "lidar_data_format": {
+                "column_window": [0, self._columns - 1],
+                "columns_per_frame": self._columns,
+                "columns_per_packet": COLUMNS_PER_PACKET,
+                "fps": rate_hz,
+                "pixel_shift_by_row": shifts,
+                "pixels_per_column": len(shifts),
+                "udp_profile_imu": "LEGACY",
+                "udp_profile_lidar": profile,
+            },
+            "beam_intrinsics": {
+                "beam_altitude_angles": _rounded(self._elevation_deg),
+                "beam_azimuth_angles": _rounded(azimuth_deg),
+                "beam_to_lidar_transform": _rounded(beam_pose),
+                "lidar_origin_to_beam_origin_mm": round(float(self._origin_mm[0]), 9),
+            },
+            "lidar_intrinsics": {"lidar_to_sensor_transform": _rounded(self._lidar_pose())},
+            "imu_intrinsics": {"imu_to_sensor_transform": _rounded(self._imu_pose())},
+            "calibration_status": {
+                "reflectivity": {"timestamp": "2024-03-01T00:00:00", "valid": True}
+            },
+        }
+
+    def _lidar_pose(self) -> Floats:
+        """Return the pose (4, 4) of the head in the sensor frame, millimetres."""
+        sin, cos = sin_cos(np.radians(self.source.sensor.head.zero_deg))  # type: ignore[attr-defined]
+        pose = np.eye(4)
+        pose[:2, :2] = [[cos, -sin], [sin, cos]]
+        pose[2, 3] = self._origin_mm[2]
+        return pose
+
+    def _imu_pose(self) -> Floats:
+        """Return the pose (4, 4) of the IMU in the sensor frame, mm; the identity without IMU."""
+        instruments = self.source.instruments
+        if instruments is None or instruments.imu is None:
+            return np.eye(4)
+        imu = instruments.imu
+        on_carrier = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
+        pose = np.linalg.inv(self.source.mount) @ on_carrier
+        pose[:3, 3] *= 1000
+        return pose
+
+
+def _rounded(values: Floats) -> list[float]:
+    """Return values without the last digits, in which radians are not exact, as a list."""
+    return [float(value) for value in np.round(values, 9).ravel() + 0.0]

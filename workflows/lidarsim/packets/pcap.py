@@ -1,0 +1,108 @@
+"""Writes datagrams as a classic pcap file: Ethernet, IPv4 and UDP, stamps in microseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from ipaddress import IPv4Address
+from struct import pack
+from typing import BinaryIO
+
+import numpy as np
+
+from ..base.arrays import Bytes, Indices, Ints
+from .encoders import Datagrams
+
+# Magic number of little-endian files with microseconds, version 2.4, longest frame, Ethernet.
+_FILE_HEADER = pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1)
+_RECORD_BYTES = 16  # header of a frame in the file
+_IP_OFFSET = _RECORD_BYTES + 14  # Ethernet header
+_UDP_OFFSET = _IP_OFFSET + 20
+_PAYLOAD_OFFSET = _UDP_OFFSET + 8
+_TIME_TO_LIVE = 64
+_UDP = 17
+_IPV4_BROADCAST = "255.255.255.255"
+# Locally administered, as no maker's device has sent the frames.
+_SOURCE_MAC = bytes.fromhex("020000000001")
+_DESTINATION_MAC = bytes.fromhex("020000000002")
+_BROADCAST_MAC = b"\xff" * 6
+
+
+class PcapWriter:
+    """Writes frames of datagrams into a binary file, in the order of their times in each call.
+
+    `address` is that of the sensor, `destination` of the receiver; each port is also the source
+    port. `start_ns` is the time 0 of the datagrams, nanoseconds since 1970. Equal datagrams give
+    equal bytes.
+    """
+
+    def __init__(
+        self, file: BinaryIO, address: str, destination: str = _IPV4_BROADCAST, start_ns: int = 0
+    ) -> None:
+        self._file = file
+        self._start_ns = start_ns
+        self._addresses = IPv4Address(address).packed + IPv4Address(destination).packed
+        is_broadcast = destination == _IPV4_BROADCAST
+        self._macs = (_BROADCAST_MAC if is_broadcast else _DESTINATION_MAC) + _SOURCE_MAC
+        file.write(_FILE_HEADER)
+
+    def write(self, groups: Sequence[Datagrams]) -> None:
+        """Write the datagrams of all groups in the order of their times; OSError on failure."""
+        groups = [group for group in groups if len(group)]
+        if not groups:
+            return
+        frames = [self._frames(group) for group in groups]
+        sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in frames])
+        order = np.argsort(np.concatenate([group.due_ns for group in groups]), kind="stable")
+        ends = np.empty(len(order), np.int64)
+        ends[order] = np.cumsum(sizes[order])
+        content = np.empty(int(sizes.sum()), np.uint8)
+        first = 0
+        for rows in frames:
+            starts = ends[first : first + len(rows)] - rows.shape[1]
+            content[starts[:, None] + np.arange(rows.shape[1])] = rows
+            first = first + len(rows)
+        self._file.write(content.data)
+
+    def _frames(self, group: Datagrams) -> Bytes:
+        """Return the frames of datagrams with their headers in the file: (n, bytes)."""
+        count, size = group.payloads.shape
+        frames = np.zeros((count, _PAYLOAD_OFFSET + size), np.uint8)
+        frames[:, _PAYLOAD_OFFSET:] = group.payloads
+        frame_bytes = frames.shape[1] - _RECORD_BYTES
+        micros = (group.due_ns + self._start_ns) // 1000
+        seconds, rest = np.divmod(micros, 1_000_000)
+        record = np.stack([seconds, rest, *[np.full(count, frame_bytes)] * 2], axis=1)
+        frames[:, :_RECORD_BYTES] = record.astype("<u4").view(np.uint8)
+        headers = self._macs + b"\x08\x00" + self._ip_header(size) + self._udp_header(group, size)
+        frames[:, _RECORD_BYTES:_PAYLOAD_OFFSET] = np.frombuffer(headers, np.uint8)
+        frames[:, _UDP_OFFSET + 6 : _UDP_OFFSET + 8] = self._udp_checksums(frames[:, _UDP_OFFSET:])
+        return frames
+
+    def _ip_header(self, size: int) -> bytes:
+        """Return the IPv4 header of a datagram of `size` bytes, which is not fragmented."""
+        head = pack(">BBHHHBB", 0x45, 0, 28 + size, 0, 0x4000, _TIME_TO_LIVE, _UDP)
+        words = np.frombuffer(head + self._addresses, ">u2").astype(np.int64)
+        checksum = int(_complement(words.sum(keepdims=True))[0])
+        return head + pack(">H", checksum) + self._addresses
+
+    def _udp_header(self, group: Datagrams, size: int) -> bytes:
+        """Return the UDP header of a datagram, without its checksum."""
+        return pack(">HHHH", group.port, group.port, 8 + size, 0)
+
+    def _udp_checksums(self, segments: Bytes) -> Bytes:
+        """Return the checksums of UDP segments (n, bytes), as big-endian bytes (n, 2)."""
+        count, size = segments.shape
+        padded = np.pad(segments, ((0, 0), (0, size % 2)))
+        words = padded.view(">u2").sum(axis=1, dtype=np.int64)
+        pseudo_header = np.frombuffer(self._addresses + pack(">HH", _UDP, size), ">u2")
+        checksums = _complement(words + pseudo_header.sum(dtype=np.int64))
+        checksums[checksums == 0] = 0xFFFF  # 0 means that there is no checksum
+        return checksums.astype(">u2").view(np.uint8).reshape(count, 2)
+
+
+def _complement(sums: Ints | Indices) -> Ints:
+    """Return the checksums of sums (n,) of 16-bit words: their ones' complement (RFC 1071)."""
+    folded = np.asarray(sums, np.int64)
+    for _ in range(3):
+        folded = (folded & 0xFFFF) + (folded >> 16)
+    return 0xFFFF - folded

@@ -1,0 +1,131 @@
+"""Packets of Velodyne: VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and VLS-128.
+
+Sources: user manuals of the VLP-16 (63-9243), VLP-32C and VLS-128; HDL-32E packet structure and
+timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Bools, Ints
+from .encoders import Datagrams, PacketEncoder, PacketSource
+from .shots import CarryOver, Shots
+from .velodyne_position import POSITION_PORT, PositionPackets
+
+DATA_PORT = 2368
+_BLOCKS = 12  # of a packet
+_BLOCK_LASERS = 32
+_CHANNELS = (16, 32, 128)
+_FLAGS = np.array([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF], "<u2")  # of lasers 0, 32, 64 and 96 onwards
+_UNUSED = 0xFFFF  # flag of blocks without lasers
+_MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
+_AZIMUTHS = 36_000  # in a revolution
+_MAX_UNITS = 65_535
+_HOUR_US = 3_600_000_000
+# Laser of the VLS-128 whose time is the packet's: the first of the fourth group of eight.
+_STAMPED_LASER_OF_128 = 24
+
+_RETURN = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
+_BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", _RETURN, _BLOCK_LASERS)])
+_PACKET = np.dtype(
+    [("blocks", _BLOCK, _BLOCKS), ("stamp_us", "<u4"), ("mode", "u1"), ("product", "u1")]
+)
+
+
+class VelodyneEncoder(PacketEncoder):
+    """Data packets of 1,206 bytes, and position packets of 512.
+
+    Azimuths are those of the head at the first firing of each block, clockwise from the sensor's
+    x axis. In the mode dual, each block of last returns is followed by a block of strongest
+    returns, or of second strongest where the last return is the strongest; an only return is in
+    both.
+    """
+
+    identifiers = ("product", "unit_m")
+
+    def __init__(self, source: PacketSource) -> None:
+        super().__init__(source)
+        if source.mode not in _MODES:
+            modes = ", ".join(_MODES)
+            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+        channels = source.sensor.channels
+        if channels not in _CHANNELS:
+            raise self.unusable(f"hold 16, 32 or 128 lasers, not {channels}")
+        self._mode = _MODES[source.mode]
+        self._unit_m = self.decimal("unit_m")
+        self._product = self.number("product")
+        self._planes = 2 if source.mode == "dual" else 1
+        # The VLS-128 leaves four blocks of a packet in the mode dual without lasers.
+        self._firings = _BLOCKS * _BLOCK_LASERS // (channels * self._planes)
+        self._port = self.port("data", DATA_PORT)
+        self._carry = CarryOver(self._firings)
+        self._positions = PositionPackets(source, self.port("position", POSITION_PORT))
+
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the data packets that the shots of a sweep fill, and the position packets."""
+        whole = self._carry.whole_packets(shots)
+        if not len(whole):
+            return []
+        data = self._data(whole)
+        last = slice(self._firings - 1, None, self._firings)
+        stamps_ns = whole.stamps_ns[last] + self.firing_interval_ns
+        positions = self._positions.beside(data.due_ns, stamps_ns)
+        dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
+        return [data.without(np.asarray(dropped)), positions]
+
+    def finish(self) -> list[Datagrams]:
+        """Return no packets, because the sensor sends no packet before its blocks are full."""
+        return []
+
+    def _data(self, shots: Shots) -> Datagrams:
+        """Return the data packets of shots that fill packets."""
+        firings = np.arange(len(shots)).reshape(-1, self._firings)
+        packets = np.zeros(len(firings), _PACKET)
+        packets["mode"] = self._mode
+        packets["product"] = self._product
+        packets["stamp_us"] = self._stamps_us(shots.stamps_ns[firings[:, 0]])
+        self._fill_blocks(packets["blocks"], shots)
+        last_ns = shots.starts_ns[firings[:, -1]]
+        payloads = packets.view(np.uint8).reshape(len(packets), _PACKET.itemsize)
+        return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
+
+    def _stamps_us(self, first_ns: Ints) -> Ints:
+        """Return stamps of packets whose first firings start at `first_ns` (n,): (n,)."""
+        settings = self.source.settings
+        offset_ns = 0.0
+        if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
+            laser = settings.channels[_STAMPED_LASER_OF_128]
+            offset_ns = float(self.source.sensor.beams.time_ns[laser])
+        stamps_ns = self.source.start_ns + first_ns + round(offset_ns)
+        return (stamps_ns + 500) // 1000 % _HOUR_US
+
+    def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
+        """Write flags, azimuths and returns of shots into blocks (n, 12) of `_BLOCK`."""
+        channels = shots.range_m.shape[2]
+        used = self._firings * channels * self._planes // _BLOCK_LASERS
+        units = np.rint(shots.range_m / self._unit_m)
+        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        distances = np.where(fits, units, 0).astype("<u2")
+        reflectivities = shots.columns["reflectivity"] * fits
+        shape = len(blocks), -1, 1, _BLOCK_LASERS
+        for name, values in (("distance", distances), ("reflectivity", reflectivities)):
+            planes = [plane.reshape(shape) for plane in self._planes_of(values, fits)]
+            interleaved = np.concatenate(planes, axis=2)
+            blocks["returns"][name][:, :used] = interleaved.reshape(len(blocks), used, -1)
+        banks = max(1, channels // _BLOCK_LASERS)
+        blocks["flag"] = _UNUSED
+        blocks["flag"][:, :used] = _FLAGS[np.arange(used) // self._planes % banks]
+        azimuths = np.rint(np.degrees(-shots.azimuths) * 100).astype(np.int64) % _AZIMUTHS
+        by_firing = azimuths.reshape(len(blocks), self._firings)
+        firing = np.arange(used) // self._planes * _BLOCK_LASERS // channels
+        blocks["azimuth"][:, :used] = by_firing[:, firing]
+        blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers take the last block's
+
+    def _planes_of(self, values: AnyArray, returned: Bools) -> list[AnyArray]:
+        """Return values (r, n, c) in the order of blocks: (n, c) for each block of a firing."""
+        if self._planes == 1:
+            return [values[0]]
+        if len(values) == 1:
+            return [values[0], values[0]]
+        return [np.where(returned[1], values[1], values[0]), values[0]]

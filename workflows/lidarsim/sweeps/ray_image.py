@@ -1,0 +1,102 @@
+"""The rays of a sweep as images: a row for each channel, a column for each firing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Ints, Ints32
+from ..base.errors import LidarError
+from ..columns.cloud import Cloud
+from ..sensor import Sensor
+from .sweeps import MIXED_UP, FiredRays, Sweeps
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Pixels of the points of a sweep in its image: a row for each channel, firings in order."""
+
+    sensor: Sensor
+    firings: Ints  # (w,): all firings of the sweep, from the start of the station
+    scan: Ints32  # (w,): scan of each firing
+    begin_ns: float  # start of the station, since the survey's start
+    plane: Ints  # (n,): number of a point among the returns of its pulse, from 0
+    row: Ints  # (n,): channel
+    column: Ints  # (n,): firing
+    planes: int
+
+    @classmethod
+    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Image:
+        """Return the pixels of the points of a sweep.
+
+        LidarError if the points are not in order, or the rays of the survey are unknown.
+        """
+        fired = fired_of(sweeps)
+        number = int(sweeps.sensor[sweep])
+        sensor = fired.sensors[number]
+        scans = np.arange(*sweeps.scans[sweep : sweep + 2])
+        steps = range(fired.steps[sweep], fired.steps[sweep] + len(scans))
+        bounds = np.array([sensor.firings(step) for step in steps])
+        firings = np.arange(bounds[0, 0], bounds[-1, 1])
+        lead_ns = float(sensor.begins_ns(firings[:1])[0]) + sensor.lead_ns
+        ray = points["ray"].astype(np.int64)
+        ray += (bounds[points["scan"] - scans[0], 0] - firings[0]) * sensor.channels
+        if (np.diff(ray) < 0).any() or (len(ray) and ray[-1] >= len(firings) * sensor.channels):
+            raise LidarError(MIXED_UP)
+        column, row = np.divmod(ray, sensor.channels)
+        plane = _return_indices(ray)
+        return cls(
+            sensor,
+            firings,
+            np.repeat(scans.astype(np.int32), np.diff(bounds, axis=1)[:, 0]),
+            round(sweeps.begins_ns[sweep] - lead_ns),
+            plane,
+            row,
+            column,
+            planes=max(fired.returns[number], int(plane.max(initial=0)) + 1),
+        )
+
+    def filled(self, values: AnyArray) -> AnyArray:
+        """Return values (n,) of the points as images (planes, channels, firings).
+
+        Rays without a return have NaN, whole numbers -1, or 0 if their type has no sign.
+        """
+        fill_value = {"f": np.nan, "i": -1}.get(values.dtype.kind, 0)
+        result = np.full(
+            (self.planes, self.sensor.channels, len(self.firings)), fill_value, values.dtype
+        )
+        result[self.plane, self.row, self.column] = values
+        return result
+
+    def ray_arrays(self) -> dict[str, AnyArray]:
+        """Return times and nominal angles of all rays, and the scan of each firing.
+
+        Arrays of rays are (channels, firings). Times are nanoseconds since the survey's start,
+        angles degrees in the sensor's axes.
+        """
+        x, y, z = self.sensor.directions(self.firings).transpose(2, 1, 0)
+        return {
+            "time": self.begin_ns + self.sensor.times_ns(self.firings).T,
+            "azimuth": (np.degrees(np.arctan2(y, x)) % 360).astype(np.float32),
+            "elevation": np.degrees(np.arcsin(np.clip(z, -1, 1))).astype(np.float32),
+            "scan": self.scan,
+        }
+
+
+def _return_indices(ray: Ints) -> Ints:
+    """Return the index of each point among the points of its ray, from 0; `ray` (n,) ascends."""
+    first_points = np.flatnonzero(np.diff(ray, prepend=-1))
+    counts = np.diff(first_points, append=len(ray))
+    return np.asarray(np.arange(len(ray)) - np.repeat(first_points, counts))
+
+
+def fired_of(sweeps: Sweeps) -> FiredRays:
+    """Return the description of all rays of a survey; LidarError without a description."""
+    if sweeps.fired is None:
+        raise LidarError(
+            "Range images need every return of a survey: run it with keep_every 1 and the column "
+            "ray. Of a Sensor class of your own they are written with the run only (output.write, "
+            "Result.report)."
+        )
+    return sweeps.fired
