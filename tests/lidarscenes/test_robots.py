@@ -404,9 +404,8 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
     for batch in batches:
         # Where the sensor was when the ray was fired, with poses made here.
         place, rotation = DRIVE.poses(0, batch.time.astype(np.float64))
-        origins = place + into_axes(
-            np.broadcast_to(mount.position, place.shape), rotation.transpose(0, 2, 1)
-        )
+        starts = sensor.beams.origin[batch.channel] @ mount.rotation.T + mount.position
+        origins = place + into_axes(starts, rotation.transpose(0, 2, 1))
         ranges = np.linalg.norm(batch.positions - origins, axis=1)
         assert np.allclose(ranges, batch.range, atol=2e-5)  # straight between firings
         for number, actor in enumerate(actors, 1):

@@ -445,6 +445,21 @@ def test_dropped_packets_are_left_out():
     assert 0.2 < (count - len(numbers)) / (count - 38) < 0.4 and numbers[:37] == list(range(37))
 
 
+def test_packets_start_anew_at_each_station():
+    """Else dropped packets, which count from the start of a station, were parts of two."""
+    poses = [Pose((0.0, 0.0, 0.0)), Pose((1.0, 0.0, 0.0))]
+    fault = Fault("dropped_packets", share=0.2, packet=24)
+    survey = Survey(
+        load_sensor("velodyne/vlp16"), poses, steps=36, columns=COLUMNS, keep_every=1,
+        faults=[fault],
+    )  # fmt: skip
+    cloud, sweeps = points_of(survey, room())
+    payloads = data_of(encoded(cloud, sweeps))
+    firings = cloud["time"] % sweeps.station_ns // 55_296
+    kept = np.unique(cloud["scan"] // 36 * 1000 + firings // 24)
+    assert len(payloads) == (kept % 1000 < 75).sum() < 130
+
+
 def test_a_jump_of_the_clock_is_in_the_stamps():
     survey = moving_survey(faults=[Fault("time_jump", from_s=0.1, by_s=0.02)])
     cloud, sweeps = points_of(survey, room())

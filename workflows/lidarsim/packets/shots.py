@@ -146,7 +146,12 @@ class CarryOver:
         self._rest: Shots | None = None
 
     def whole_packets(self, shots: Shots) -> Shots:
-        """Add firings; return all firings that fill packets, perhaps none, and keep the rest."""
+        """Add firings; return all firings that fill packets, perhaps none, and keep the rest.
+
+        At a new station the sensor starts anew: the rest of the last station is never sent.
+        """
+        if len(shots) and shots.firings[0] == 0:
+            self._rest = None
         joined = shots if self._rest is None else Shots.joined([self._rest, shots])
         count = len(joined) // self.firings_per_packet * self.firings_per_packet
         self._rest = joined[count:]

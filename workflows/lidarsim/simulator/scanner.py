@@ -86,7 +86,7 @@ class Scanner:
     >>> from lidarpool import Pose, Scanner, Scene, load_sensor
     >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=["range"])
     >>> scanner.sweep(Pose((0, 0, 1)))
-    <Cloud of 2,270 points: x, y, z, scan, channel, object, range>
+    <Cloud of 2,278 points: x, y, z, scan, channel, object, range>
     >>> scanner.ranges([(0, 0, 1), (1, 0, 1)]).shape
     (2, 1809, 16)
     """
