@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,14 +12,14 @@ import numpy as np
 from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
-from ..sensor.trajectory import Stations, presence_ns
+from ..sensor.trajectory import StaticPose, Stations, presence_ns
 
 if TYPE_CHECKING:
     from .surface_loops import TrackTable
 
 
 class _StraightTrack(NamedTuple):
-    """A track of s straight segments; poses of an actor that stands are a single segment."""
+    """A track of s straight segments."""
 
     times_s: Floats  # (s + 1,): start of each segment, and end of the last, by the track's clock
     start_s: float  # time of the track's clock at the survey's start, seconds
@@ -28,24 +28,34 @@ class _StraightTrack(NamedTuple):
 
 
 def _straight_track(trajectory: Trajectory) -> _StraightTrack | None:
-    """Return the straight track of a `Track` or of the first of `Stations`.
-
-    None for smooth tracks and for trajectories of other classes.
-    """
-    if isinstance(trajectory, Track) and not trajectory.smooth:
-        return _StraightTrack(
-            trajectory.times_s,
-            float(trajectory.start_s or 0),
-            trajectory.slack_s,
-            trajectory.segments,
-        )
-    if not isinstance(trajectory, Stations):
+    """Return the straight track of a `Track`; None for smooth tracks and other classes."""
+    if not isinstance(trajectory, Track) or trajectory.smooth:
         return None
-    (position,), rotations = trajectory.poses(0, np.zeros(1))
-    rotation = np.zeros((3, 9, 1))
-    rotation[0] = np.eye(3).reshape(9, 1) if rotations is None else rotations.reshape(9, 1)
-    segments = position[:, None], np.zeros((3, 1)), rotation, np.zeros(1)
-    return _StraightTrack(np.zeros(2), 0.0, np.inf, segments)
+    return _StraightTrack(
+        trajectory.times_s,
+        float(trajectory.start_s or 0),
+        trajectory.slack_s,
+        trajectory.segments,
+    )
+
+
+def _static_tracks(trajectories: Sequence[Stations | StaticPose]) -> _StraightTrack:
+    """Return the tracks of actors that stand, one segment each, as a track of s segments."""
+    count = len(trajectories)
+    positions = np.empty((count, 3))
+    rotations = np.empty((count, 3, 3))
+    for row, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, StaticPose):
+            positions[row] = trajectory.position
+            rotations[row] = trajectory.rotation
+        else:
+            pose = trajectory.pose(0)
+            positions[row] = pose.position
+            rotations[row] = pose.rotation_matrix
+    terms = np.zeros((3, 9, count))
+    terms[0] = rotations.reshape(-1, 9).T
+    segments = positions.T, np.zeros((3, count)), terms, np.zeros(count)
+    return _StraightTrack(np.zeros(count + 1), 0.0, np.inf, segments)
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
@@ -156,10 +166,21 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         """Straight tracks among the trajectories, for compiled loops."""
         from .surface_loops import TrackTable
 
-        straight_tracks = [_straight_track(trajectory) for trajectory in self]
-        straight = np.array([track is not None for track in straight_tracks], np.bool_)
-        tracks = [track for track in straight_tracks if track is not None]
-        counts = np.array([len(track.times_s) - 1 for track in tracks], np.int64)
+        straight_tracks = {
+            number: track
+            for number, trajectory in enumerate(self)
+            if (track := _straight_track(trajectory)) is not None
+        }
+        static = [
+            number
+            for number, trajectory in enumerate(self)
+            if isinstance(trajectory, Stations | StaticPose)
+        ]
+        # Tracks in the order of actors that move, and then of actors that stand.
+        member = np.full(len(self), -1, np.int64)
+        member[[*straight_tracks, *static]] = np.arange(len(straight_tracks) + len(static))
+        tracks = [*straight_tracks.values(), _static_tracks([self[number] for number in static])]
+        counts = np.array([len(track.times_s) - 1 for track in tracks[:-1]] + [1] * len(static))
 
         def joined(part: int, *shape: int) -> Floats:
             """Concatenate field `part` of the segments of all tracks: (*shape, s)."""
@@ -167,10 +188,12 @@ class ActorTrajectories(tuple[Trajectory, ...]):
             return np.concatenate([empty, *(track.segments[part] for track in tracks)], axis=-1)
 
         limits = [
-            (track.start_s, track.times_s[0], track.times_s[-1], track.slack_s) for track in tracks
-        ]
+            (track.start_s, track.times_s[0], track.times_s[-1], track.slack_s)
+            for track in tracks[:-1]
+        ] + [(0.0, 0.0, 0.0, np.inf)] * len(static)
+        counts = counts.astype(np.int64)
         return TrackTable(
-            member=np.where(straight, np.cumsum(straight) - 1, -1),
+            member=member,
             first=np.cumsum(counts) - counts,
             segments=counts,
             limits=np.array(limits, np.float64).reshape(-1, 4).T.copy(),

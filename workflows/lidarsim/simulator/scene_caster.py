@@ -137,8 +137,7 @@ class SceneCaster:
         `surfaces` are the surfaces of the scene with the moved instances.
         """
         first = self.caster.instance_count - len(instances)
-        for row in rows:
-            self.caster.move(first + int(row), instances.transforms[row])
+        self.caster.move(first + rows, instances.transforms[rows])
         self._surfaces = surfaces
         self._instances = instances
 
