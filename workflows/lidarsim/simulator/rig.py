@@ -23,6 +23,7 @@ from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firing
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
+from .static_bodies import largest_range_m
 from .surfaces import Surfaces
 
 # Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
@@ -84,7 +85,10 @@ class Rig:
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         # The parts from which scans are cast, for other tools to look into.
         self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self.scene_caster = SceneCaster(scene, self.surfaces, shared_caster, **options)
+        range_m = largest_range_m(survey)
+        self.scene_caster = SceneCaster(
+            scene, self.surfaces, shared_caster, range_m=range_m, **options
+        )
         self._prepare()
         check_trajectory(survey.path)
         # {(number of the sensor, whether the carrier moves): rays}
@@ -174,7 +178,7 @@ class Rig:
             for number in range(len(survey.carried))
         ]
         self._device: DeviceColumns | None = None
-        if caster.caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
+        if caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
             self._device = DeviceColumns(caster, scene, survey, surfaces)
 
     @property
@@ -232,6 +236,7 @@ class Rig:
         stop = specs[-1].firings[1]
         firings = Firings.from_scans(sensor, specs)
         poses = self._poses(firings, path, late_ns, by_head=by_head)
+        self.scene_caster.cover(poses.positions)
         if repeated is not None:
             pattern = repeated
             start = first * channels % len(repeated)  # row of the first ray in the pattern
@@ -301,6 +306,7 @@ class Rig:
         """
         sensor = self.survey.carried[specs[0].sensor].sensor
         first = specs[0].firings[0]
+        self.scene_caster.cover(positions)
         pattern = self._pattern_of_firings(specs[0].sensor, first, specs[-1].firings[1])
         rays = len(pattern)
         ranges_m = np.full((len(positions), rays), np.inf, np.float32)

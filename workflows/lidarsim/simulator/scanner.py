@@ -41,6 +41,7 @@ from .body_poses import poses_of_bodies, poses_of_body
 from .motion import check_trajectory
 from .rig import Rig
 from .scene_caster import check_backend_here
+from .static_bodies import warn_of_reach
 from .surfaces import warn_of_grey
 
 MAX_SCANS = 1 << 31  # the type of the column `scan`
@@ -141,6 +142,7 @@ class Scanner:
             spray_g_m3=spray_g_m3,
         )
         warn_of_grey(scene, survey)
+        warn_of_reach(scene, survey)
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
