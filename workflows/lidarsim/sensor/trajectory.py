@@ -372,7 +372,9 @@ class Track:
         self._set_span()
 
     @classmethod
-    def from_matrices(cls, times_s: Floats, matrices: Floats) -> list[Track]:
+    def from_matrices(
+        cls, times_s: Floats, matrices: Floats, beyond: Beyond = "refuse"
+    ) -> list[Track]:
         """Return the straight tracks of k bodies, whose poses are computed all at once.
 
         Time 0 of the tracks is 0 by the clock of `times_s`, also if that is outside the times.
@@ -383,6 +385,8 @@ class Track:
             (s,): times of the poses of all tracks, seconds, ascending; at least two.
         matrices
             (k, s, 4, 4): rigid transforms, which are not checked.
+        beyond
+            As of `Track`.
 
         Raises
         ------
@@ -417,7 +421,7 @@ class Track:
                 smooth=False,
                 start_s=0.0,
                 duration_s=float(times[-1]),
-                beyond="refuse",
+                beyond=beyond,
                 segments=Segments(*(part[..., columns] for part in segments)),
             )
             tracks.append(track)

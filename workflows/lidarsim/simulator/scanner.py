@@ -184,6 +184,25 @@ class Scanner:
         """Name of the ray-casting backend in use."""
         return self._rig.backend
 
+    @property
+    def origin(self) -> Floats:
+        """World coordinates of the scene's local origin, metres: (3,)."""
+        return self._rig.scene.origin
+
+    @checked
+    def span_s(
+        self, number: SweepNumber = 0, *, start_s: StartSeconds = None
+    ) -> tuple[float, float]:
+        """Return the times at which the first and the last beam of a sweep are fired, seconds.
+
+        `number` and `start_s` are as in `sweep`.
+        """
+        rig = self._rig
+        specs, _ = self._scans_of(rig, number, start_s)
+        begin_ns, end_ns = _span_ns(rig, specs)
+        last_delay_ns = float(rig.survey.sensor.beams.time_ns.max())
+        return begin_ns / 1e9, (end_ns + last_delay_ns) / 1e9
+
     @checked
     def sweep(
         self,
@@ -442,24 +461,35 @@ class Scanner:
         `start_s`. Without a `number`, the scans are those of revolution 0 with the random numbers
         of later revolutions, and `count` revolutions of random numbers are used up.
         """
-        sensor = rig.survey.sensor
-        ahead = 0  # scans by which random numbers are ahead, see `ScanSpec`
-        steps = sensor.steps_of_revolution(number or 0)
-        if steps.stop > MAX_SCANS:
-            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
+        revolutions_ahead = 0  # by which random numbers are ahead
         if number is None:
             with self._lock:
-                ahead = self._unnumbered * len(steps)
+                revolutions_ahead = self._unnumbered
                 self._unnumbered += count
+        specs, late_ns = self._scans_of(rig, number or 0, start_s, revolutions_ahead)
+        begin_ns, end_ns = _span_ns(rig, specs)
+        rig.check_actors(begin_ns, end_ns)
+        return specs, late_ns
+
+    def _scans_of(
+        self, rig: Rig, number: int, start_s: float | None, revolutions_ahead: int = 0
+    ) -> tuple[list[ScanSpec], float]:
+        """Return the scans of revolution `number`, and the delay of its start, nanoseconds.
+
+        Random numbers are those of a revolution that is `revolutions_ahead`, see `ScanSpec.ahead`.
+        """
+        sensor = rig.survey.sensor
+        steps = sensor.steps_of_revolution(number)
+        if steps.stop > MAX_SCANS:
+            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
         late_ns = (
-            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number or 0))
+            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
+        ahead = revolutions_ahead * len(steps)
         specs = [
             ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
             for step in steps
         ]
-        begin_ns, end_ns = _span_ns(rig, specs)
-        rig.check_actors(begin_ns, end_ns)
         return specs, late_ns
 
     @contextmanager
