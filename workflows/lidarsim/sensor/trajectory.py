@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
@@ -373,8 +374,8 @@ class Track:
 
     @classmethod
     def from_matrices(
-        cls, times_s: Floats, matrices: Floats, beyond: Beyond = "refuse"
-    ) -> list[Track]:
+        cls, times_s: Floats, matrices: Floats, beyond: Literal["refuse", "hold"] = "refuse"
+    ) -> Sequence[Track]:
         """Return the straight tracks of k bodies, whose poses are computed all at once.
 
         Time 0 of the tracks is 0 by the clock of `times_s`, also if that is outside the times.
@@ -397,35 +398,8 @@ class Track:
         if len(times) < 2:
             raise LidarError(f"A trajectory needs two poses at least; there are {len(times)}.")
         _check_times(times)
-        count, samples = matrices.shape[:2]
-        quaternions = quaternions_of(matrices[..., :3, :3].reshape(-1, 3, 3))
-        rows = quaternions.reshape(count, samples, 4)
-        positions = np.ascontiguousarray(matrices[..., :3, 3])
-        segments = _segments(
-            np.tile(np.diff(times), count),
-            positions[:, :-1].reshape(-1, 3),
-            positions[:, 1:].reshape(-1, 3),
-            rows[:, :-1].reshape(-1, 4),
-            rows[:, 1:].reshape(-1, 4),
-        )
-        for array in (times, positions, rows):
-            array.flags.writeable = False
-        tracks = []
-        for number in range(count):
-            columns = slice(number * (samples - 1), (number + 1) * (samples - 1))
-            track = object.__new__(cls)
-            vars(track).update(
-                times_s=times,
-                positions=positions[number],
-                quaternions=rows[number],
-                smooth=False,
-                start_s=0.0,
-                duration_s=float(times[-1]),
-                beyond=beyond,
-                segments=Segments(*(part[..., columns] for part in segments)),
-            )
-            tracks.append(track)
-        return tracks
+        batch = TrackBatch.from_matrices(times, matrices, beyond)
+        return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
 
     def _set_poses(self) -> None:
         """Check and freeze the times, positions and quaternions; compute missing quaternions."""
@@ -630,6 +604,95 @@ def _segments(
         rates=rates[:, 0],
         spins=np.ascontiguousarray(spins.T),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackBatch:
+    """Straight tracks of k bodies with the same times, computed all at once.
+
+    Attributes
+    ----------
+    times_s
+        (s,): times of the poses, seconds; time 0 of the tracks is 0.
+    positions
+        (k, s, 3): metres.
+    quaternions
+        (k, s, 4)
+    beyond
+        As of `Track`.
+    segments
+        Coefficients of k * (s - 1) segments, track by track.
+    """
+
+    times_s: Floats
+    positions: Floats
+    quaternions: Floats
+    beyond: Beyond
+    segments: Segments
+
+    @classmethod
+    def from_matrices(cls, times_s: Floats, matrices: Floats, beyond: Beyond) -> TrackBatch:
+        """Return the tracks of rigid transforms (k, s, 4, 4) at times (s,)."""
+        count, samples = matrices.shape[:2]
+        quaternions = quaternions_of(matrices[..., :3, :3].reshape(-1, 3, 3))
+        rows = quaternions.reshape(count, samples, 4)
+        positions = np.ascontiguousarray(matrices[..., :3, 3])
+        segments = _segments(
+            np.tile(np.diff(times_s), count),
+            positions[:, :-1].reshape(-1, 3),
+            positions[:, 1:].reshape(-1, 3),
+            rows[:, :-1].reshape(-1, 4),
+            rows[:, 1:].reshape(-1, 4),
+        )
+        for array in (positions, rows):
+            array.flags.writeable = False
+        return cls(times_s, positions, rows, beyond, segments)
+
+    def segments_of(self, numbers: ArrayLike) -> Segments:
+        """Return the segments of tracks `numbers` (n,), track by track."""
+        steps = len(self.times_s) - 1
+        columns = (np.asarray(numbers)[:, None] * steps + np.arange(steps)).reshape(-1)
+        return Segments(*(np.ascontiguousarray(part[..., columns]) for part in self.segments))
+
+
+class _BatchTrack(Track):
+    """A track of a batch, whose segments are looked up when they are needed.
+
+    Its actor is always in the scene.
+    """
+
+    batch: TrackBatch
+    number: int  # of the track in the batch
+
+    @classmethod
+    def of_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
+        """Return a track of a batch."""
+        track = object.__new__(cls)
+        vars(track).update(
+            times_s=batch.times_s,
+            positions=batch.positions[number],
+            quaternions=batch.quaternions[number],
+            smooth=False,
+            start_s=0.0,
+            duration_s=float(batch.times_s[-1]),
+            beyond=batch.beyond,
+            batch=batch,
+            number=number,
+        )
+        return track
+
+    @cached_property
+    def segments(self) -> Segments:
+        """Coefficients of poses on straight lines."""
+        return self.batch.segments_of([self.number])
+
+
+def batch_of(trajectory: Trajectory) -> TrackBatch | None:
+    """Return the batch of a track; None for other trajectories.
+
+    Actors on tracks of batches are always in the scene.
+    """
+    return trajectory.batch if isinstance(trajectory, _BatchTrack) else None
 
 
 class _SegmentTimes(NamedTuple):

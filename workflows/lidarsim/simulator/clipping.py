@@ -45,7 +45,7 @@ def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
         return None
-    absent = is_outside.all(axis=1).any(axis=1)
+    absent = np.any(np.all(is_outside, axis=1), axis=1)
     parts = [
         part
         for face in np.flatnonzero(crossing & ~absent).tolist()
