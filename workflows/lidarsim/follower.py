@@ -74,9 +74,10 @@ class Follower:
     >>> cloud = follower.sweep(lidar, [car])
     >>> follower.names
     ('Ground', 'Car')
-    >>> for k in range(51):  # a tenth of a second, in which the car drives a metre
+    >>> clouds = []
+    >>> for k in range(60):  # the car drives at 10 m/s
     ...     car[0, 3] = 9 + 0.02 * k
-    ...     clouds = follower.step(0.002 * k, lidar, [car])
+    ...     clouds += follower.step(0.002 * k, lidar, [car])
     >>> len(clouds)
     1
     """

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats, Ints
+from ..base.elementary import arctan2
 from ..base.errors import LidarError
 from ..scene.actors import box
 from ..scene.scene_mesh import SceneMesh
@@ -82,7 +83,8 @@ def segments(radius: float, sag_m: float) -> int:
     A multiple of 4.
     """
     share = min(max(sag_m / radius, 1e-9), 0.2)
-    return min(4 * math.ceil(math.pi / math.acos(1 - share) / 4), _MAX_SEGMENTS)
+    half_angle = float(arctan2(math.sqrt((2 - share) * share), 1 - share))
+    return min(4 * math.ceil(math.pi / half_angle / 4), _MAX_SEGMENTS)
 
 
 def height_field(model: Any, field: int) -> GeomMesh:

@@ -49,6 +49,7 @@ class MujocoScanner:
 
     Examples
     --------
+    >>> from lidarpool import MujocoScanner, load_sensor
     >>> sensor = load_sensor("velodyne/vlp16")
     >>> scanner = MujocoScanner(model, sensor, site="lidar")  # doctest: +SKIP
     >>> mujoco.mj_step(model, data)  # doctest: +SKIP

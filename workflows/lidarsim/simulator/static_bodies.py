@@ -16,7 +16,7 @@ import numpy as np
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
 from raybeam.registry import choose
 
-from ..base.arrays import Floats, Indices, Integers, Ints, Ints32
+from ..base.arrays import Floats, Indices, Ints, Ints32
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart
 from ..sensor import Survey
@@ -75,9 +75,9 @@ class _Trees(NamedTuple):
     # {instance of the caster: the triangle of its mesh of which each triangle is a part}
     origins: dict[int, Indices]
 
-    def numbered(self, hits: ScanReturns) -> Integers:
+    def numbered(self, hits: ScanReturns) -> Ints32:
         """Return the triangles of hits (k,), by the numbers of the scene."""
-        triangle: Integers = hits.triangle
+        triangle = hits.triangle
         if self.origins:
             triangle = triangle.copy()
             for instance, origin in self.origins.items():
