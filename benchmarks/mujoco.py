@@ -141,7 +141,9 @@ def measure(world: World, sensor: Sensor, rounds: int) -> list[str]:
             clouds = scanner.step(data)
 
     directions = sensor.directions(np.arange(scanner.ranges(data).shape[-2])).reshape(-1, 3)
-    peer = milliseconds(lambda: cast_by_mujoco(world, directions), min(rounds, 3))
+    peer = milliseconds(
+        lambda: cast_by_mujoco(world, directions), min(rounds, 3) if is_single else 1
+    )
     calls: list[Callable[[], None]] = [ranges]
     if is_single:
         calls += [sweep, step]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -265,15 +264,6 @@ class Follower:
             names = [self._body_names[row] for row in changed]
             self._frozen.move(names, _local(matrices[changed], self._frozen.origin))
             self._matrices = matrices.copy()
-
-
-def share_meshes(bodies: Iterable[tuple[Any, SceneMesh]]) -> list[SceneMesh]:
-    """Return meshes, those of equal keys with the arrays of the first; each keeps its name.
-
-    A body is a hashable key and its mesh.
-    """
-    meshes: dict[Any, SceneMesh] = {}
-    return [replace(meshes.setdefault(key, mesh), name=mesh.name) for key, mesh in bodies]
 
 
 def _local(matrices: Floats, origin: Floats) -> Floats:

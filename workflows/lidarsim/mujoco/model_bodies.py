@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -29,8 +30,7 @@ class ModelBody(NamedTuple):
     """A body, or a geom of a body, that a lidar may see."""
 
     body: int  # number of the body
-    key: Hashable  # equal for bodies with equal triangles, colours and materials
-    mesh: SceneMesh  # in the frame of the body
+    mesh: SceneMesh  # in the frame of the body; equal bodies share its arrays
 
 
 class ModelBodies(NamedTuple):
@@ -108,23 +108,27 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
     geoms = _visible_geoms(model, choice)
     groups = [[geom] for geom in geoms]
     if choice.objects == "body":
-        body_of = np.asarray(model.geom_bodyid)
-        groups = [
-            [geom for geom in geoms if body_of[geom] == body]
-            for body in dict.fromkeys(body_of[geoms].tolist())
-        ]
+        by_body: dict[int, list[int]] = {}
+        for geom in geoms:
+            by_body.setdefault(int(model.geom_bodyid[geom]), []).append(geom)
+        groups = list(by_body.values())
     is_static = _static_bodies(model)
+    names = names_of(model, choice.objects)
+    colours = _colours(model)
+    meshes: dict[Hashable, SceneMesh] = {}  # of equal bodies, the mesh of the first
     static = []
     moving = []
     for group in groups:
         body = int(model.geom_bodyid[group[0]])
-        mesh = _mesh_of_geoms(model, group, choice)
+        key = tuple(_key(model, geom) for geom in group)
+        if key not in meshes:
+            meshes[key] = _mesh_of_geoms(model, group, colours, choice.sag_m)
+        name = names[group[0] if choice.objects == "geom" else body]
         if is_static[body]:
             rotation, position = _rest_pose(model, body)
-            static.append(mesh.moved(mesh.name, rotation, position))
+            static.append(meshes[key].moved(name, rotation, position))
         else:
-            key = tuple(_key(model, geom) for geom in group)
-            moving.append(ModelBody(body, key, mesh))
+            moving.append(ModelBody(body, replace(meshes[key], name=name)))
     return ModelBodies(static, moving)
 
 
@@ -171,17 +175,17 @@ def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
     return as_srgb(LINEAR[srgb] * light)
 
 
-def _mesh_of_geoms(model: Any, geoms: list[int], choice: Choice) -> SceneMesh:
-    """Return the mesh of geoms of a body, in the frame of the body."""
-    colours = _colours(model)
-    shapes = [_placed_geom(model, geom, choice.sag_m) for geom in geoms]
+def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, sag_m: float) -> SceneMesh:
+    """Return the mesh of geoms of a body, in the frame of the body, without a name.
+
+    `colours` (geoms, 4) are those of all geoms of the model.
+    """
+    shapes = [_placed_geom(model, geom, sag_m) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
     vertices, faces = stacked((shape.vertices, shape.faces) for shape in shapes)
     face_colours = [_srgb_of(model, geom, colours[geom]) for geom in geoms]
-    kind = choice.objects
-    number = geoms[0] if kind == "geom" else int(model.geom_bodyid[geoms[0]])
     return SceneMesh(
-        names_of(model, kind)[number],
+        "",
         vertices,
         faces,
         colours=Colours.of_faces(np.repeat(face_colours, counts, axis=0)),

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.arrays import Floats, Floats32, Indices
 from ..base.errors import LidarError
 from ..columns.cloud import Cloud
-from ..follower import Follower, share_meshes
+from ..follower import Follower
 from ..sensor import Mounted, Sensor
 from .model_bodies import Choice, Objects, bodies_of, excluded, required_number
 
@@ -95,7 +95,7 @@ class MujocoScanner:
         if not bodies.static and not bodies.moving:
             raise LidarError(f"The lidar sees no geom of the groups {tuple(groups)} of the model.")
         self.follower = Follower(
-            share_meshes((item.key, item.mesh) for item in bodies.moving),
+            [item.mesh for item in bodies.moving],
             sensor,
             static=bodies.static,
             **options,
