@@ -140,6 +140,25 @@ def test_instances_that_are_cut_or_left_out_can_move(uncut):
         assert same(scene, scanner.sweep(HERE, number=1), whole.sweep(HERE, number=1))
 
 
+def test_bodies_that_fall_for_ever_are_left_out(uncut):
+    """And are there again once they are put back."""
+    crates = [SceneInstance(box("Crate", (2, 1, 1)), Pose((x, -4, 0))) for x in (5, -5, 0)]
+    scene = Scene.from_meshes([*seed_objects(rings=8, segments=12), level("Ground"), *crates])
+    names = ["Crate", "Crate.2", "Crate.3"]
+    scanner = Scanner(scene, GRID, columns=COLUMNS, backend="numpy")
+    whole = uncut(scene, backend="numpy")
+    in_trees = []
+    for x, depth, height in ((5, 0, 0), (5, -2e5, 1), (4, -3e5, 2), (3, -4e5, -1e6), (6, 0, 0)):
+        for each in (scanner, whole):
+            each.move(names, [(x, -4, 0), (-5, -4, depth), (0, 5, height)])
+        cloud = scanner.sweep(HERE, number=1)
+        expected = whole.sweep(HERE, number=1)
+        assert len(cloud) > 300 and np.array_equal(cloud.object, expected.object)
+        assert np.abs(cloud.positions - expected.positions).max() <= 0.002
+        in_trees.append(scanner._rig.scene_caster.caster.instance_count - 1)
+    assert in_trees == [3, 2, 2, 1, 3]
+
+
 def test_parts_of_triangles_cover_the_box_and_share_corners():
     ground = plane("Ground", 1e6)
     shifted = ground.vertices + np.array([9.0, 12, 0.5])

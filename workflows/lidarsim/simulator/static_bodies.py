@@ -16,7 +16,7 @@ import numpy as np
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
 from raybeam.registry import choose
 
-from ..base.arrays import Floats, Indices, Ints, Ints32
+from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart
 from ..sensor import Survey
@@ -43,7 +43,7 @@ def warn_of_reach(scene: Scene, survey: Survey) -> None:
     """Warn that a part of a scene is left out, since no sensor can reach it."""
     range_m = largest_range_m(survey)
     reach_m = _half_side(scene.bounds)
-    if _cuts(scene.bounds, range_m):
+    if reach_m > MAX_REACH_M and _is_short(range_m):
         _log.warning(
             "the scene is %s km wide, and the sensor measures up to %.6g m: what is more than %s "
             "km from the sensor is left out, so that casting stays fast; no point is lost",
@@ -58,9 +58,9 @@ def _half_side(bounds: Floats) -> float:
     return float(np.ptp(bounds, axis=0).max(initial=0.0)) / 2
 
 
-def _cuts(bounds: Floats, range_m: float) -> bool:
-    """Return whether bodies beyond the range are left out of a scene with bounds (2, 3)."""
-    return _half_side(bounds) > MAX_REACH_M >= 2 * (2 * range_m + MARGIN_M)
+def _is_short(range_m: float) -> bool:
+    """Return whether bodies beyond a range may be left out: whether a region around it is small."""
+    return 2 * (2 * range_m + MARGIN_M) <= MAX_REACH_M
 
 
 class _Trees(NamedTuple):
@@ -113,9 +113,11 @@ class StaticBodies:
         self._instances = scene.instances
         self._options = options
         self._lock = threading.Lock()
-        self._may_cut = (
-            _cuts(scene.bounds, range_m) and not choose(options.get("backend", "auto")).on_device
-        )
+        self._centre = scene.bounds.mean(axis=0)
+        on_device = choose(options.get("backend", "auto")).on_device
+        # Whether bodies may be left out once some are remote, and whether some are.
+        self._can_cut = _is_short(range_m) and not on_device
+        self._may_cut = self._can_cut and _half_side(scene.bounds) > MAX_REACH_M
         self._trees: _Trees | None = None
         if not self._may_cut:
             self._trees = self._build(None)
@@ -125,7 +127,7 @@ class StaticBodies:
         """The trees: of the whole scene, or of the region that was covered last."""
         if self._trees is None:
             with self._lock:
-                self._trees = self._build(None)
+                self._trees = self._trees or self._build(None)
         return self._trees
 
     @property
@@ -166,20 +168,29 @@ class StaticBodies:
     def move(self, instances: Instances, rows: Indices) -> None:
         """Move instances `rows` (m,) to their transforms in `instances`; no cast may be under way.
 
-        Trees are built again if one of the instances was cut or left out.
+        Trees are built again if an instance leaves for where no sensor reaches, such as a body that
+        falls for ever, if it comes from there, or if it was cut.
         """
         self._instances = instances
         trees = self._trees
         if trees is None:
             return
+        offsets = instances.transforms[rows, :, 3] - self._centre
+        is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
+        if trees.region is None and is_remote.any() and self._can_cut:
+            self._may_cut = True
+            self._trees = None  # `cover` builds them
+            return
         first = trees.caster.instance_count - len(trees.rows)
         numbers = first + np.searchsorted(trees.rows, rows)
+        has_tree = np.isin(rows, trees.rows)
         if trees.region is not None:
-            is_whole = np.isin(rows, trees.rows) & ~np.isin(numbers, list(trees.origins))
-            if not is_whole.all():
+            is_cut = has_tree & np.isin(numbers, list(trees.origins))
+            comes = ~has_tree & _is_near(instances, trees.region)[rows]
+            if (is_cut | comes | (has_tree & is_remote)).any():
                 self._trees = self._build(trees.region)
                 return
-        trees.caster.move(numbers, instances.transforms[rows])
+        trees.caster.move(numbers[has_tree], instances.transforms[rows[has_tree]])
 
     def _build(self, region: Floats | None) -> _Trees:
         """Build the trees of the bodies within a region (2, 3), or of all bodies.
@@ -243,8 +254,7 @@ def _parts_in(instances: Instances, region: Floats | None) -> Iterator[tuple[int
         return
     lower, upper = instances.bounds.transpose(1, 0, 2)
     is_whole = ((region[0] <= lower) & (upper <= region[1])).all(axis=1)
-    is_near = ((lower <= region[1]) & (region[0] <= upper)).all(axis=1)
-    for row in np.flatnonzero(is_near).tolist():
+    for row in np.flatnonzero(_is_near(instances, region)).tolist():
         cut_part = None
         part = instances.parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
@@ -252,6 +262,12 @@ def _parts_in(instances: Instances, region: Floats | None) -> Iterator[tuple[int
             cut_part = cut(part.vertices, part.faces, planes)
         if cut_part is None or len(cut_part.faces):
             yield row, cut_part
+
+
+def _is_near(instances: Instances, region: Floats) -> Bools:
+    """Return whether the box of each instance meets a region (2, 3): (n,)."""
+    lower, upper = instances.bounds.transpose(1, 0, 2)
+    return np.asarray(((lower <= region[1]) & (region[0] <= upper)).all(axis=1))
 
 
 def mesh_of(part: MeshPart) -> Mesh:
