@@ -14,7 +14,7 @@ from .backend import Backend
 from .crossing import Crossing, Nearest, TimedBodies
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
-from .instances import Instance, Mesh, check_instances, check_transform, nested_scene
+from .instances import Instance, Mesh, check_instances, check_transforms, nested_scene
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
 from .rays import check_rays
@@ -161,8 +161,8 @@ class RayCaster:
         """
         self.engine.cast_bodies(bodies, nearest)
 
-    def move(self, number: int, transform: ArrayLike) -> None:
-        """Set another transform of an instance, for all later casts.
+    def move(self, number: int | ArrayLike, transform: ArrayLike) -> None:
+        """Set other transforms of instances, for all later casts.
 
         Only the tree over the instances is built anew, once for all moves before a cast. The
         results equal the results of a new caster. No cast of this caster may be under way.
@@ -170,29 +170,40 @@ class RayCaster:
         Parameters
         ----------
         number
-            Number of the instance.
+            Number of the instance, or numbers (k,) without duplicates.
         transform
-            (3, 4) or (4, 4), as for `Instance`.
+            (3, 4) or (4, 4), as for `Instance`; for k instances (k, 3, 4) or (k, 4, 4).
 
         Raises
         ------
         IndexError
-            If there is no such instance.
+            If there is no such instance; no instance has moved then.
         ValueError
-            If the transform is invalid, or the caster has a single mesh without a transform.
+            If a transform is invalid, or the caster has a single mesh without a transform; no
+            instance has moved then.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        >>> instances = [Instance(mesh), Instance(mesh)]
+        >>> caster = RayCaster.from_instances(instances, backend="numpy")
+        >>> caster.move([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
         """
-        if not 0 <= index(number) < self.instance_count:
+        single = np.ndim(number) == 0
+        numbers = np.asarray([index(number)] if single else number)  # type: ignore[arg-type]
+        outside = numbers[(numbers < 0) | (numbers >= self.instance_count)]
+        if len(outside):
             raise IndexError(
-                f"There is no instance {number}: this caster has {self.instance_count}, from 0."
+                f"There is no instance {outside[0]}: this caster has {self.instance_count}, from 0."
             )
         if not self._scene.nested:
             raise ValueError(
                 "A single mesh without a transform stays in its place: make the caster with "
                 "RayCaster.from_instances([Instance(mesh, numpy.eye(4))]) to move it."
             )
-        matrix = check_transform(index(number), transform)
+        matrices = check_transforms(numbers, np.asarray(transform)[None] if single else transform)
         with self._lock:
-            self._transforms[index(number)] = matrix
+            self._transforms[numbers] = matrices
             self._moved = True
 
     @property

@@ -191,10 +191,16 @@ class EmbreeInstances(EmbreeScene):
         """Set the transforms of the instances to the transforms of a scene, and build the tree."""
         embree = load_library()
         transforms = scene.to_scene()
-        for number in np.flatnonzero((transforms != self._transforms).any(axis=(1, 2))).tolist():
-            geometry = embree.rtcGetGeometry(self.address, number)
-            matrix = np.ascontiguousarray(transforms[number], np.float32)
-            embree.rtcSetGeometryTransform(geometry, 0, _FLOAT3X4_ROWS, matrix.ctypes.data)
-            embree.rtcCommitGeometry(geometry)
+        changed = np.flatnonzero((transforms != self._transforms).any(axis=(1, 2)))
+        matrices = np.ascontiguousarray(transforms[changed], np.float32)
+        address = matrices.ctypes.data
+        geometry_of = embree.rtcGetGeometry
+        set_transform = embree.rtcSetGeometryTransform
+        commit = embree.rtcCommitGeometry
+        for number in changed.tolist():
+            geometry = geometry_of(self.address, number)
+            set_transform(geometry, 0, _FLOAT3X4_ROWS, address)
+            commit(geometry)
+            address += matrices.strides[0]
         self._transforms = transforms
         self._commit(f"{len(transforms):,} instances")

@@ -61,6 +61,17 @@ def test_a_robot_reaches_its_goal_by_its_ranges(capsys):
     assert 340 < steps < 400 and 68 < reward < 74 and left < 1
 
 
+def test_a_robot_of_mujoco_scans_while_balls_fall(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "mujoco_lidar.py"), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5 and all(
+        re.fullmatch(r"0\.\d+ s: 28,.* on balls", line) for line in lines
+    )
+    assert (tmp_path / "balls.ply").exists()
+
+
 def test_a_node_publishes_what_a_bag_holds(tmp_path):
     node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
     scene = Scene.seed()

@@ -154,9 +154,11 @@ def test_columns_after_instances_have_moved(scene, scenes, backend):
     survey = replace(MADE["beams with offsets"], materials=MATERIALS)
     rigs = [Rig(scenes[scene], survey, name) for name in (backend, "numpy")]
     cast_between(rigs[0], survey, (0, 1))  # its tables are on the device
-    owner = int(scenes[scene].instances.owner[0])
+    owners = scenes[scene].instances.owner[:1]
     for yaw in (40, 80):
-        rigs = [rig.moved(owner, Pose((1.0, 2.0, 0.1), yaw)) for rig in rigs]
+        pose = Pose((1.0, 2.0, 0.1), yaw)
+        positions = np.array([pose.position])
+        rigs = [rig.moved(owners, positions, pose.rotation_matrix[None]) for rig in rigs]
         got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
         assert got == want
     assert isinstance(next(rigs[0].cast(0, 1)), DevicePoints)

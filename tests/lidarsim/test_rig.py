@@ -17,7 +17,7 @@ from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator import scene_caster
+from lidarsim.simulator import static_bodies
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from poolpart.task_context import WorkerLeft
@@ -169,7 +169,7 @@ def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch
             built.append(len(faces))
             super().__init__(vertices, faces, **options)
 
-    monkeypatch.setattr(scene_caster, "RayCaster", Counted)
+    monkeypatch.setattr(static_bodies, "RayCaster", Counted)
     scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
     car = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 2], [[6, -3, 0.5], [6, 7, 0.5]]))
     surveys = [survey(poses=TURNED), survey(trajectory=CART)]

@@ -349,6 +349,75 @@ def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend)
     assert same(moved.sweep(HERE, number=2), new.sweep(HERE, number=2))
 
 
+BODIES = ["Crate", "Car", "Grate.2", "Van"]
+
+
+def matrices_of(*poses):
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :3, :3] = [pose.rotation_matrix for pose in poses]
+    matrices[:, :3, 3] = [pose.position for pose in poses]
+    return matrices
+
+
+def with_bodies(scene, **options):
+    van = Actor(box("Van", (5, 2, 2)), Track([0, 9], [[9, 9, 0], [9, 0, 0]]))
+    bodies = with_copies(scene).with_actors([CAR, van])
+    return Scanner(bodies, GRID, columns=COLUMNS, **options)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
+def test_bodies_that_move_together_give_the_bytes_of_bodies_that_move_one_by_one(
+    scene, physics, backend
+):
+    """Instances and actors in one call, as matrices, poses, and positions."""
+    steps = [
+        [Pose((6, -2, 0.5), 70, 5), Pose((4, 3, 0), 30), Pose((-4, -3, 1), 20), Pose((-7, 1, 0))],
+        [Pose((5, -1, 0.2), 170), Pose((4, -2, 0), 10, 3), Pose((-5, 0, 1)), Pose((0, 6, 0), 90)],
+    ]
+    together, singly, listed = scanners = [
+        with_bodies(scene, backend=backend, **physics) for _ in range(3)
+    ]
+    for poses in steps:
+        together.move(BODIES, matrices_of(*poses))
+        listed.move(BODIES, poses)
+        for name, pose, matrix in zip(BODIES, poses, matrices_of(*poses), strict=True):
+            singly.move(name, matrix if name in ("Van", "Crate") else pose)
+        clouds = [scanner.sweep(HERE, number=2) for scanner in scanners]
+        assert {7, 9, 10, 11} <= {*clouds[0].object.tolist()}
+        assert same(clouds[0], clouds[1]) and same(clouds[0], clouds[2])
+        images = [scanner.ranges([HERE, (0, 0, 1)], number=2) for scanner in scanners]
+        assert np.array_equal(images[0], images[1]) and np.array_equal(images[0], images[2])
+    together.move(["Van", "Crate"], [(3, 3, 0), (7, 0, 0)])
+    singly.move("Van", (3, 3, 0))
+    singly.move("Crate", (7, 0, 0))
+    assert same(together.sweep(HERE, number=3), singly.sweep(HERE, number=3))
+
+
+def test_beams_meet_bodies_where_they_are_when_the_beams_are_fired(scene):
+    """A wall that flees at 20 m/s, and one that stands; against the poses of a `Track`."""
+    walls = [Actor(box(name, (0.1, 60, 40))) for name in ("Ahead", "Behind")]
+    scanner = Scanner(scene.with_actors(walls), VLP16, columns=["time", "range"], precision_m=1e-5)
+    times_s = [0, 0.05, 0.11]
+    matrices = np.tile(np.eye(4), (2, 3, 1, 1))
+    matrices[0, :, :3, 3] = [[4, 0, -20], [5, 0, -20], [6.2, 0, -20]]
+    matrices[1, :, :3, 3] = [-3, 0, -20]
+    scanner.move(["Ahead", "Behind"], matrices, times_s=times_s)
+    cloud = scanner.sweep((0, 0, 1))
+    x = cloud.positions[:, 0]
+    first = len(scene.names)
+    on_ahead = (cloud.object == first) & (np.abs(cloud.positions[:, 1]) < 25)
+    position = 4 - 0.05 + 20 * cloud.time[on_ahead] / 1e9
+    assert on_ahead.sum() > 3000 and np.ptp(position) > 0.5
+    assert np.abs(x[on_ahead] - position).max() < 2e-5
+    assert np.abs(x[cloud.object == first + 1] + 2.95).max() < 2e-5
+    track = Track(times_s, matrices[0, :, :3, 3], np.tile([0, 0, 0, 1.0], (3, 1)))
+    scanner.move(["Ahead", "Behind"], [track, (-3, 0, -20)])
+    assert same(scanner.sweep((0, 0, 1), number=0), cloud)
+    with pytest.raises(LidarError, match=r"Actor 'Ahead': The trajectory goes from 0 to 0\.11 s"):
+        scanner.sweep((0, 0, 1), number=1)
+
+
 @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
 def test_a_pickled_scanner_gives_the_same_bytes(scene, dumps):
     """Also of what was moved, and with the random numbers that are next."""
@@ -449,6 +518,27 @@ WRONG = {
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
     "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor or instance 'Cart'. Did you mean"),
     "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the standing scene"),
+    "some name": (lambda s: s.move(["Car", "Cat"], [(0, 0, 1)] * 2), "no actor or instance 'Cat'"),
+    "twice": (lambda s: s.move(["Car", "Car"], [(0, 0, 1)] * 2), "'Car' is among the names twice"),
+    "count": (lambda s: s.move(["Car"], [(0, 0, 1)] * 2), "There are 1 names and 2 poses"),
+    "deformed": (lambda s: s.move("Car", np.diag([1, 2, 1, 1])), "Matrix 0 of a pose deforms"),
+    "no matrix": (lambda s: s.move(["Car"], np.ones((1, 4, 4))), "last row of each matrix"),
+    "no pose": (lambda s: s.move(["Car"], np.ones((1, 2))), "of the shape (1, 2)"),
+    "not finite": (lambda s: s.move(["Car"], [(0, np.inf, 1)]), "Pose 0 is not finite"),
+    "no times": (
+        lambda s: s.move("Car", np.eye(4), times_s=[0, 1]),
+        "must be matrices (k, samples, 4, 4)",
+    ),
+    "times": (
+        lambda s: s.move("Car", np.tile(np.eye(4), (2, 1, 1)), times_s=[1, 1]),
+        "times must ascend",
+    ),
+    "standing": (
+        lambda s: with_bodies(Scene.seed(), backend="numpy").move(
+            ["Car", "Crate"], np.tile(np.eye(4), (2, 2, 1, 1)), times_s=[0, 1]
+        ),
+        "'Crate' is a SceneInstance, which stands still during a sweep",
+    ),
     "pose": (lambda s: s.sweep("here"), "pose is 'here'"),
     "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),
     "mixed": (lambda s: s.ranges([HERE, "here"]), "a pose is 'here'"),

@@ -174,6 +174,15 @@ def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest
     after = caster.cast(origins, directions)
     assert (after.instance != before.instance).any()
     same(after, RayCaster.from_instances(instances, backend).cast(origins, directions))
+    together = RayCaster.from_instances(forest("uneven", 8)[0], backend)
+    together.move([3, 7, 0], np.stack([shift(1, 2, 3), np.eye(4)[:3], shift(90, 50, -40)]))
+    same(together.cast(origins, directions), after)
+    with pytest.raises(IndexError, match="instance 41"):
+        caster.move([2, 41], [np.eye(4)] * 2)
+    with pytest.raises(ValueError, match="instance 6 is singular"):
+        caster.move([2, 6], [np.eye(4), np.diag([1, 1, 0, 1])])
+    with pytest.raises(ValueError, match="must be 2 transforms"):
+        caster.move([2, 6], np.eye(4)[None])
     with pytest.raises(IndexError, match="instance 40"):
         caster.move(40, np.eye(4))
     with pytest.raises(ValueError, match="instance 5 is singular"):

@@ -104,3 +104,11 @@ def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
     points = {name: rows[name]["points"] for name in ("all points", "every fifth point")}
     assert points["every fifth point"] == pytest.approx(points["all points"] / 5, rel=0.01)
     assert all(rows[name]["grays_s"] > 0 for name in points)
+
+
+def test_mujoco(capsys):
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    from benchmarks import mujoco
+
+    assert mujoco.main(["--quick"]) == 0
+    assert "| 4 quadrupeds | 23,040 |" in capsys.readouterr().out

@@ -221,7 +221,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarsim.simulator.scene_caster.RayCaster",
+            "lidarsim.simulator.static_bodies.RayCaster",
             raise_at(None),
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),

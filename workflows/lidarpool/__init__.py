@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.table import Column
+    from lidarsim.follower import Follower
+    from lidarsim.mujoco import MujocoScanner
     from lidarsim.scene.actors import Actor
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
@@ -64,12 +66,14 @@ __all__ = [
     "Comparison",
     "Fault",
     "Fit",
+    "Follower",
     "Gnss",
     "Imu",
     "Job",
     "LidarError",
     "Material",
     "Mounted",
+    "MujocoScanner",
     "Navigation",
     "Noise",
     "Optics",

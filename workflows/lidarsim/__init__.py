@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from .base.errors import LidarError
     from .columns.cloud import Cloud
     from .columns.table import Column
+    from .follower import Follower
+    from .mujoco import MujocoScanner
     from .scene.actors import Actor
     from .scene.scene import Scene
     from .scene.scene_instances import SceneInstance
@@ -45,11 +47,13 @@ __all__ = [
     "Cloud",
     "Column",
     "Fault",
+    "Follower",
     "Gnss",
     "Imu",
     "LidarError",
     "Material",
     "Mounted",
+    "MujocoScanner",
     "Navigation",
     "Noise",
     "Optics",
@@ -75,6 +79,8 @@ _MODULES = {
     "base.errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
+    "follower": ("Follower",),
+    "mujoco": ("MujocoScanner",),
     "scene.actors": ("Actor",),
     "scene.scene": ("Scene",),
     "scene.scene_instances": ("SceneInstance",),

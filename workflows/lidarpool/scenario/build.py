@@ -30,6 +30,7 @@ from lidarsim.sensor.materials import (
 from lidarsim.sensor.survey import CloudOptions
 from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
+from lidarsim.simulator.static_bodies import warn_of_reach
 from lidarsim.simulator.surfaces import warn_of_grey
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -131,6 +132,7 @@ class Job:
                 f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}."
             )
         warn_of_grey(scene, survey)
+        warn_of_reach(scene, survey)
 
     @property
     def trials(self) -> int:

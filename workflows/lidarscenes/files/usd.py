@@ -49,7 +49,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
     placed_nodes,
 )
-from lidarsim.scene.scene_instances import SceneInstance, scale_of
+from lidarsim.scene.scene_instances import SceneInstance, scales_of
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
@@ -267,7 +267,7 @@ def _content(
         matrices[number] = np.eye(4)
         scale = matrices[number, :3, :3]
         poses = motion[:, 1:].reshape(-1, 3, 4)
-        scale[:] = scale_of(poses[0, :, :3])
+        scale[:] = scales_of(poses[:1, :, :3])[0]
         part = placed_content(placed_nodes([number], node, stem))
         content.skipped += part.skipped
         if part.meshes:

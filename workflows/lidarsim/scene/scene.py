@@ -18,7 +18,7 @@ from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import plural
-from ..sensor import Pose, Track
+from ..sensor import Track
 from ..sensor.materials import SurfaceKinds
 from .actors import Actor
 from .colours import GREY, Colours, are_indices, join_colours
@@ -291,17 +291,17 @@ class Scene:
         object.__setattr__(scene, "actors", actors)
         return scene
 
-    def moved(self, owner: int, pose: Pose) -> Scene:
-        """Return the same scene with the instances of an object at another pose.
+    def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Scene:
+        """Return the same scene with instances `rows` (m,) at other poses.
 
-        `owner` is the object's index in `names`. The pose is the pose of the mesh's frame in local
-        coordinates; the instances keep their scale.
+        A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), metres, and
+        rotations (m, 3, 3). The instances keep their scales.
         """
         assert self.instances is not None
         scene = copy(self)
         for cached in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(cached, None)
-        moved = self.instances.moved(owner, np.array(pose.position), pose.rotation_matrix)
+        moved = self.instances.moved(rows, positions, rotations)
         object.__setattr__(scene, "instances", moved)
         return scene
 

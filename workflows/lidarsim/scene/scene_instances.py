@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Floats, Floats32, Indices, Ints, Ints32
+from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32
 from ..base.elementary import decade
 from ..base.errors import LidarError
 from ..base.validation import checked_fields
@@ -168,9 +168,29 @@ class Instances:
     part: Indices
     transforms: Floats
     owner: Ints32
+    # Bounds before some instances moved, (n, 2, 3), and whether each instance has moved since, (n,)
+    _earlier_bounds: tuple[Floats, Bools] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
         return len(self.part)
+
+    @cached_property
+    def _by_owner(self) -> tuple[Indices, Ints32]:
+        """Rows of the instances by their objects, (n,), and the objects in this order, (n,)."""
+        order = np.argsort(self.owner, kind="stable")
+        return order, self.owner[order]
+
+    def rows_of(self, owners: Integers) -> tuple[Indices, Indices]:
+        """Return the rows (m,) of the instances of objects (k,), and the index in `owners` of each.
+
+        Rows are in the order of `owners`, which has no duplicates.
+        """
+        order, sorted_owners = self._by_owner
+        starts = np.searchsorted(sorted_owners, owners, "left")
+        counts = np.searchsorted(sorted_owners, owners, "right") - starts
+        index = np.repeat(np.arange(len(owners)), counts)
+        offset = np.arange(len(index)) - (np.cumsum(counts) - counts)[index]
+        return order[starts[index] + offset], index
 
     @cached_property
     def sizes(self) -> Ints:
@@ -207,6 +227,17 @@ class Instances:
     @cached_property
     def bounds(self) -> Floats:
         """Lowest and highest corner of each instance, local, metres: (n, 2, 3)."""
+        if self._earlier_bounds is not None:
+            earlier, changed = self._earlier_bounds
+            corners = earlier.copy()
+            rows = np.flatnonzero(changed)
+            corners[rows] = replace(
+                self,
+                part=self.part[rows],
+                transforms=self.transforms[rows],
+                owner=self.owner[rows],
+            ).bounds
+            return corners
         corners = np.empty((len(self), 2, 3))
         for rows, points in self.placed():
             corners[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
@@ -228,39 +259,71 @@ class Instances:
         vars(instances)["bounds"] = bounds  # shifted, since computing bounds again takes time
         return instances
 
-    def moved(self, owner: int, position: Floats, rotation: Floats) -> Instances:
-        """Return the instances with all instances of the object `owner` at another pose.
+    @cached_property
+    def _scales(self) -> _Scales:
+        """Scales of instances that have moved, shared by all copies: moves keep the scales."""
+        return _Scales(np.zeros((len(self), 3, 3)), np.zeros(len(self), np.bool_))
 
-        The moved instances keep their scale. LidarError if the position is too far from zero.
+    def _scales_of(self, rows: Indices) -> Floats:
+        """Return the scales (m, 3, 3) of instances `rows` (m,)."""
+        scales, is_known = self._scales
+        unknown = rows[~is_known[rows]]
+        if len(unknown):
+            scales[unknown] = scales_of(self.transforms[unknown, :, :3])
+            is_known[unknown] = True
+        return np.asarray(scales[rows])
+
+    def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Instances:
+        """Return the instances with instances `rows` (m,) at other poses.
+
+        Poses are positions (m, 3) and rotations (m, 3, 3). The moved instances keep their scales.
+        Rows have no duplicates. LidarError if a position is too far from zero.
         """
-        check_coordinate(position)
-        rows = np.flatnonzero(self.owner == owner)
+        if not (np.abs(positions) <= MAX_COORDINATE_M).all():
+            for position in positions:
+                check_coordinate(position)
+        linear = matmul(rotations, self._scales_of(rows))
         transforms = self.transforms.copy()
-        for row in rows:
-            transforms[row] = np.column_stack(
-                [matmul(rotation, scale_of(transforms[row, :, :3])), position]
-            )
+        transforms[rows] = np.concatenate([linear, positions[:, :, None]], axis=2)
         instances = copy(self)
         object.__setattr__(instances, "transforms", transforms)
-        if "bounds" in vars(self):  # computing the bounds of all instances takes long
-            moved_rows = Instances(self.parts, self.part[rows], transforms[rows], self.owner[rows])
-            bounds = vars(instances)["bounds"] = self.bounds.copy()
-            bounds[rows] = moved_rows.bounds
+        earlier_bounds = self._earlier_bounds
+        # Computing bounds takes long: only those of moved instances are computed again, on demand.
+        bounds = vars(instances).pop("bounds", None)
+        if bounds is not None:
+            earlier_bounds = bounds, np.zeros(len(self), np.bool_)
+        if earlier_bounds is not None:
+            bounds, changed = earlier_bounds
+            changed = changed.copy()
+            changed[rows] = True
+            earlier_bounds = bounds, changed
+        object.__setattr__(instances, "_earlier_bounds", earlier_bounds)
         return instances
 
 
-def scale_of(matrix: Floats) -> Floats:
-    """Return the scaling and mirroring (3, 3) of a matrix (3, 3), by polar decomposition.
+class _Scales(NamedTuple):
+    """Scales of instances, as far as they are known."""
+
+    scales: Floats  # (n, 3, 3)
+    is_known: Bools  # (n,)
+
+
+def scales_of(matrices: Floats) -> Floats:
+    """Return the scalings and mirrorings (m, 3, 3) of matrices (m, 3, 3), by polar decomposition.
 
     The rotation is found by Newton's method (Higham 1986). The result is rounded to 12 digits, so
     that a factor of 1.4 stays 1.4 however often an instance is moved.
     """
-    rotation = matrix
+    rotations = matrices
     for _ in range(_MAX_ITERATIONS):
-        previous = rotation
-        rotation = (rotation + inverse(rotation).T) / 2
-        if (rotation == previous).all():
+        previous = rotations
+        rotations = (rotations + inverse(rotations).transpose(0, 2, 1)) / 2
+        if (rotations == previous).all():
             break
-    scale = matmul(rotation.T, matrix)
-    scale = (scale + scale.T) / 2 * np.sign(determinant(rotation))
-    return np.asarray(np.round(scale, 11 - decade(float(np.abs(scale).max()))) + 0.0)
+    scales = matmul(rotations.transpose(0, 2, 1), matrices)
+    scales = (
+        (scales + scales.transpose(0, 2, 1)) / 2 * np.sign(determinant(rotations))[:, None, None]
+    )
+    digits = [11 - decade(largest) for largest in np.abs(scales).max(axis=(1, 2)).tolist()]
+    rounded = [np.round(scale, count) for scale, count in zip(scales, digits, strict=True)]
+    return np.array(rounded) + 0.0

@@ -9,7 +9,7 @@ from .optics import Optics, Returns
 from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
 from .survey import Mounted, ScanSpec, Survey
-from .trajectory import Pose, Stations, Track, Trajectory
+from .trajectory import Pose, StaticPose, Stations, Track, Trajectory
 from .trajectory_files import load_trajectory
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "ScanSpec",
     "Sensor",
     "Spin",
+    "StaticPose",
     "Stations",
     "Survey",
     "Track",

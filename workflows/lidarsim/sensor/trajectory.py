@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
@@ -288,6 +289,37 @@ class Stations:
 
 
 @dataclass(frozen=True, eq=False)
+class StaticPose:
+    """A trajectory that stays at one pose, which is given by a matrix and not by angles.
+
+    Attributes
+    ----------
+    position
+        (3,), metres.
+    rotation
+        (3, 3): from the frame of the carrier to the scene frame.
+    """
+
+    position: Floats
+    rotation: Floats
+    stations: ClassVar[int] = 1
+    moves: ClassVar[bool] = False
+    duration_ns: ClassVar[float] = np.inf
+
+    def pose(self, station: int, time_ns: float = 0.0) -> Pose:
+        """Return the pose, at any time."""
+        return Pose.from_rotation(self.position, self.rotation)
+
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
+        """Return the pose for each of k times: positions (k, 3), rotations (k, 3, 3)."""
+        count = len(times_ns)
+        return (
+            np.broadcast_to(self.position, (count, 3)),
+            np.broadcast_to(self.rotation, (count, 3, 3)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 @checked_fields
 class Track:
     """Poses at times, with a straight or smooth path in between: a single station.
@@ -340,6 +372,35 @@ class Track:
         self._set_poses()
         self._set_span()
 
+    @classmethod
+    def from_matrices(
+        cls, times_s: Floats, matrices: Floats, beyond: Literal["refuse", "hold"] = "refuse"
+    ) -> Sequence[Track]:
+        """Return the straight tracks of k bodies, whose poses are computed all at once.
+
+        Time 0 of the tracks is 0 by the clock of `times_s`, also if that is outside the times.
+
+        Parameters
+        ----------
+        times_s
+            (s,): times of the poses of all tracks, seconds, ascending; at least two.
+        matrices
+            (k, s, 4, 4): rigid transforms, which are not checked.
+        beyond
+            As of `Track`.
+
+        Raises
+        ------
+        LidarError
+            If the times are too few, or do not ascend.
+        """
+        times = np.asarray(times_s, np.float64)
+        if len(times) < 2:
+            raise LidarError(f"A trajectory needs two poses at least; there are {len(times)}.")
+        _check_times(times)
+        batch = TrackBatch.from_matrices(times, matrices, beyond)
+        return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
+
     def _set_poses(self) -> None:
         """Check and freeze the times, positions and quaternions; compute missing quaternions."""
         times = as_array("times_s", self.times_s).copy()
@@ -349,14 +410,9 @@ class Track:
                 f"A trajectory needs two poses at least, with x, y and z each; there are "
                 f"{times.size} times and positions of {positions.shape}."
             )
-        _check_poses(~np.isfinite(times), "the time of pose {} is not finite")
         finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
         _check_poses(~finite, "the position of pose {} is not finite")
-        not_ascending = np.append(False, np.diff(times) <= 0)
-        _check_poses(
-            not_ascending,
-            "times must ascend, and that of pose {} does not come after the one before",
-        )
+        _check_times(times)
         if self.quaternions is None:
             if self.smooth:
                 slopes = knots_of(times, positions.T)[1]
@@ -508,16 +564,12 @@ class Track:
         """Coefficients of poses on straight lines."""
         quaternions = self.quaternions
         assert quaternions is not None  # set above
-        velocities = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
-        axes, rates = _rotations_between(quaternions, self.times_s)
-        rotations = matrices(quaternions[:-1])
-        spins = applied(rotations, axes * rates)
-        return Segments(
-            starts=np.ascontiguousarray(self.positions[:-1].T),
-            velocities=np.ascontiguousarray(velocities.T),
-            rotation_terms=_rotation_terms(rotations, axes),
-            rates=rates[:, 0],
-            spins=np.ascontiguousarray(spins.T),
+        return _segments(
+            np.diff(self.times_s),
+            self.positions[:-1],
+            self.positions[1:],
+            quaternions[:-1],
+            quaternions[1:],
         )
 
 
@@ -531,6 +583,116 @@ class Segments(NamedTuple):
     rotation_terms: Floats
     rates: Floats  # (s,): of that angle, rad/s
     spins: Floats  # (3, s): angular velocities in the scene frame, rad/s
+
+
+def _segments(
+    durations_s: Floats, starts: Floats, stops: Floats, first: Floats, last: Floats
+) -> Segments:
+    """Return segments (s,) from positions (s, 3) and quaternions (s, 4) to the next.
+
+    `starts` and `first` are those at the start of each segment, `stops` and `last` at its end;
+    durations (s,) are seconds.
+    """
+    velocities = (stops - starts) / durations_s[:, None]
+    axes, rates = _rotations_between(first, last, durations_s)
+    rotations = matrices(first)
+    spins = applied(rotations, axes * rates)
+    return Segments(
+        starts=np.ascontiguousarray(starts.T),
+        velocities=np.ascontiguousarray(velocities.T),
+        rotation_terms=_rotation_terms(rotations, axes),
+        rates=rates[:, 0],
+        spins=np.ascontiguousarray(spins.T),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackBatch:
+    """Straight tracks of k bodies with the same times, computed all at once.
+
+    Attributes
+    ----------
+    times_s
+        (s,): times of the poses, seconds; time 0 of the tracks is 0.
+    positions
+        (k, s, 3): metres.
+    quaternions
+        (k, s, 4)
+    beyond
+        As of `Track`.
+    segments
+        Coefficients of k * (s - 1) segments, track by track.
+    """
+
+    times_s: Floats
+    positions: Floats
+    quaternions: Floats
+    beyond: Beyond
+    segments: Segments
+
+    @classmethod
+    def from_matrices(cls, times_s: Floats, matrices: Floats, beyond: Beyond) -> TrackBatch:
+        """Return the tracks of rigid transforms (k, s, 4, 4) at times (s,)."""
+        count, samples = matrices.shape[:2]
+        quaternions = quaternions_of(matrices[..., :3, :3].reshape(-1, 3, 3))
+        rows = quaternions.reshape(count, samples, 4)
+        positions = np.ascontiguousarray(matrices[..., :3, 3])
+        segments = _segments(
+            np.tile(np.diff(times_s), count),
+            positions[:, :-1].reshape(-1, 3),
+            positions[:, 1:].reshape(-1, 3),
+            rows[:, :-1].reshape(-1, 4),
+            rows[:, 1:].reshape(-1, 4),
+        )
+        for array in (positions, rows):
+            array.flags.writeable = False
+        return cls(times_s, positions, rows, beyond, segments)
+
+    def segments_of(self, numbers: ArrayLike) -> Segments:
+        """Return the segments of tracks `numbers` (n,), track by track."""
+        steps = len(self.times_s) - 1
+        columns = (np.asarray(numbers)[:, None] * steps + np.arange(steps)).reshape(-1)
+        return Segments(*(np.ascontiguousarray(part[..., columns]) for part in self.segments))
+
+
+class _BatchTrack(Track):
+    """A track of a batch, whose segments are looked up when they are needed.
+
+    Its actor is always in the scene.
+    """
+
+    batch: TrackBatch
+    number: int  # of the track in the batch
+
+    @classmethod
+    def of_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
+        """Return a track of a batch."""
+        track = object.__new__(cls)
+        vars(track).update(
+            times_s=batch.times_s,
+            positions=batch.positions[number],
+            quaternions=batch.quaternions[number],
+            smooth=False,
+            start_s=0.0,
+            duration_s=float(batch.times_s[-1]),
+            beyond=batch.beyond,
+            batch=batch,
+            number=number,
+        )
+        return track
+
+    @cached_property
+    def segments(self) -> Segments:
+        """Coefficients of poses on straight lines."""
+        return self.batch.segments_of([self.number])
+
+
+def batch_of(trajectory: Trajectory) -> TrackBatch | None:
+    """Return the batch of a track; None for other trajectories.
+
+    Actors on tracks of batches are always in the scene.
+    """
+    return trajectory.batch if isinstance(trajectory, _BatchTrack) else None
 
 
 class _SegmentTimes(NamedTuple):
@@ -552,18 +714,18 @@ def _rotation_terms(rotations: Floats, axes: Floats) -> Floats:
     return np.ascontiguousarray(terms.transpose(0, 2, 1))
 
 
-def _rotations_between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
-    """Return the axes (s, 3) and rates (s, 1), rad/s, of rotations from each pose to the next.
+def _rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
+    """Return the axes (s, 3) and rates (s, 1), rad/s, of rotations between quaternions (s, 4).
 
-    Axes are in the frame of the first of the two poses.
+    Axes are in the frame of the first pose. A rotation takes its duration (s,), seconds.
     """
     # conjugate(p) q
-    (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (quaternions[:-1], quaternions[1:]))
+    (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (first, last))
     axis = pw * q - qw * p - np.cross(p, q)
     cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
     axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
     sine = length(axis)[:, None]
-    rates = 2 * arctan2(sine, np.abs(cosine)) / np.diff(times_s)[:, None]
+    rates = 2 * arctan2(sine, np.abs(cosine)) / durations_s[:, None]
     return axis / np.where(sine > 0, sine, 1), rates
 
 
@@ -613,6 +775,15 @@ def _travel_quaternions(slopes: Floats) -> Floats:
     last = moving[np.maximum(np.searchsorted(moving, np.arange(len(x)), "right") - 1, 0)]
     half = arctan2(y[last], x[last]) / 2
     return np.stack([np.zeros_like(half), np.zeros_like(half), *sin_cos(half)], axis=1)
+
+
+def _check_times(times_s: Floats) -> None:
+    """Check that times (k,) are finite and ascend; LidarError if not."""
+    _check_poses(~np.isfinite(times_s), "the time of pose {} is not finite")
+    _check_poses(
+        np.append(False, np.diff(times_s) <= 0),
+        "times must ascend, and that of pose {} does not come after the one before",
+    )
 
 
 def _check_poses(bad: Bools, words: str) -> None:

@@ -2,50 +2,101 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..base.arrays import Floats, Indices, Integers, Ints, owned
 from ..scene.actors import Actor
 from ..sensor import Track, Trajectory
-from ..sensor.trajectory import Stations, presence_ns
+from ..sensor.trajectory import ALWAYS, StaticPose, Stations, batch_of, presence_ns
 
 if TYPE_CHECKING:
     from .surface_loops import TrackTable
 
 
-class _StraightTrack(NamedTuple):
-    """A track of s straight segments; poses of an actor that stands are a single segment."""
+class _StraightTracks(NamedTuple):
+    """Tracks of straight segments of n actors; an actor that stands has a single segment."""
 
-    times_s: Floats  # (s + 1,): start of each segment, and end of the last, by the track's clock
-    start_s: float  # time of the track's clock at the survey's start, seconds
-    slack_s: float  # how far outside `times_s` poses are defined, seconds; inf for any time
-    segments: tuple[Floats, ...]  # the fields of `trajectory.Segments`; the first four are used
+    actors: Sequence[int]  # (n,): numbers of the actors
+    counts: Ints  # (n,): number of segments of each track
+    limits: Floats  # (n, 4): see `TrackTable`
+    times_s: Floats  # (s,): start of each segment, by the track's clock, seconds
+    segments: Sequence[Floats]  # the fields of `trajectory.Segments`; the first four are used
 
 
-def _straight_track(trajectory: Trajectory) -> _StraightTrack | None:
-    """Return the straight track of a `Track` or of the first of `Stations`.
+def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTracks]:
+    """Yield the straight tracks of trajectories, those of a batch and those that stand together.
 
-    None for smooth tracks and for trajectories of other classes.
+    Smooth tracks and trajectories of other classes have none.
     """
-    if isinstance(trajectory, Track) and not trajectory.smooth:
-        return _StraightTrack(
-            trajectory.times_s,
-            float(trajectory.start_s or 0),
-            trajectory.slack_s,
-            trajectory.segments,
-        )
-    if not isinstance(trajectory, Stations):
-        return None
-    (position,), rotations = trajectory.poses(0, np.zeros(1))
-    rotation = np.zeros((3, 9, 1))
-    rotation[0] = np.eye(3).reshape(9, 1) if rotations is None else rotations.reshape(9, 1)
-    segments = position[:, None], np.zeros((3, 1)), rotation, np.zeros(1)
-    return _StraightTrack(np.zeros(2), 0.0, np.inf, segments)
+    static: list[int] = []
+    batches: dict[int, list[int]] = {}  # {id of a batch: numbers of actors}
+    for actor, trajectory in enumerate(trajectories):
+        batch = batch_of(trajectory)
+        if batch is not None:
+            batches.setdefault(id(batch), []).append(actor)
+        elif isinstance(trajectory, Stations | StaticPose):
+            static.append(actor)
+        elif isinstance(trajectory, Track) and not trajectory.smooth:
+            yield _single_track(actor, trajectory)
+    for actors in batches.values():
+        yield _batch_tracks(actors, [trajectories[actor] for actor in actors])
+    if static:
+        yield _static_tracks(static, [trajectories[actor] for actor in static])
+
+
+def _limits_of(track: Track) -> tuple[float, float, float, float]:
+    """Return a row of `TrackTable.limits`."""
+    first_s, last_s = track.times_s[[0, -1]].tolist()
+    return float(track.start_s or 0), first_s, last_s, track.slack_s
+
+
+def _single_track(actor: int, track: Track) -> _StraightTracks:
+    """Return the straight track of an actor."""
+    counts = np.array([len(track.times_s) - 1], np.int64)
+    limits = np.array([_limits_of(track)])
+    return _StraightTracks([actor], counts, limits, track.times_s[:-1], track.segments)
+
+
+def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
+    """Return the straight tracks of actors whose tracks are of one batch."""
+    batch = tracks[0].batch
+    steps = len(batch.times_s) - 1
+    return _StraightTracks(
+        actors,
+        np.full(len(actors), steps, np.int64),
+        np.tile(_limits_of(tracks[0]), (len(actors), 1)),
+        np.tile(batch.times_s[:-1], len(actors)),
+        batch.segments_of([track.number for track in tracks]),
+    )
+
+
+def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightTracks:
+    """Return the tracks of actors that stand: of the first of `Stations`, or of a `StaticPose`."""
+    count = len(actors)
+    positions = np.empty((count, 3))
+    rotations = np.empty((count, 3, 3))
+    for row, trajectory in enumerate(trajectories):
+        if isinstance(trajectory, StaticPose):
+            positions[row] = trajectory.position
+            rotations[row] = trajectory.rotation
+        else:
+            pose = trajectory.pose(0)
+            positions[row] = pose.position
+            rotations[row] = pose.rotation_matrix
+    terms = np.zeros((3, 9, count))
+    terms[0] = rotations.reshape(-1, 9).T
+    return _StraightTracks(
+        actors,
+        np.ones(count, np.int64),
+        np.tile([0.0, 0.0, 0.0, np.inf], (count, 1)),
+        np.zeros(count),
+        (positions.T, np.zeros((3, count)), terms, np.zeros(count)),
+    )
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
@@ -89,7 +140,10 @@ class ActorTrajectories(tuple[Trajectory, ...]):
     @cached_property
     def presence_ns(self) -> Floats:
         """First and last time of each of w actors in the scene, nanoseconds: (w, 2)."""
-        presence = [presence_ns(trajectory) for trajectory in self]
+        presence = [
+            presence_ns(trajectory) if batch_of(trajectory) is None else ALWAYS
+            for trajectory in self
+        ]
         return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
@@ -156,27 +210,29 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         """Straight tracks among the trajectories, for compiled loops."""
         from .surface_loops import TrackTable
 
-        straight_tracks = [_straight_track(trajectory) for trajectory in self]
-        straight = np.array([track is not None for track in straight_tracks], np.bool_)
-        tracks = [track for track in straight_tracks if track is not None]
-        counts = np.array([len(track.times_s) - 1 for track in tracks], np.int64)
+        tracks = [_no_tracks(), *_straight_tracks(self)]
+        member = np.full(len(self), -1, np.int64)
+        actors = [actor for group in tracks for actor in group.actors]
+        member[actors] = np.arange(len(actors))
+        counts = np.concatenate([group.counts for group in tracks])
 
-        def joined(part: int, *shape: int) -> Floats:
-            """Concatenate field `part` of the segments of all tracks: (*shape, s)."""
-            empty = np.zeros((*shape, 0))
-            return np.concatenate([empty, *(track.segments[part] for track in tracks)], axis=-1)
+        def joined(part: int) -> Floats:
+            """Concatenate field `part` of the segments of all tracks: (..., s)."""
+            return np.concatenate([group.segments[part] for group in tracks], axis=-1)
 
-        limits = [
-            (track.start_s, track.times_s[0], track.times_s[-1], track.slack_s) for track in tracks
-        ]
         return TrackTable(
-            member=np.where(straight, np.cumsum(straight) - 1, -1),
+            member=member,
             first=np.cumsum(counts) - counts,
             segments=counts,
-            limits=np.array(limits, np.float64).reshape(-1, 4).T.copy(),
-            times=np.concatenate([np.zeros(0), *(track.times_s[:-1] for track in tracks)]),
-            start=joined(0, 3),
-            speed=joined(1, 3),
-            rotation=joined(2, 3, 9),
+            limits=np.concatenate([group.limits for group in tracks]).T.copy(),
+            times=np.concatenate([group.times_s for group in tracks]),
+            start=joined(0),
+            speed=joined(1),
+            rotation=joined(2),
             rates=joined(3),
         )
+
+
+def _no_tracks() -> _StraightTracks:
+    """Return no tracks, with the shapes of tables."""
+    return _static_tracks([], [])

@@ -121,6 +121,10 @@ class WeatherStep(PulseStep):
             air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether the weather of the survey returns light."""

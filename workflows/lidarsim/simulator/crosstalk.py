@@ -101,6 +101,10 @@ class CrosstalkStep(PulseStep):
             if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if the sensor has crosstalk."""

@@ -195,6 +195,12 @@ class CastStep(PulseStep):
             or self._media is not None
         )
 
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return the step for a scene in which instances have moved; media have new bounds."""
+        if self._media is not None:
+            return super().moved(setup, surfaces)
+        return self.repointed(setup, surfaces)
+
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if a ray may have several returns, or no return."""

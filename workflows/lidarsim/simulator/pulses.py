@@ -5,6 +5,8 @@ Random numbers depend only on scan, ray and return, so batches do not change the
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +51,14 @@ class PulseCaster:
         self._surfaces = surfaces
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
+
+    def moved(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
+        """Return the caster of the same scans of a scene in which instances have moved."""
+        caster = copy(self)
+        caster.setup = replace(self.setup, scene=scene)
+        caster._surfaces = surfaces
+        caster.steps = [step.moved(caster.setup, surfaces) for step in self.steps]
+        return caster
 
     def scan(
         self,

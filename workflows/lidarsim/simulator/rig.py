@@ -11,18 +11,19 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Floats32
+from ..base.arrays import Floats, Floats32, Integers
 from ..base.errors import LidarError
 from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
+from ..sensor import ScanSpec, Sensor, Survey, Trajectory
 from .actor_trajectories import ActorTrajectories
 from .device import DeviceColumns, DevicePoints
 from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .scene_caster import SceneCaster
+from .static_bodies import largest_range_m
 from .surfaces import Surfaces
 
 # Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
@@ -84,8 +85,10 @@ class Rig:
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         # The parts from which scans are cast, for other tools to look into.
         self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self.scene_caster = SceneCaster(scene, self.surfaces, shared_caster, **options)
-        self._device: DeviceColumns | None = None
+        range_m = largest_range_m(survey)
+        self.scene_caster = SceneCaster(
+            scene, self.surfaces, shared_caster, range_m=range_m, **options
+        )
         self._prepare()
         check_trajectory(survey.path)
         # {(number of the sensor, whether the carrier moves): rays}
@@ -144,20 +147,21 @@ class Rig:
                 self.scene.actors[number].check(begin_ns, end_ns)  # its error names the actor
             raise
 
-    def moved(self, owner: int, pose: Pose) -> Rig:
-        """Return a rig with the instances of an object at a pose, see `Scene.moved`.
+    def moved(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
+        """Return a rig with the instances of objects `owners` (k,) at poses, see `Scene.moved`.
 
-        `owner` is the number of the object. The trees are shared: this rig must not cast
-        afterwards, and no cast may be under way.
+        Objects have no duplicates; poses are positions (k, 3) and rotations (k, 3, 3). The trees
+        are shared: this rig must not cast afterwards, and no cast may be under way.
         """
+        assert self.scene.instances is not None
+        rows, index = self.scene.instances.rows_of(owners)
         rig = copy(self)
-        rig.scene = self.scene.moved(owner, pose)
-        instances = rig.scene.instances
-        assert instances is not None
-        rows = np.flatnonzero(instances.owner == owner)
-        rig.surfaces = self.surfaces.moved(rig.scene, rows)
-        rig.scene_caster.move_instances(rig.surfaces, instances, rows)
-        rig._prepare()
+        rig.scene = scene = self.scene.moved(rows, positions[index], rotations[index])
+        assert scene.instances is not None
+        rig.surfaces = surfaces = self.surfaces.moved(scene, rows)
+        rig.scene_caster.move_instances(surfaces, scene.instances, rows)
+        rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
+        rig._device = self._device and self._device.moved(scene, surfaces)
         return rig
 
     def _prepare(self) -> None:
@@ -173,9 +177,8 @@ class Rig:
             PulseCaster(number, caster, scene, survey, surfaces)
             for number in range(len(survey.carried))
         ]
-        if self._device is not None:
-            self._device = self._device.moved(scene, surfaces)
-        elif caster.caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
+        self._device: DeviceColumns | None = None
+        if caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
             self._device = DeviceColumns(caster, scene, survey, surfaces)
 
     @property
@@ -233,6 +236,7 @@ class Rig:
         stop = specs[-1].firings[1]
         firings = Firings.from_scans(sensor, specs)
         poses = self._poses(firings, path, late_ns, by_head=by_head)
+        self.scene_caster.cover(poses.positions)
         if repeated is not None:
             pattern = repeated
             start = first * channels % len(repeated)  # row of the first ray in the pattern
@@ -302,6 +306,7 @@ class Rig:
         """
         sensor = self.survey.carried[specs[0].sensor].sensor
         first = specs[0].firings[0]
+        self.scene_caster.cover(positions)
         pattern = self._pattern_of_firings(specs[0].sensor, first, specs[-1].firings[1])
         rays = len(pattern)
         ranges_m = np.full((len(positions), rays), np.inf, np.float32)

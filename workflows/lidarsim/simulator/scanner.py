@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import compress
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +15,13 @@ from pydantic import Field
 
 from raybeam.poses import check_poses
 
-from ..base.arrays import Floats, Floats32
+from ..base.arrays import Floats, Floats32, Indices
 from ..base.errors import LidarError
 from ..base.validation import checked, shown
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
+from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import (
     Material,
@@ -36,9 +37,11 @@ from ..sensor import (
 )
 from ..sensor.trajectory import CENTRE, pose_of
 from .batch import columns_of
+from .body_poses import poses_of_bodies, poses_of_body
 from .motion import check_trajectory
 from .rig import Rig
 from .scene_caster import check_backend_here
+from .static_bodies import warn_of_reach
 from .surfaces import warn_of_grey
 
 MAX_SCANS = 1 << 31  # the type of the column `scan`
@@ -139,6 +142,7 @@ class Scanner:
             spray_g_m3=spray_g_m3,
         )
         warn_of_grey(scene, survey)
+        warn_of_reach(scene, survey)
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
@@ -179,6 +183,25 @@ class Scanner:
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
         return self._rig.backend
+
+    @property
+    def origin(self) -> Floats:
+        """World coordinates of the scene's local origin, metres: (3,)."""
+        return self._rig.scene.origin
+
+    @checked
+    def span_s(
+        self, number: SweepNumber = 0, *, start_s: StartSeconds = None
+    ) -> tuple[float, float]:
+        """Return the times at which the first and the last beam of a sweep are fired, seconds.
+
+        `number` and `start_s` are as in `sweep`.
+        """
+        rig = self._rig
+        specs, _ = self._scans_of(rig, number, start_s)
+        begin_ns, end_ns = _span_ns(rig, specs)
+        last_delay_ns = float(rig.survey.sensor.beams.time_ns.max())
+        return begin_ns / 1e9, (end_ns + last_delay_ns) / 1e9
 
     @checked
     def sweep(
@@ -290,54 +313,141 @@ class Scanner:
             return rig.ranges(specs, checked_poses.positions, checked_poses.rotations)
 
     @checked
-    def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
-        """Move an actor or an instance; sweeps under way still see the earlier pose.
+    def move(
+        self,
+        name: str | Sequence[str],
+        pose: Pose | Trajectory | ArrayLike | Sequence[Any],
+        *,
+        times_s: ArrayLike | None = None,
+    ) -> None:
+        """Move actors and instances; sweeps under way still see the earlier poses.
+
+        Bodies that move in one call give the same bytes as bodies that move one by one, which takes
+        longer. If a body cannot move, none does.
 
         Parameters
         ----------
         name
             Name of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy
-            of a scenario.
+            of a scenario; or k names.
         pose
-            New pose of the mesh's frame, in the scene's local coordinates. An instance keeps its
-            scale. An actor may also get a trajectory, which it follows from time 0 on.
+            New pose of the mesh's frame, in the scene's local coordinates: a `Pose`, a position, or
+            a matrix (4, 4). An instance keeps its scale. An actor may also get a trajectory, which
+            it follows from time 0 on. For k names a list of these, positions (k, 3), or matrices
+            (k, 4, 4); arrays are faster.
+        times_s
+            (samples,): times of poses within a sweep, seconds by the clock of `start_s`, ascending.
+            Then `pose` is matrices (samples, 4, 4), or (k, samples, 4, 4) for k names, and each
+            beam meets the actors where they are when the beam is fired. From each pose to the next,
+            actors move straight and rotate evenly.
 
         Raises
         ------
         LidarError
-            If there is no such actor or instance, an instance would move during a sweep, or a
-            rotation of the trajectory mirrors or deforms.
-        """
-        path = _trajectory_of(pose)
-        scene = self._rig.scene
-        object_count = len(scene.names)
-        number = self._numbers.get(name, -1)
-        if 0 <= number < object_count and self._movable[number]:
-            if path.moves:
-                raise LidarError(
-                    f"{name!r} is a SceneInstance, which stands still during a sweep: give a pose, "
-                    "or make it an Actor."
-                )
-            self._move_instance(number, path.pose(0))
-            return
-        if number < object_count:
-            names = [*list(self._numbers)[object_count:], *compress(scene.names, self._movable)]
-            hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
-            if number >= 0:
-                hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
-            raise LidarError(f"There is no actor or instance {name!r}.{hint}")
-        with self._lock:
-            actor = self._actors[number - object_count]
-            self._actors[number - object_count] = replace(actor, trajectory=path)
-            self._rig = self._rig.with_actors(tuple(self._actors))
+            If there is no such actor or instance, a name is given twice, an instance would move
+            during a sweep, or a rotation mirrors or deforms.
 
-    def _move_instance(self, number: int, pose: Pose) -> None:
-        """Wait for the sweeps under way and move an instance, by object number; new sweeps wait."""
+        Examples
+        --------
+        >>> from lidarpool import Actor, Scanner, Scene, load_sensor
+        >>> from lidarsim.scene.actors import box
+        >>> cars = [Actor(box(f"Car {number}", (4.5, 1.8, 1.5))) for number in range(3)]
+        >>> scene = Scene.seed().with_actors(cars)
+        >>> scanner = Scanner(scene, load_sensor("velodyne/vlp16"))
+        >>> names = [car.name for car in cars]
+        >>> scanner.move(names, [(4, 0, 0), (8, 4, 0), (8, -4, 0)])
+        >>> matrices = np.tile(np.eye(4), (3, 2, 1, 1))
+        >>> matrices[:, 1, 0, 3] = 1.5  # a metre and a half in a tenth of a second
+        >>> scanner.move(names, matrices, times_s=[0, 0.1])
+        """
+        names = [name] if isinstance(name, str) else list(name)
+        poses = (
+            poses_of_body(pose, times_s)
+            if isinstance(name, str)
+            else poses_of_bodies(pose, len(names), times_s)
+        )
+        numbers = self._numbers_of(names)
+        object_count = len(self._rig.scene.names)
+        is_instance = numbers < object_count
+        moving = np.flatnonzero(is_instance & poses.moves)
+        if len(moving):
+            raise LidarError(
+                f"{names[moving[0]]!r} is a SceneInstance, which stands still during a sweep: give "
+                "a pose, or make it an Actor."
+            )
+        actors = [
+            (number - object_count, poses.trajectory(row))
+            for row, number in enumerate(numbers.tolist())
+            if number >= object_count
+        ]
+        if is_instance.any():
+            self._move_instances(
+                numbers[is_instance],
+                poses.positions[is_instance],
+                poses.rotations[is_instance],
+                actors,
+            )
+        else:
+            with self._lock:
+                self._follow(self._with_moved(actors))
+
+    def _numbers_of(self, names: list[str]) -> Indices:
+        """Return the numbers (k,) of actors and instances; LidarError for other or double names."""
+        numbers = np.array([self._numbers.get(name, -1) for name in names], np.intp)
+        object_count = len(self._movable)
+        movable = numbers >= object_count
+        movable[~movable] = (numbers[~movable] >= 0) & self._movable[numbers[~movable]]
+        if not movable.all():
+            row = int(movable.argmin())
+            self._refuse_name(names[row], int(numbers[row]))
+        if len(set(names)) < len(names):
+            double = next(name for row, name in enumerate(names) if name in names[:row])
+            raise LidarError(f"{double!r} is among the names twice: give each body one pose.")
+        return numbers
+
+    def _refuse_name(self, name: str, number: int) -> NoReturn:
+        """Raise LidarError for a name of no actor or instance; `number` is -1 for no object."""
+        object_count = len(self._movable)
+        names = [
+            *list(self._numbers)[object_count:],
+            *compress(self._rig.scene.names, self._movable),
+        ]
+        hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
+        if number >= 0:
+            hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
+        raise LidarError(f"There is no actor or instance {name!r}.{hint}")
+
+    def _with_moved(self, moves: list[tuple[int, Trajectory]]) -> list[Actor]:
+        """Return all actors; some, by index, on new trajectories. The caller holds the lock."""
+        actors = self._actors.copy()
+        for index, trajectory in moves:
+            actors[index] = actors[index].following(trajectory)
+        return actors
+
+    def _follow(self, actors: list[Actor]) -> None:
+        """Cast with other trajectories of all actors; the caller holds the lock."""
+        self._rig = self._rig.with_actors(tuple(actors))
+        self._actors = actors
+
+    def _move_instances(
+        self,
+        numbers: Indices,
+        positions: Floats,
+        rotations: Floats,
+        actors: list[tuple[int, Trajectory]],
+    ) -> None:
+        """Wait for the sweeps under way and move instances, by object numbers; new sweeps wait.
+
+        Actors, by index, get new trajectories.
+        """
         with self._lock:
             self._moves += 1  # new sweeps wait
             try:
                 self._lock.wait_for(lambda: not self._casts)
-                self._rig = self._rig.moved(number, pose)
+                moved_actors = self._with_moved(actors)
+                self._rig = self._rig.moved(numbers, positions, rotations)
+                if actors:
+                    self._follow(moved_actors)
             finally:
                 self._moves -= 1
                 self._lock.notify_all()
@@ -351,24 +461,35 @@ class Scanner:
         `start_s`. Without a `number`, the scans are those of revolution 0 with the random numbers
         of later revolutions, and `count` revolutions of random numbers are used up.
         """
-        sensor = rig.survey.sensor
-        ahead = 0  # scans by which random numbers are ahead, see `ScanSpec`
-        steps = sensor.steps_of_revolution(number or 0)
-        if steps.stop > MAX_SCANS:
-            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
+        revolutions_ahead = 0  # by which random numbers are ahead
         if number is None:
             with self._lock:
-                ahead = self._unnumbered * len(steps)
+                revolutions_ahead = self._unnumbered
                 self._unnumbered += count
+        specs, late_ns = self._scans_of(rig, number or 0, start_s, revolutions_ahead)
+        begin_ns, end_ns = _span_ns(rig, specs)
+        rig.check_actors(begin_ns, end_ns)
+        return specs, late_ns
+
+    def _scans_of(
+        self, rig: Rig, number: int, start_s: float | None, revolutions_ahead: int = 0
+    ) -> tuple[list[ScanSpec], float]:
+        """Return the scans of revolution `number`, and the delay of its start, nanoseconds.
+
+        Random numbers are those of a revolution that is `revolutions_ahead`, see `ScanSpec.ahead`.
+        """
+        sensor = rig.survey.sensor
+        steps = sensor.steps_of_revolution(number)
+        if steps.stop > MAX_SCANS:
+            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
         late_ns = (
-            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number or 0))
+            0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
+        ahead = revolutions_ahead * len(steps)
         specs = [
             ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
             for step in steps
         ]
-        begin_ns, end_ns = _span_ns(rig, specs)
-        rig.check_actors(begin_ns, end_ns)
         return specs, late_ns
 
     @contextmanager

@@ -14,9 +14,7 @@ import numpy as np
 from raybeam import (
     Deforming,
     Instance,
-    Mesh,
     Moving,
-    Opacity,
     OtherHits,
     Pattern,
     RayCaster,
@@ -34,9 +32,10 @@ from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
 from ..scene.actors import Actor, distinct_meshes
 from ..scene.scene import Scene
-from ..scene.scene_instances import Instances, MeshPart, parts_of
+from ..scene.scene_instances import Instances, parts_of
 from .actor_trajectories import ActorTrajectories
 from .motion import CastPoses, Clock
+from .static_bodies import StaticBodies, mesh_of
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
@@ -92,6 +91,9 @@ class SceneCaster:
     shared_caster
         Caster of the same scene, possibly with other actors. Its trees of static bodies are shared
         if the same surfaces enclose media.
+    range_m
+        Largest range of the sensors, metres: of a scene of hundreds of kilometres, what is far
+        beyond the range is left out. Before scans, `cover` says where sensors are.
     options
         Arguments of `RayCaster`.
     """
@@ -101,31 +103,28 @@ class SceneCaster:
         scene: Scene,
         surfaces: Surfaces,
         shared_caster: SceneCaster | None = None,
+        range_m: float = np.inf,
         **options: Any,
     ) -> None:
         self._surfaces = surfaces
         self._instances = scene.instances
-        # First triangle of each instance of the caster: of the scene's faces, if any, and then of
-        # the scene's instances. None if the scene has no instances.
-        self._first_triangles: Ints32 | None = None
         self._face_count = static_triangles = len(scene.faces)
         if self._instances is not None:
-            first_triangles = static_triangles + np.cumsum([0, *self._instances.sizes[:-1]])
-            self._first_triangles = np.append([0] * bool(static_triangles), first_triangles).astype(
-                np.int32
-            )
             static_triangles += self._instances.triangles
         # Distance behind a surface at which light continues, so as not to hit the surface again:
         # Embree's rounding is up to a quarter of this distance.
         reach = np.float32(np.abs(scene.bounds).max())
         self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+        self._range_m = range_m
         self._media = surfaces.media
         if shared_caster is None or shared_caster._media != self._media:
             # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
             vertices = surfaces.spread_out(1.5 * self.clear_m)
-            self.caster: RayCaster = _caster_of(scene, vertices, options)
+            # Media are searched beyond the range: their bodies stay whole.
+            cut_range_m = np.inf if self._media else range_m
+            self._static = StaticBodies(scene, vertices, cut_range_m, options)
         else:
-            self.caster = shared_caster.caster
+            self._static = shared_caster._static
         self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         # First triangle of each actor.
@@ -136,11 +135,18 @@ class SceneCaster:
 
         `surfaces` are the surfaces of the scene with the moved instances.
         """
-        first = self.caster.instance_count - len(instances)
-        for row in rows:
-            self.caster.move(first + int(row), instances.transforms[row])
+        self._static.move(instances, rows)
         self._surfaces = surfaces
         self._instances = instances
+
+    def cover(self, positions: Floats) -> None:
+        """Build the trees of all bodies in the range of sensors at positions (p, 3), if missing."""
+        self._static.cover(positions, self._range_m)
+
+    @property
+    def caster(self) -> RayCaster:
+        """Caster of the static bodies, of which triangles may be cut or left out."""
+        return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
         """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
@@ -160,7 +166,12 @@ class SceneCaster:
     @property
     def backend(self) -> str:
         """Name of the backend in use."""
-        return self.caster.backend
+        return self._static.backend
+
+    @property
+    def on_device(self) -> bool:
+        """Whether hits can stay on a CUDA device."""
+        return self._static.on_device
 
     def scan(
         self,
@@ -197,13 +208,13 @@ class SceneCaster:
             "t_max": t_max,
             "room": room,
         }
-        if self._first_triangles is None and self._shapes is None:
-            return self.caster.scan(
+        trees = self._static.trees
+        if self._instances is None and self._shapes is None and not trees.origins:
+            return trees.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
-        hits = self.caster.scan(pattern, **common)
-        if self._first_triangles is not None:
-            hits = replace(hits, triangle=hits.triangle + self._first_triangles[hits.instance])
+        hits = trees.caster.scan(pattern, **common)
+        hits = replace(hits, triangle=trees.numbered(hits))
         if self._shapes is None:
             ray = hits.ray.astype(np.int64)
             distance = hits.distance
@@ -304,25 +315,6 @@ class SceneCaster:
         return hits_on(moving, scan, poses.times, limit), self._shapes
 
 
-def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
-    """Build the caster of static bodies; `vertices` (v, 3) are those of the scene's faces."""
-    if scene.instances is None:
-        return RayCaster(vertices, scene.faces, **options)
-    static_instances = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
-    meshes = [_mesh_of(part) for part in scene.instances.parts]
-    instances = [
-        Instance(meshes[part], matrix)
-        for part, matrix in zip(scene.instances.part, scene.instances.transforms, strict=True)
-    ]
-    return RayCaster.from_instances([*static_instances, *instances], **options)
-
-
-def _mesh_of(part: MeshPart) -> Mesh:
-    """Return the mesh of a part, with the mask of its texture, if any."""
-    opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
-    return Mesh(part.vertices, part.faces, opacity)
-
-
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
     """Build the casters of the shapes of actors; None without actors.
 
@@ -338,7 +330,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     casters = tuple(
         Deforming(mesh.animation.vertices, mesh.faces)
         if mesh.animation
-        else RayCaster.from_instances([Instance(_mesh_of(part)) for part in mesh_parts], **options)
+        else RayCaster.from_instances([Instance(mesh_of(part)) for part in mesh_parts], **options)
         for mesh, mesh_parts in zip(meshes, parts, strict=True)
     )
     boxes = np.array([(mesh.animation or mesh).bounds for mesh in meshes])

@@ -83,6 +83,10 @@ class SprayStep(PulseStep):
         )
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether spray is on, and an actor raises spray."""

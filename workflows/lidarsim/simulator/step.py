@@ -8,10 +8,11 @@ decides whether a step acts: how rays are cast follows from the roles of the ste
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 from enum import Flag, auto
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -311,6 +312,21 @@ class PulseStep(ABC):
         self.setup = setup
         self.caster = caster
         self.surfaces = surfaces
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return the step for a scene in which instances have moved, with its setup and surfaces.
+
+        By default, a new step is made; a step that takes long to make, and stores no positions of
+        surfaces, returns `repointed`.
+        """
+        return type(self)(setup, self.caster, surfaces)
+
+    def repointed(self, setup: Setup, surfaces: Surfaces) -> Self:
+        """Return a copy of the step with another setup and other surfaces."""
+        step = copy(self)
+        step.setup = setup
+        step.surfaces = surfaces
+        return step
 
     @staticmethod
     @abstractmethod

@@ -1,0 +1,183 @@
+"""Lidars in worlds of MuJoCo, beside MuJoCo's own rays: `python -m benchmarks.mujoco`.
+
+Rooms with 20, 100 and 400 moving bodies are scanned by a VLP-16 and an OS1-64; then the lidars of
+256 quadrupeds on a terrain, 16 x 360 rays each, in one call. All bodies move before each scan. One
+thread, processor time, the least of several rounds, because other programs may share the cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarpool import MujocoScanner, Sensor, load_sensor
+
+_ROUNDS = 7
+MAX_M = 120.0  # range of MuJoCo's rays
+_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+_ROUND_SHAPES = ("box", "cylinder", "capsule", "sphere")
+
+
+class World(NamedTuple):
+    """A model of MuJoCo with the sites of its lidars."""
+
+    name: str
+    model: Any
+    data: Any
+    sites: list[str]
+
+
+def room(bodies: int) -> str:
+    """Return the MJCF of a floor, a robot, and bodies of four shapes."""
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(-20, 20, (bodies, 2))
+    angles = rng.uniform(0, 360, bodies)
+    free = "".join(
+        f'<body pos="{x:.3f} {y:.3f} 0.5" euler="0 0 {angle:.0f}"><freejoint/>'
+        f'<geom type="{_ROUND_SHAPES[k % 4]}" size=".3 .4 .5"/></body>'
+        for k, ((x, y), angle) in enumerate(zip(positions, angles, strict=True))
+    )
+    robot = (
+        '<body pos="0 0 1"><freejoint/><geom type="box" size=".1 .1 .1"/>'
+        '<site name="lidar" pos="0 0 .5"/></body>'
+    )
+    floor = '<geom type="plane" size="0 0 .1"/>'
+    return f"<mujoco><worldbody>{floor}{robot}{free}</worldbody></mujoco>"
+
+
+def herd(robots: int, cells: int) -> str:
+    """Return the MJCF of quadrupeds with a lidar each, on a terrain of 2 * cells² triangles."""
+    side = int(np.ceil(np.sqrt(robots)))
+    leg = (
+        '<body pos="{x} {y} 0"><joint axis="0 1 0"/>'
+        '<geom type="capsule" size=".03" fromto="0 0 0 0 0 -.2"/>'
+        '<body pos="0 0 -.2"><joint axis="0 1 0"/>'
+        '<geom type="capsule" size=".025" fromto="0 0 0 0 0 -.2"/></body></body>'
+    )
+    legs = "".join(leg.format(x=x, y=y) for x in (-0.25, 0.25) for y in (-0.15, 0.15))
+    bodies = "".join(
+        f'<body pos="{2 * (k % side) - side} {2 * (k // side) - side} 1.6"><freejoint/>'
+        f'<geom type="box" size=".3 .12 .08"/><site name="lidar{k}" pos="0 0 .2"/>{legs}</body>'
+        for k in range(robots)
+    )
+    field = f'<hfield name="hills" nrow="{cells + 1}" ncol="{cells + 1}" size="40 40 1 1"/>'
+    return (
+        f'<mujoco><asset>{field}</asset><worldbody><geom type="hfield" hfield="hills"/>{bodies}'
+        "</worldbody></mujoco>"
+    )
+
+
+def build(name: str, xml: str, sites: list[str]) -> World:
+    """Compile a model; hills are waves."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(xml)
+    for field in range(model.nhfield):
+        rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        row, column = np.mgrid[:rows, :columns] / 20
+        heights = 0.5 + 0.25 * (np.sin(row) + np.sin(1.3 * column))
+        model.hfield_data[: rows * columns] = heights.ravel()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return World(name, model, data, sites)
+
+
+def milliseconds(function: Callable[[], object], rounds: int) -> float:
+    """Return the least processor time of calls, milliseconds."""
+    times = []
+    for _ in range(rounds):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return 1e3 * min(times)
+
+
+def cast_by_mujoco(world: World, directions: Any) -> None:
+    """Cast rays (n, 3), in the frame of each site, by MuJoCo."""
+    import mujoco
+
+    model, data = world.model, world.data
+    count = len(directions)
+    geom = np.zeros(count, np.int32)
+    distance = np.zeros(count)
+    for name in world.sites:
+        number = model.site(name).id
+        turned = directions @ data.site_xmat[number].reshape(3, 3).T
+        mujoco.mj_multiRay(
+            model, data, data.site_xpos[number].copy(), turned.ravel(), _GROUPS, True,
+            model.site_bodyid[number], geom, distance, None, count, MAX_M,
+        )  # fmt: skip
+
+
+def measure(world: World, sensor: Sensor, rounds: int) -> list[str]:
+    """Return a row of the table: times of MuJoCo's rays, `ranges`, `sweep` and `step`."""
+    rng = np.random.default_rng(1)
+    data = world.data
+    is_single = len(world.sites) == 1
+    site = world.sites[0] if is_single else world.sites
+    scanner = MujocoScanner(world.model, sensor, site=site, columns=["range"], threads=1)
+
+    def move() -> None:
+        data.xpos[1:] += rng.uniform(-0.01, 0.01, (world.model.nbody - 1, 3))
+
+    def ranges() -> None:
+        move()
+        scanner.ranges(data)
+
+    def sweep() -> None:
+        move()
+        scanner.sweep(data)
+
+    def step() -> None:
+        clouds: list[Any] = []
+        while not clouds:
+            data.time += 0.01
+            move()
+            clouds = scanner.step(data)
+
+    directions = sensor.directions(np.arange(scanner.ranges(data).shape[-2])).reshape(-1, 3)
+    peer = milliseconds(
+        lambda: cast_by_mujoco(world, directions), min(rounds, 3) if is_single else 1
+    )
+    calls: list[Callable[[], None]] = [ranges]
+    if is_single:
+        calls += [sweep, step]
+        step()
+    own_times = [milliseconds(call, rounds) for call in calls]
+    rays = f"{len(directions) * len(world.sites):,}"
+    return [world.name, rays, f"{peer:.1f}", *(f"{t:.1f} ({peer / t:.1f})" for t in own_times)]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; return 2 without MuJoCo."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="toy sizes")
+    chosen = parser.parse_args(arguments)
+    try:
+        import mujoco as _  # noqa: F401
+    except ImportError:
+        print("Nothing was measured: pip install mujoco", file=sys.stderr)
+        return 2
+    rounds = 1 if chosen.quick else _ROUNDS
+    robots, cells = (4, 16) if chosen.quick else (256, 257)
+    print("| bodies | rays | mj_multiRay, ms | ranges (times as fast) | sweep | step |")
+    print("|---|--:|--:|--:|--:|--:|")
+    for bodies in (5,) if chosen.quick else (20, 100, 400):
+        for model in ("velodyne/vlp16", "ouster/os1-64"):
+            world = build(f"{bodies}, {model}", room(bodies), ["lidar"])
+            print("|", " | ".join(measure(world, load_sensor(model), rounds)), "|", flush=True)
+    sensor = Sensor.grid(360, 16, step_deg=360, max_range_m=30)
+    sites = [f"lidar{k}" for k in range(robots)]
+    world = build(f"{robots} quadrupeds", herd(robots, cells), sites)
+    row = measure(world, sensor, 1 if chosen.quick else 3)
+    print("|", " | ".join([*row, "–", "–"]), "|")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

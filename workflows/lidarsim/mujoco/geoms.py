@@ -1,0 +1,166 @@
+"""Meshes of MuJoCo's geoms, in the frames of the geoms."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Floats, Ints
+from ..base.elementary import arctan2
+from ..base.errors import LidarError
+from ..scene.actors import box
+from ..scene.scene_mesh import SceneMesh
+from ..scene.shapes import capsule, cylinder
+
+# Half of the side of planes without a size, metres: far beyond the range of lidars on robots, and
+# so small that single precision resolves a millimetre.
+PLANE_M = 4000.0
+_MAX_SEGMENTS = 1024
+
+
+class GeomType(IntEnum):
+    """Types of geoms, as numbered by MuJoCo (mjtGeom)."""
+
+    PLANE = 0
+    HFIELD = 1
+    SPHERE = 2
+    CAPSULE = 3
+    ELLIPSOID = 4
+    CYLINDER = 5
+    BOX = 6
+    MESH = 7
+    SDF = 8
+
+
+class GeomMesh(NamedTuple):
+    """Triangles of a geom, in its frame."""
+
+    vertices: Floats  # (v, 3), metres
+    faces: Ints  # (f, 3)
+
+
+def mesh_of_geom(model: Any, geom: int, sag_m: float) -> GeomMesh:
+    """Return the triangles of a geom, by its number.
+
+    Triangles of round surfaces are up to `sag_m` within the surface, twice that on balls.
+
+    Raises
+    ------
+    LidarError
+        If MuJoCo has no such type of geom.
+    """
+    kind = int(model.geom_type[geom])
+    size = np.asarray(model.geom_size[geom], np.float64)
+    radius, half, _ = size.tolist()
+    match kind:
+        case GeomType.PLANE:
+            return _plane(size)
+        case GeomType.HFIELD:
+            return height_field(model, int(model.geom_dataid[geom]))
+        case GeomType.SPHERE:
+            return _of(capsule(radius, 0, segments(radius, sag_m), "ball"))
+        case GeomType.CAPSULE:
+            return _of(capsule(radius, 2 * half, segments(radius, sag_m), "capsule"))
+        case GeomType.ELLIPSOID:
+            ball = capsule(1, 0, segments(float(size.max()), sag_m), "ball")
+            return GeomMesh(ball.vertices * size, ball.faces)
+        case GeomType.CYLINDER:
+            return _of(cylinder(radius, 2 * half, segments(radius, sag_m), "cylinder"))
+        case GeomType.BOX:
+            cube = box("box", (2.0, 2.0, 2.0))
+            return GeomMesh((cube.vertices - [0, 0, 1]) * size, cube.faces)
+        case GeomType.MESH | GeomType.SDF:
+            return _mesh(model, int(model.geom_dataid[geom]))
+    raise LidarError(f"Geom {geom} is of type {kind}, which is none of {[*GeomType]}.")
+
+
+def segments(radius: float, sag_m: float) -> int:
+    """Return the number of sides of a circle, of which the middles are `sag_m` within the circle.
+
+    A multiple of 4.
+    """
+    share = min(max(sag_m / radius, 1e-9), 0.2)
+    half_angle = float(arctan2(math.sqrt((2 - share) * share), 1 - share))
+    return min(4 * math.ceil(math.pi / half_angle / 4), _MAX_SEGMENTS)
+
+
+def height_field(model: Any, field: int) -> GeomMesh:
+    """Return the triangles of a height field: its surface, sides and base.
+
+    Cells are divided as by MuJoCo: the edge goes along the rising row and column.
+    """
+    columns = int(model.hfield_ncol[field])
+    top = _field_vertices(model, field)
+    grid = np.arange(len(top)).reshape(-1, columns)
+    rim = np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])
+    bottom = top[rim].copy()
+    bottom[:, 2] = -float(model.hfield_size[field][3])
+    sides = columns - 1, len(grid) - 1, columns - 1
+    corners = len(top) + np.cumsum([0, *sides])
+    base = corners[[[0, 2, 1], [0, 3, 2]]]
+    faces = np.concatenate([_cells(grid), _walls(rim, len(top)), base])
+    return GeomMesh(np.concatenate([top, bottom]), faces.astype(np.int64))
+
+
+def _field_vertices(model: Any, field: int) -> Floats:
+    """Return the vertices of the surface of a height field, row by row: (rows * columns, 3)."""
+    rows = int(model.hfield_nrow[field])
+    columns = int(model.hfield_ncol[field])
+    first = int(model.hfield_adr[field])
+    half_x, half_y, height, _ = np.asarray(model.hfield_size[field], np.float64).tolist()
+    shares = np.asarray(model.hfield_data[first : first + rows * columns], np.float64)
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    x = 2 * half_x / (columns - 1) * column - half_x
+    y = 2 * half_y / (rows - 1) * row - half_y
+    return np.stack([x, y, shares * height], axis=1)
+
+
+def _cells(grid: Ints) -> Ints:
+    """Return the triangles of the cells of a grid (r, c) of vertices, two of each cell."""
+    first = grid[:-1, :-1]
+    right = grid[:-1, 1:]
+    above = grid[1:, :-1]
+    opposite = grid[1:, 1:]
+    return np.concatenate(
+        [
+            np.stack([first, right, opposite], axis=-1).reshape(-1, 3),
+            np.stack([first, opposite, above], axis=-1).reshape(-1, 3),
+        ]
+    )
+
+
+def _walls(rim: Ints, first_lower: int) -> Ints:
+    """Return the triangles below a closed line of vertices; the lower vertices are numbered on."""
+    lower = first_lower + np.arange(len(rim))
+    next_rim = np.roll(rim, -1)
+    next_lower = np.roll(lower, -1)
+    return np.concatenate(
+        [
+            np.stack([rim, lower, next_lower], axis=-1),
+            np.stack([rim, next_lower, next_rim], axis=-1),
+        ]
+    )
+
+
+def _plane(size: Floats) -> GeomMesh:
+    """Return the triangles of a plane; without a size along an axis, of `PLANE_M`."""
+    x, y = np.where(size[:2] > 0, size[:2], PLANE_M).tolist()
+    corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
+    return GeomMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _mesh(model: Any, mesh: int) -> GeomMesh:
+    """Return the triangles of a mesh."""
+    vertex = int(model.mesh_vertadr[mesh])
+    face = int(model.mesh_faceadr[mesh])
+    vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])]
+    faces = model.mesh_face[face : face + int(model.mesh_facenum[mesh])]
+    return GeomMesh(np.array(vertices, np.float64), np.array(faces, np.int64))
+
+
+def _of(mesh: SceneMesh) -> GeomMesh:
+    """Return the triangles of a generated shape."""
+    return GeomMesh(mesh.vertices, mesh.faces)
