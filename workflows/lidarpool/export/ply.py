@@ -140,7 +140,7 @@ class GrowingPly:
 
     def flush(self) -> None:
         """Flush the points to the disk."""
-        os.fdatasync(self._file.fileno())
+        os.fsync(self._file.fileno())
 
     def finish(self) -> None:
         """Write the header with the number of points."""

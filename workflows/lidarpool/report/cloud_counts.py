@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Ints, Records
+from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Ints
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.part_columns import positions_of
+from lidarsim.columns.ply_format import PlyLayout, layout
 from lidarsim.columns.table import AXES, Column
 
 from ..columns.parts import StoredCloud
@@ -81,14 +83,14 @@ class CloudCounts:
                 max(upper, np.fmax.reduce(values).item()),
             )
 
-    def add_positions(self, points: StoredCloud, rows: Records, *, from_above: bool) -> None:
-        """Add the positions of all points, from the rows of their file; see `PositionCounts`.
+    def add_positions(self, points: StoredCloud, path: Path, *, from_above: bool) -> None:
+        """Add the positions of all points, from their PLY file; see `PositionCounts`.
 
         `above` is counted only if `from_above`, because it takes as long as all else.
         """
-        counted = partial(_counted_positions, points, rows, from_above)
-        size = -(-len(rows) // THREADS) or 1
-        starts = range(0, len(rows), size)
+        counted = partial(_counted_positions, points, path, layout(path), from_above)
+        size = -(-len(points) // THREADS) or 1
+        starts = range(0, len(points), size)
         self._positions = PositionCounts(points.bounds, len(points))
         with ThreadPoolExecutor(THREADS, "count") as pool:  # NumPy lets threads run
             for positions in pool.map(counted, starts, [start + size for start in starts]):
@@ -172,16 +174,18 @@ class PositionCounts:
 
 
 def _counted_positions(
-    points: StoredCloud, rows: Records, from_above: bool, start: int, stop: int
+    points: StoredCloud, path: Path, ply: PlyLayout, from_above: bool, start: int, stop: int
 ) -> PositionCounts:
-    """Return the counts of the points in the rows from `start` to `stop` of their file."""
+    """Return the counts of the points in the rows from `start` to `stop` of a PLY file."""
     counts = PositionCounts(points.bounds, len(points))
     cell_indices = [_of_cells(points, axis, partial(counts.cell_index, axis)) for axis in range(3)]
     pixel_indices = [
         _of_cells(points, axis, partial(counts.pixel_index, axis)) for axis in range(2)
     ]
-    for first in range(start, min(stop, len(rows)), _BLOCK_ROWS):
-        block = rows[first : min(first + _BLOCK_ROWS, stop)]
+    for first in range(start, min(stop, ply.points), _BLOCK_ROWS):
+        # Pages of a mapped file would count as memory of this process.
+        offset = ply.start + first * ply.row.itemsize
+        block = np.fromfile(path, ply.row, min(_BLOCK_ROWS, stop - first), offset=offset)
         x, y, z = (points.cells_along(axis, block[AXES[axis].name]) for axis in range(3))
         cells = cell_indices[0](x) + cell_indices[1](y)
         cells += cell_indices[2](z)

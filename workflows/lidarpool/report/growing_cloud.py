@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.errors import LidarError
-from lidarsim.columns.ply_format import mapped_rows
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -26,7 +25,8 @@ from ..run.pipeline.messages import Receipt
 from ..run.store.job_under_way import JobUnderWay
 from .cloud_counts import CloudCounts
 
-_FLUSH_BYTES = 1 << 26  # appended between two flushes, so that the last flush is short
+# Bytes appended between two flushes: the last flush is short, and no flush delays those of parts.
+_FLUSH_BYTES = 1 << 25
 _LOOK_EVERY_S = 0.05
 
 
@@ -93,7 +93,7 @@ class CloudWriter:
     def finish(self, points: StoredCloud, *, from_above: bool) -> CloudCounts:
         """Complete the file; return the counts of all `points`, see `CloudCounts.add_positions`."""
         self.file.finish()
-        self.counts.add_positions(points, mapped_rows(self._path), from_above=from_above)
+        self.counts.add_positions(points, self._path, from_above=from_above)
         return self.counts
 
 
@@ -193,7 +193,9 @@ class GrowingCloud:
             points.tell(self._appended_rows - told_count)
             told_count = self._appended_rows
         writer = self._writer
-        if writer is None or not self._is_complete or writer.file.count != len(points):
+        # On a network disk without locks, another run may have removed the file.
+        is_usable = self._is_complete and self._path.exists()
+        if writer is None or not is_usable or writer.file.count != len(points):
             self._discard()
             return None
         with writer.file:
