@@ -215,15 +215,17 @@ class StoredCloud(CloudDisplay):
         return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
 
     def columns_of(self, part: PartColumns) -> dict[str, AnyArray]:
-        """Return the points of a part: {axis or name of a column: (n,)}, positions in float64."""
-        columns: dict[str, AnyArray] = {
-            axis.name: positions_of(part.columns[axis.name], self.precision_m, self.origin[i])
-            for i, axis in enumerate(AXES)
+        """Return the columns of a part without positions, {name: (n,)}, in the order of files."""
+        return {
+            column.name: part.scan_column() if column is SCAN else part.columns[column.name]
+            for column in self.table
         }
-        for column in self.table:
-            is_scan = column is SCAN
-            columns[column.name] = part.scan_column() if is_scan else part.columns[column.name]
-        return columns
+
+    def positions_of(self, part: PartColumns, rows: slice) -> Iterator[tuple[str, Floats]]:
+        """Yield the names of axes with coordinates of rows of a part, (n,), metres."""
+        for i, axis in enumerate(AXES):
+            cells = part.columns[axis.name][rows]
+            yield axis.name, positions_of(cells, self.precision_m, self.origin[i])
 
     def cells_along(self, axis: int, coordinates: AnyFloats) -> Ints:
         """Return the cells of coordinates along an axis, (n,), metres.

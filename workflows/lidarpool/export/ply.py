@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     with GrowingPly(path, cloud.table, position_type, sweeps, len(cloud)) as file:
         file.check_room(len(cloud))
         for chunk in cloud.chunks():
-            file.append(chunk.by_name)
+            file.append(len(chunk), chunk.by_name.items())
         file.finish()
 
 
@@ -81,7 +81,7 @@ class GrowingPly:
         self.row = row_type(position_type, table)
         self.count = 0  # points in the file
         self._path = path
-        self._table = tuple(table)
+        self._columns = {column.name: column for column in table}
         self._expected_count = expected_count
         self._comments = _comments(table, sweeps)
         self._start = 0  # offset of the first row, bytes; 0 without rows
@@ -115,8 +115,15 @@ class GrowingPly:
                 "folder."
             )
 
-    def append(self, columns: Mapping[str, AnyArray]) -> None:
-        """Append points: {axis or name of a column: (n,)}, positions in float32 or float64.
+    def append(self, count: int, columns: Iterable[tuple[str, AnyArray]]) -> None:
+        """Append points.
+
+        Parameters
+        ----------
+        count
+            Number of points.
+        columns
+            Names of axes and columns, with values (n,), each once; positions in float32 or float64.
 
         Raises
         ------
@@ -125,16 +132,19 @@ class GrowingPly:
         OSError
             If the disk is full, or the file cannot be written for another reason.
         """
-        count = len(columns["x"])
-        first = min(count, FIRST_POINTS) if not self._start else 0
-        if first:
-            self._write_first({name: values[:first] for name, values in columns.items()})
+        first = 0
+        if not self._start and count:
+            columns = [*columns]
+            first = min(count, FIRST_POINTS)
+            self._write_first({name: values[:first] for name, values in columns})
         if first < count:
             rows = np.empty(count - first, self.row)
-            for axis in AXES:
-                rows[axis] = columns[axis][first:]
-            for column in self._table:
-                rows[column.in_files] = as_file_type(column, columns[column.name][first:])
+            for name, values in columns:
+                column = self._columns.get(name)
+                if column is None:
+                    rows[name] = values[first:]
+                else:
+                    rows[column.in_files] = as_file_type(column, values[first:])
             self._write(rows.data.cast("B"))
         self.count += count
 
@@ -160,8 +170,8 @@ class GrowingPly:
     def _write_first(self, columns: Mapping[str, AnyArray]) -> None:
         """Write a header and the first rows in the layout of Open3D."""
         positions = np.stack([columns[axis] for axis in AXES], axis=1)
-        others = {column.name: columns[column.name] for column in self._table}
-        cloud = Cloud(positions, others, self._table)
+        others = {name: columns[name] for name in self._columns}
+        cloud = Cloud(positions, others, tuple(self._columns.values()))
         # Open3D chooses the format by the ending of the name.
         piece = self._path.with_name(f".{self._path.name}.ply")
         write_with_open3d(piece, cloud, self.position_type)
