@@ -19,7 +19,7 @@ from ..columns.parts import StoredCloud
 from ..export.pieces import THREADS
 
 _CELLS = 64  # along an axis of the grid in which points are counted, a power of two
-_BLOCK_ROWS = 1 << 18  # rows whose positions are counted at a time
+_BLOCK_ROWS = 1 << 15  # rows whose positions are counted at a time, which fit into a cache
 _MIN_POINTS = 12  # points in a cell from which a density is estimated
 
 
@@ -148,11 +148,12 @@ class PositionCounts:
 
     def add_cells(self, cells: Ints) -> None:
         """Add points by the indices of their cells in the grid, (n,)."""
-        self._cells += np.bincount(cells, minlength=len(self._cells))
+        # Of few points, `bincount` would take longer to make its array than to count.
+        np.add.at(self._cells, cells, 1)
 
     def add_pixels(self, pixels: Ints) -> None:
         """Add points by the indices of their pixels, (n,)."""
-        self.above += np.bincount(pixels, minlength=self.above.size).reshape(self.above.shape)
+        np.add.at(self.above.reshape(-1), pixels, 1)
 
     def merge(self, other: PositionCounts) -> None:
         """Add the points of counts with the same bounds."""
@@ -213,4 +214,4 @@ def _of_cells(
     if upper - lower >= len(points):
         return of_cells
     table = of_cells(np.arange(lower, upper + 1))
-    return lambda cells: table[cells - lower]
+    return lambda cells: table.take(cells - lower)
