@@ -9,6 +9,7 @@ import threading
 import numpy as np
 import pytest
 from tests.committing import commit
+from tests.daemons import wait_until
 
 from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
 from lidarpool.export import ply
@@ -91,6 +92,21 @@ def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_fi
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     expected = CloudCounts.from_cloud(points, len(SCENE.all_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
+
+
+def test_it_grows_by_parts_whose_predecessors_are_committed(store, tmp_path):
+    path = grown_at(tmp_path / "new")
+    with GrowingCloud(path, store.only_job) as growing:
+        for first in (0, 5, 2):
+            add(store, growing, first, PARTS[first])
+        row_bytes = 3 * 4 + 4 + 2 + 4 + 8 + 2 + 4  # position, scan, channel, object, and COLUMNS
+        expected_bytes = sum(PARTS[0] + PARTS[2]) * row_bytes  # that of 5 waits for that of 3
+
+        def rows() -> bytes:
+            return path.read_bytes().partition(b"end_header\n")[2] if path.exists() else b""
+
+        wait_until(lambda: len(rows()) >= expected_bytes)
+        assert len(rows()) == expected_bytes
 
 
 def test_a_resumed_run_begins_with_the_parts_that_are_there(store, tmp_path):
