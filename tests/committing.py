@@ -9,10 +9,10 @@ from lidarpool.run.pipeline.messages import Receipt, samples_of_scan
 from lidarsim.columns.part_columns import PartColumns
 
 
-def commit(store, first, counts, triangles, hits, job=None):
+def commit(store, first, counts, triangles, hits, job=None, offset=0):
     """Write a part of scans, with so many points of each, and commit it; whether it was new.
 
-    It is of the only job of a run, or of one that is under way.
+    It is of the only job of a run, or of one that is under way. `offset` cells are added to x.
     """
     rng = np.random.default_rng(first)
     job = job or store.only_job.job
@@ -21,6 +21,7 @@ def commit(store, first, counts, triangles, hits, job=None):
     columns = {
         c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype) for c in survey.stored_columns
     }
+    columns["x"] += np.int32(offset)
     of_scans = np.zeros(len(counts), np.uint32)
     of_scans[0] = sum(hits)
     ends = np.zeros((len(counts), samples_of_scan(survey.scan_count), 3), np.float32)

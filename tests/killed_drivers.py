@@ -18,7 +18,7 @@ from lidarpool.__main__ import main
 from lidarsim.base.storage import Storage
 from lidarpool.base.tracing import trace_to
 from lidarpool.datasets.dataset import DataSet
-from lidarpool.export.formats import Format
+from lidarpool.report.growing_cloud import CloudWriter
 from lidarpool.run.store.database import RunDatabase
 from lidarpool.run.store.run_store import RunStore
 
@@ -28,7 +28,8 @@ CALLS = {
     "END": (RunStore, "end"),
     "TABLE": (campaign_output, "write_table"),
     "FINISH": (DataSet, "finish"),
-    "SAVE": (Format, "write"),
+    "GROW": (CloudWriter, "append"),
+    "SAVE": (CloudWriter, "finish"),
     "PUT": (Storage, "put"),
     "REMOVE": (RunStore, "remove"),
 }

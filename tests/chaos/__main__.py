@@ -118,7 +118,11 @@ def main(arguments: list[str] | None = None) -> int:
             outcome = campaign.play(arena, known)
             _tell(len(campaign.outcomes), outcome, sum(campaign.done.values()))
     print(f"\n{campaign.table()}\n")
-    print(f"{len(campaign.outcomes)} runs in {time.monotonic() - started:.0f} s")
+    grown = sum(outcome.grown for outcome in campaign.outcomes)
+    runs = len(campaign.outcomes)
+    print(
+        f"{runs} runs in {time.monotonic() - started:.0f} s, in {grown} cloud.ply grew to its end"
+    )
     if campaign.waiting:
         print("not reached:", ", ".join(f"{f.kind} at {f.point}" for f in campaign.waiting))
     sound = all(outcome.sound for outcome in campaign.outcomes)

@@ -12,12 +12,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from tests.shapes import block
 
-from lidarpool import Actor, Planning, Result, Scene, Sensor, Survey, Track, remove_run, simulate
+from lidarpool import (
+    Actor,
+    Planning,
+    Result,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    remove_run,
+    save_cloud,
+    simulate,
+)
+from lidarpool.report.growing_cloud import GrowingCloud
+from lidarpool.run.pipeline.messages import Receipt
 from lidarpool.run.pipeline.placement import placement_violations
+from lidarpool.run.run_result import RunResult
+from lidarpool.run.runner import Run, StoredOutput
 
 from .arena import Arena
 from .checker import Verdict, judge
@@ -61,17 +78,72 @@ def digest(result: Result) -> str:
     return sha.hexdigest()
 
 
+class GrowingOutput(StoredOutput):
+    """Points that stay in the run's store, and a cloud.ply in `folder` that grows by them.
+
+    `ply` are the bytes of the file; None if it failed, as it may where a part is damaged.
+    """
+
+    ply: bytes | None
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._set(_folder=folder, ply=None)
+
+    def _set(self, **fields: Any) -> None:
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)  # the class is frozen
+
+    def look(self, run: Run[RunResult]) -> None:
+        """Begin the file, with the points of an earlier run."""
+        job = run.store.only_job
+        assert job is not None
+        growing = GrowingCloud(self._folder / "growing.ply", job)
+        self._set(_growing=run.stack.enter_context(growing))
+
+    def on_parts(self, parts: Sequence[Receipt]) -> None:
+        """Append parts to the file."""
+        self._growing.add(parts)
+
+    def finish(self, run: Run[RunResult]) -> RunResult:
+        """Complete the file, and return the result."""
+        path = self._folder / "cloud.ply"
+        points = run.store.only_job.points()
+        if self._growing.finish(path, points, from_above=True) is not None:
+            self._set(ply=path.read_bytes())
+        return super().finish(run)
+
+
+def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
+    """Run `simulate`, and grow a cloud.ply meanwhile; return its bytes too, None if it failed."""
+    with tempfile.TemporaryDirectory(prefix="chaos-ply-") as folder:
+        output = GrowingOutput(Path(folder))
+        with patch("lidarpool.api.simulation.StoredOutput", lambda: output):
+            result = simulate(*arguments, **options)
+        left = {path.name for path in Path(folder).iterdir()}
+    assert left == ({"cloud.ply"} if output.ply else set()), left
+    return result, output.ply
+
+
 @dataclass(frozen=True)
 class Reference:
     """What an undisturbed run gives."""
 
     digest: str
     rows: tuple[int, ...]  # scan of each row of the cloud
+    ply: bytes  # of the whole cloud, written at once
 
     @classmethod
     def of(cls, result: Result) -> Reference:
         """Keep what is compared."""
-        return cls(digest(result), tuple(result.cloud.scan.tolist()))
+        with tempfile.TemporaryDirectory() as folder:
+            save_cloud(result.points, path := Path(folder, "cloud.ply"))
+            ply = path.read_bytes()
+        return cls(digest(result), tuple(result.cloud.scan.tolist()), ply)
+
+    def is_same(self, result: Result, ply: bytes | None) -> bool:
+        """Whether all that a run delivers is the same; a file that has not grown is no loss."""
+        return digest(result) == self.digest and ply in (None, self.ply)
 
 
 @dataclass(frozen=True)
@@ -85,6 +157,7 @@ class Outcome:
     seconds: float
     replayed: int
     misplaced: int
+    grown: bool  # whether cloud.ply has grown to its end
     error: str = ""
 
     @property
@@ -128,28 +201,29 @@ def disturbed(
     arena.board.forget_events()
     started = time.monotonic()
     result: Result | None = None
+    ply: bytes | None = None
     error = ""
     place, stranger = (tempfile.mkdtemp(prefix=f"chaos-{of}-") for of in ("run", "stranger"))
     theirs = _run_of_another(Path(stranger))
     again = partial(
-        simulate, room(), what, planning, client=arena.client, backend="numpy", folder=place
+        growing, room(), what, planning, client=arena.client, backend="numpy", folder=place
     )
     try:
         with Nemesis(arena, faults, Path(place, "parts"), Path(stranger)) as nemesis:
             try:
-                result = again(**options)
+                result, ply = again(**options)
             except Exception as failure:
                 error = "".join(traceback.format_exception(failure))
         events = arena.board.events(nemesis.run)
         if result is not None and not {DAMAGE, LINK}.isdisjoint(kind for kind, _ in nemesis.done):
             arena.wait_until_whole()
-            mended = again(resume=True)
+            mended, ply = again(resume=True)
             cloud = mended.cloud
-            same = digest(mended) == known.digest
+            same = known.is_same(mended, ply)
             remove_run(place)
         else:
             cloud = None if result is None else result.cloud
-            same = result is not None and digest(result) == known.digest
+            same = result is not None and known.is_same(result, ply)
     finally:
         error += "" if _files_of(Path(stranger)) == theirs else "another's run was touched"
         shutil.rmtree(place, ignore_errors=True)
@@ -163,6 +237,7 @@ def disturbed(
         left=tuple(nemesis.left),
         seconds=time.monotonic() - started,
         replayed=0 if result is None else result.replayed,
+        grown=ply is not None,
         misplaced=0 if result is None else len(placement_violations(result.records)),
         error=error,
     )

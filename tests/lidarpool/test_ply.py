@@ -138,7 +138,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
 @pytest.mark.parametrize("count", [0, 70, 1000])
 def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch, count):
     """Written in pieces of 300 points, the file needs room for itself and one of them."""
-    monkeypatch.setattr(ply, "CHUNK_POINTS", 300)
+    monkeypatch.setattr(ply, "FIRST_POINTS", 300)
     path = tmp_path / "c.ply"
     free = 0
     usage = shutil.disk_usage(tmp_path)

@@ -19,8 +19,9 @@ from PIL import Image
 from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
+from lidarpool.report.cloud_counts import CloudCounts
 from lidarpool.report.page.rendering import MAX_ROWS, put_picture, write_page
-from lidarpool.report.report import CountedCloud, make_report
+from lidarpool.report.report import make_report
 from lidarpool.run.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.placement import TaskRecord
 from lidarpool.run.pipeline.task_book import TaskBook
@@ -64,13 +65,6 @@ def scene_of(names: Sequence[str]) -> Scene:
     return Scene.from_meshes(
         [SceneMesh(name, corners + 2 * k, faces) for k, name in enumerate(names)]
     )
-
-
-def counted(cloud: Any, objects: int) -> CountedCloud:
-    """Count a cloud while it is read, as by whoever writes it."""
-    counted = CountedCloud(cloud, objects)
-    assert sum(map(len, counted.chunks())) == len(counted) == len(cloud)
-    return counted
 
 
 def cloud_of(points: int, objects: int, scans: int, layers: int) -> Cloud:
@@ -131,7 +125,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         )
         drawn = PICTURES if plan else PICTURES[:4]
         page = tmp_path / "report.html"
-        numbers = counted(result.points, len(scene.names))
+        numbers = CloudCounts.from_cloud(result.points, len(scene.names))
         report = make_report(result, numbers)
         write_page(page, report, result, numbers, scenario)
         for name in drawn:
@@ -315,7 +309,7 @@ def test_the_density_is_that_of_the_surfaces(each):
     zero = np.zeros_like(u)
     both = np.concatenate([np.stack([u, v, zero], axis=1), np.stack([u, zero, v], axis=1)])
     columns = {name: np.zeros(len(both), np.int32) for name in ("scan", "channel", "object")}
-    found = counted(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
+    found = CloudCounts.from_cloud(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
     assert found.density == pytest.approx(each, rel=0.3)
 
 

@@ -22,7 +22,7 @@ from lidarpool import (
     Survey,
     save_cloud,
 )
-from lidarpool.report.report import CountedCloud
+from lidarpool.report.cloud_counts import CloudCounts
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
@@ -350,6 +350,6 @@ def test_other_formats_leave_waveforms_out(tmp_path):
     save_cloud(cloud, tmp_path / "cloud.ply")
     assert b"waveform" not in (tmp_path / "cloud.ply").read_bytes()[:2000]
     assert "waveform" not in cloud.to_dataframe().columns
-    numbers = CountedCloud(cloud, objects=60)
-    assert sum(len(chunk) for chunk in numbers.chunks()) == len(cloud)
+    numbers = CloudCounts.from_cloud(cloud, objects=60)
+    assert numbers.by_object.sum() == len(cloud)
     assert "range" in numbers.limits and WAVEFORM not in numbers.limits

@@ -66,7 +66,9 @@ MOMENTS = [
     ("COMMIT", 1),  # parts are in storage, and nothing is in the database
     ("COMMIT", 2),  # a run's first is of less than half: few batches are under way until then
     ("driver.frame", 100),
+    ("GROW", 1),  # by a thread, of parts of earlier runs
     ("OPEN", 1),
+    ("GROW", 5),
     ("SAVE", 1),
     ("REMOVE", 1),
 ]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from lidarsim.base.archives import read_arrays, read_npy
-from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
+from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Integers, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input
 from lidarsim.base.sampling import even_indices
@@ -213,6 +213,29 @@ class StoredCloud(CloudDisplay):
     def cloud_of(self, part: PartColumns, rows: Integers | slice = slice(None)) -> Cloud:
         """Return the points of a part, or a selection of rows."""
         return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
+
+    def columns_of(self, part: PartColumns) -> dict[str, AnyArray]:
+        """Return the columns of a part without positions, {name: (n,)}, in the order of files."""
+        return {
+            column.name: part.scan_column() if column is SCAN else part.columns[column.name]
+            for column in self.table
+        }
+
+    def positions_of(self, part: PartColumns, rows: slice) -> Iterator[tuple[str, Floats]]:
+        """Yield the names of axes with coordinates of rows of a part, (n,), metres."""
+        for i, axis in enumerate(AXES):
+            cells = part.columns[axis.name][rows]
+            yield axis.name, positions_of(cells, self.precision_m, self.origin[i])
+
+    def cells_along(self, axis: int, coordinates: AnyFloats) -> Ints:
+        """Return the cells of coordinates along an axis, (n,), metres.
+
+        Coordinates in a file err by a tenth of the precision at most.
+        """
+        cells = coordinates.astype(np.float64)
+        cells -= self.origin[axis]
+        cells /= self.precision_m
+        return np.rint(cells, out=cells).astype(np.int64)
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the cloud in order, from row `first` on, in chunks of `points`.

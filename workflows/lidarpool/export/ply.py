@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyFloats, Records
+from lidarsim.base.arrays import AnyArray, AnyFloats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
-from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.table import AXES as POSITION
-from lidarsim.columns.table import NORMAL, TABLE, check_names
+from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
@@ -24,43 +26,193 @@ from . import reading
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
+FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long for a point
+_BLOCK_BYTES = 1 << 23  # moved at a time
 
 
 def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
-    About a million points are in memory at a time: Open3D writes the first chunk to a temporary
-    file, whose rows and header show its layout, and the further chunks follow as such rows. The
-    bytes are the same as if Open3D wrote all points at once, which would need memory for all.
-    float64 positions are stored in single precision if the error is below a twentieth of the
-    precision of the sweeps, else in double. Names of classes and materials are comments: `class 40
-    road`, `material 0 Brick`. A comment says if points are not in the world frame.
+    About a million points are in memory at a time. float64 positions are stored in single precision
+    if the error is below a twentieth of the precision of the sweeps, else in double. Names of
+    classes and materials are comments: `class 40 road`, `material 0 Brick`. A comment says if
+    points are not in the world frame.
     """
-    check_names((*POSITION, *cloud.table))
     position_type = real_type(cloud.bounds, sweeps.precision_m)
-    row = row_type(position_type, cloud.table)
+    with GrowingPly(path, cloud.table, position_type, sweeps, len(cloud)) as file:
+        file.check_room(len(cloud))
+        for chunk in cloud.chunks():
+            file.append(len(chunk), chunk.by_name.items())
+        file.finish()
+
+
+class GrowingPly:
+    """A binary PLY file to which points are appended; the file is complete after `finish`.
+
+    Open3D writes the first points to a temporary file, whose rows and header show its layout, and
+    further points follow as such rows. The bytes are the same as if Open3D wrote all points at
+    once, which would need memory for all.
+
+    Parameters
+    ----------
+    path
+        The file, which must not exist.
+    table
+        Columns beside the positions.
+    position_type
+        float32 or float64, see `real_type`.
+    sweeps
+        Sweeps of the points, for comments.
+    expected_count
+        Expected number of points. If the number at the end has more or fewer digits, the rows are
+        moved within the file, because the header has another length.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        table: Sequence[Column],
+        position_type: np.dtype[np.floating],
+        sweeps: Sweeps,
+        expected_count: int,
+    ) -> None:
+        check_names((*POSITION, *table))
+        self.position_type = position_type
+        self.row = row_type(position_type, table)
+        self.count = 0  # points in the file
+        self._path = path
+        self._columns = {column.name: column for column in table}
+        self._expected_count = expected_count
+        self._comments = _comments(table, sweeps)
+        self._start = 0  # offset of the first row, bytes; 0 without rows
+        self._head_parts = (b"", b"")  # the header, before and after the line of the number
+        self._file = path.open("x+b", buffering=0)
+
+    def __enter__(self) -> GrowingPly:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    @property
+    def size(self) -> int:
+        """Size of the file in bytes."""
+        return self._start + self.count * self.row.itemsize
+
+    def check_room(self, count: int) -> None:
+        """Raise LidarError unless the disk has room for `count` points, and for the first again."""
+        size = len(header(self.row, count, self._comments)) + count * self.row.itemsize
+        piece = min(count, FIRST_POINTS) * self.row.itemsize
+        free = shutil.disk_usage(self._path.parent).free
+        if free < size + piece:
+            raise LidarError(
+                f"{self._path} could not be written: it takes {size:,} bytes, and {piece:,} beside "
+                f"it meanwhile; the disk has {free:,} bytes free. Make room, or write to another "
+                "folder."
+            )
+
+    def append(self, count: int, columns: Iterable[tuple[str, AnyArray]]) -> None:
+        """Append points.
+
+        Parameters
+        ----------
+        count
+            Number of points.
+        columns
+            Names of axes and columns, with values (n,), each once; positions in float32 or float64.
+
+        Raises
+        ------
+        LidarError
+            If Open3D cannot write, or a value does not fit into the file.
+        OSError
+            If the disk is full, or the file cannot be written for another reason.
+        """
+        first = 0
+        if not self._start and count:
+            columns = [*columns]
+            first = min(count, FIRST_POINTS)
+            self._write_first({name: values[:first] for name, values in columns})
+        if first < count:
+            rows = np.empty(count - first, self.row)
+            for name, values in columns:
+                column = self._columns.get(name)
+                if column is None:
+                    rows[name] = values[first:]
+                else:
+                    rows[column.in_files] = as_file_type(column, values[first:])
+            self._write(rows.data.cast("B"))
+        self.count += count
+
+    def flush(self) -> None:
+        """Flush the points to the disk."""
+        os.fsync(self._file.fileno())
+
+    def finish(self) -> None:
+        """Write the header with the number of points."""
+        if not self._start:  # Open3D refuses to write a file without points
+            self._write(header(self.row, 0, self._comments))
+            return
+        head = self._header(self.count)
+        if len(head) != self._start:
+            _move_bytes(self._file.fileno(), self._start, self.size, len(head))
+            self._start = len(head)
+        os.pwrite(self._file.fileno(), head, 0)
+
+    def _header(self, count: int) -> bytes:
+        before, after = self._head_parts
+        return b"%s%selement vertex %d\n%s" % (before, self._comments.encode(), count, after)
+
+    def _write_first(self, columns: Mapping[str, AnyArray]) -> None:
+        """Write a header and the first rows in the layout of Open3D."""
+        positions = np.stack([columns[axis] for axis in AXES], axis=1)
+        others = {name: columns[name] for name in self._columns}
+        cloud = Cloud(positions, others, tuple(self._columns.values()))
+        # Open3D chooses the format by the ending of the name.
+        piece = self._path.with_name(f".{self._path.name}.ply")
+        write_with_open3d(piece, cloud, self.position_type)
+        start, self.row = _layout(piece, self._path, len(cloud))
+        written = piece.read_bytes()
+        piece.unlink()
+        before, _, after = written[:start].partition(b"element vertex %d\n" % len(cloud))
+        self._head_parts = before, after
+        head = self._header(self._expected_count)
+        self._write(head + written[start:])
+        self._start = len(head)
+
+    def _write(self, data: bytes | memoryview) -> None:
+        """Append bytes to the file."""
+        view = memoryview(data)
+        while view:  # the kernel writes 2 GiB at most at a time
+            view = view[self._file.write(view) :]
+
+
+def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
+    """Return the lines of a header that lidarpool adds to those of Open3D."""
     comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
     comments += "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
-    if any(column.name == "material" for column in cloud.table):
+    if any(column.name == "material" for column in table):
         names = enumerate(map(_comment, sweeps.materials))
         comments += "".join(f"comment material {n} {name}\n" for n, name in names)
-    _check_room(path, header(row, len(cloud), comments), len(cloud), row.itemsize)
-    with path.open("xb") as file:
-        for chunk in cloud.chunks():
-            if file.tell():
-                file.write(_rows(chunk, row).data)
-                continue
-            piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
-            write_with_open3d(piece, chunk, position_type)
-            start, row = _layout(piece, path, len(chunk))
-            written = piece.read_bytes()
-            vertex_line = b"element vertex %d\n" % len(chunk)
-            all_points = f"{comments}element vertex {len(cloud)}\n".encode()
-            file.write(written[:start].replace(vertex_line, all_points))
-            file.write(memoryview(written)[start:])
-            piece.unlink()
-        if not file.tell():  # which Open3D refuses to write
-            file.write(header(row, 0, comments))
+    return comments
+
+
+def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
+    """Move the bytes from `start` to `stop` of a file to `new_start`, and cut off what follows."""
+    offsets = range(start, stop, _BLOCK_BYTES)
+    distance = new_start - start
+    for offset in reversed(offsets) if distance > 0 else offsets:
+        block = memoryview(os.pread(file, min(_BLOCK_BYTES, stop - offset), offset))
+        position = offset + distance
+        while block:
+            written_count = os.pwrite(file, block, position)
+            block = block[written_count:]
+            position += written_count
+    os.ftruncate(file, stop + distance)
 
 
 @checked
@@ -120,18 +272,6 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     return np.dtype(np.float32 if enough else np.float64)
 
 
-def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
-    """Check that the disk has room for a file of `count` points, and for a temporary chunk."""
-    size = len(head) + count * row_bytes
-    piece = min(count, CHUNK_POINTS) * row_bytes
-    free = shutil.disk_usage(path.parent).free
-    if free < size + piece:
-        raise LidarError(
-            f"{path} could not be written: it takes {size:,} bytes, and {piece:,} beside it "
-            f"meanwhile; the disk has {free:,} bytes free. Make room, or write to another folder."
-        )
-
-
 def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
     """Write a cloud with positions of a type; LidarError if Open3D reports an error."""
     o3d = load_open3d()  # here, because read_cloud does not need it
@@ -154,16 +294,6 @@ def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> 
         raise LidarError(f"Open3D cannot write {path.parent}: {error}.") from error
     if not written:
         raise LidarError(f"Open3D cannot write to {path.parent}: check folder and disk.")
-
-
-def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
-    """Return the rows of a file, of the types and in the order of `row`."""
-    rows = np.empty(len(cloud), row)
-    for axis, values in zip(AXES, cloud.positions.T, strict=True):
-        rows[axis] = values
-    for column in cloud.table:
-        rows[column.in_files] = as_file_type(column, cloud[column.name])
-    return rows
 
 
 def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:

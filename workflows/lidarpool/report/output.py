@@ -27,12 +27,15 @@ from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.format_table import FORMATS, FormatRow, plugin_rows
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation_files import write_instruments
+from ..run.pipeline.messages import Receipt
 from ..run.run_result import RunResult
 from ..run.runner import Output, Run
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
+from .cloud_counts import CloudCounts
+from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content
-from .report import CountedCloud, make_report
+from .report import make_report
 
 CLOUD = FORMATS["ply"].file
 PAGE = "report.html"
@@ -59,6 +62,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     judge: Callable[[RunResult], str] = lambda result: ""
 
     def __post_init__(self) -> None:
+        self._growing: GrowingCloud | None = None
         self.formats = [
             output_format for output_format in self.formats if output_format.format != "ply"
         ]
@@ -108,6 +112,18 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             lists = f"{target} holds {foreign[0]}, which no result there lists"
             raise LidarError(f"{lists}: {advice}")
         refuse_strangers(storage, _rows({*further, *listed}))
+
+    def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
+        """Begin the cloud, with the points of an earlier run."""
+        job = run.store.only_job
+        assert job is not None, "of a survey"
+        folder = run.stack.enter_context(staging(self._folder, self.target))
+        self._growing = run.stack.enter_context(GrowingCloud(folder / CLOUD, job))
+
+    def on_parts(self, parts: Sequence[Receipt]) -> None:
+        """Append parts to the cloud."""
+        if self._growing is not None:
+            self._growing.add(parts)
 
     def finish(
         self, run: Run[tuple[RunResult, dict[str, Any]]]
@@ -173,9 +189,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             refuse_strangers(destination, _rows({*further, *earlier}))
             clear = cache(partial(_clear, destination, further, earlier))  # at most once
             sweeps = _write_sweeps(staged, result, sweeps)
-            sizes = len(result.scene.all_names), len(result.scene.material_names)
-            cloud = CountedCloud(_shown_points(result, CLOUD, show), *sizes)
-            Format("ply").write(staged / CLOUD, cloud, sweeps)
+            counts = self._write_cloud(staged / CLOUD, result, sweeps, show)
             timeline.mark(timeline.CLOUD_WRITTEN)
             for output_format in sorted(self.formats, key=lambda entry: entry.row.in_pieces):
                 file = output_format.row.file
@@ -188,11 +202,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                     output_format.write(staged / file, points, sweeps, workers=format_workers)
             if workers:
                 result = workers.recorded(result)
-            report = make_report(result, cloud)
+            report = make_report(result, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps)
             if self.extent != "cloud":
-                self._report(result, report, cloud, staged, show)
+                self._report(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
             if storage is None:
@@ -205,11 +219,24 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         timeline.mark(timeline.IN_PLACE)
         return report
 
+    def _write_cloud(
+        self, path: Path, result: RunResult, sweeps: Sweeps, show: WritingProgress
+    ) -> CloudCounts:
+        """Write the cloud, or move the file there that has grown; return the counts of points."""
+        points = _shown_points(result, CLOUD, show)
+        on_page = self.extent != "cloud"
+        with explained(f"{path} cannot be written"):
+            if self._growing is not None:
+                counts = self._growing.finish(path, points, from_above=on_page)
+                if counts is not None:
+                    return counts
+            return write_cloud(path, points, sweeps, result.scene, from_above=on_page)
+
     def _report(
         self,
         result: RunResult,
         report: dict[str, Any],
-        cloud: CountedCloud,
+        counts: CloudCounts,
         staged: Path,
         show: WritingProgress,
     ) -> None:
@@ -218,7 +245,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
         shown = picture_content(result)
         shown.save(staged / PICTURE_FILE)
-        write_page(staged / PAGE, report, result, cloud, self.scenario)
+        write_page(staged / PAGE, report, result, counts, self.scenario)
         if self.extent == "pictures":
             from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
 

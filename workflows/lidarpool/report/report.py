@@ -1,10 +1,10 @@
-"""The report of a run, as plain data for JSON, and the statistics of its cloud."""
+"""The report of a run, as plain data for JSON."""
 
 from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 
 from lidarsim._version import __version__
-from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import declared
 from lidarsim.base.storage import Storage
-from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from lidarsim.columns.table import NO_SURFACE, Column
+from lidarsim.columns.table import NO_SURFACE
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Sensor, Survey
 from lidarsim.sensor.survey import CloudOptions
@@ -29,9 +27,8 @@ from ..run.pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
 from ..run.run_result import RunResult
 from ..run.trials import TRIAL
+from .cloud_counts import CloudCounts
 
-_CELLS = 64  # along an axis of the grid in which points are counted, a power of two
-_MIN_POINTS = 12  # points in a cell from which a density is estimated
 ELEVATION_RAYS = 20_000  # whose elevations are examined
 # {stage: its name on pages}, in the order of the pipeline
 STAGES = {
@@ -54,81 +51,6 @@ _FIGURES = (
 _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
-class CountedCloud:
-    """A cloud that computes statistics while its points are read for another purpose.
-
-    `by_object`, `by_class` and `by_material` are the numbers of points of each object, class and
-    material, `no_surface` the points of no object, `limits` are {column: minimum and maximum},
-    `bounds` (2, 3) the lowest and highest coordinates in the world, and `above` (rows, columns) the
-    numbers of points seen from above, the first row in the south.
-    """
-
-    def __init__(self, cloud: CloudLike, objects: int, materials: int = 0) -> None:
-        self._cloud = cloud
-        self.by_object = np.zeros(objects, np.int64)
-        self.no_surface = 0
-        self.by_class = np.zeros(1 << 16, np.int64)
-        self.by_material = np.zeros(materials, np.int64)
-        self.limits: dict[str, tuple[float, float]] = {}
-        self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
-        # A cell that a surface crosses has about the square of its side of that surface.
-        self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
-        self._cells = np.zeros(_CELLS**3, np.int64)
-        # The more points, the finer.
-        across = np.ptp(self.bounds[:, :2], axis=0)
-        self._pixel = float(across.max() / np.clip(len(cloud) ** 0.5, 50, 800)) or 1.0
-        self.above = np.zeros((across[::-1] / self._pixel).astype(np.int64) + 1, np.int64)
-        self.table: tuple[Column, ...] = cloud.table
-        self.row_of = cloud.row_of
-
-    def __len__(self) -> int:
-        return len(self._cloud)
-
-    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, and update the statistics."""
-        for chunk in self._cloud.chunks(points, first):
-            owners = chunk["object"]
-            if owners.min(initial=0) < 0:
-                owners = owners[owners >= 0]
-                self.no_surface += len(chunk) - len(owners)
-            self.by_object += np.bincount(owners, minlength=len(self.by_object))
-            if "class" in chunk.columns:
-                self.by_class += np.bincount(chunk["class"], minlength=len(self.by_class))
-            if "material" in chunk.columns:
-                numbers = chunk["material"]
-                numbers = numbers[numbers >= 0]
-                self.by_material += np.bincount(numbers, minlength=len(self.by_material))
-            for name in (column.name for column in chunk.table):
-                values = chunk[name]
-                lower, upper = self.limits.get(name, (np.inf, -np.inf))
-                self.limits[name] = (
-                    min(lower, np.fmin.reduce(values).item()),
-                    max(upper, np.fmax.reduce(values).item()),
-                )
-            cell = ((chunk.positions - self.bounds[0]) / self._side).astype(np.int64)
-            x, y, z = cell.clip(0, _CELLS - 1).T
-            cell = (x * _CELLS + y) * _CELLS + z  # a product of whole numbers by `@` is slow
-            self._cells += np.bincount(cell, minlength=len(self._cells))
-            pixel = (chunk.positions[:, :2] - self.bounds[0, :2]) / self._pixel
-            rows, columns = self.above.shape
-            x, y = pixel.astype(np.int64).clip(0, (columns - 1, rows - 1)).T
-            self.above += np.bincount(y * columns + x, minlength=rows * columns).reshape(rows, -1)
-            yield chunk
-
-    @property
-    def density(self) -> float | None:
-        """Points per square metre, the median over the surfaces; None before points are read."""
-        if not self._cells.any():
-            return None
-        cells = self._cells.reshape(3 * (_CELLS,))
-        side = self._side
-        while (median := float(np.median(cells[cells > 0]))) < _MIN_POINTS and len(cells) > 1:
-            half = len(cells) // 2  # in larger cells, gaps between sparse points count
-            cells = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5))
-            side = 2 * side
-        return median / side**2
-
-
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the main dependencies."""
     result = {"lidarpool": __version__, "python": platform.python_version()}
@@ -138,7 +60,7 @@ def versions() -> dict[str, str]:
     return result
 
 
-def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
+def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     """Return the report of a run, ready for JSON.
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
@@ -187,7 +109,7 @@ def make_report(result: RunResult, cloud: CountedCloud) -> dict[str, Any]:
     }
 
 
-def _points_by_material(scene: Scene, cloud: CountedCloud) -> dict[str, Any]:
+def _points_by_material(scene: Scene, cloud: CloudCounts) -> dict[str, Any]:
     """Return the points of each material, if the cloud has the column `material`."""
     if not any(column.name == "material" for column in cloud.table):
         return {}
@@ -238,7 +160,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     }
 
 
-def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
+def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
     """Describe the columns of the cloud except x, y and z."""
     return [
         {

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
@@ -30,7 +30,7 @@ from .job_source import JobMaker, failed_row
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
-from .pipeline.messages import ScanFrame
+from .pipeline.messages import Receipt, ScanFrame
 from .pipeline.names import GPU, LIDAR, OTHER
 from .pipeline.pipeline import Pipeline
 from .pipeline.task_book import StageTotals
@@ -47,6 +47,13 @@ LONGEST_PAUSE_S = 0.05  # while nothing moves
 EXTRA_JOBS = 64  # jobs under way, at most, in addition to two for each GPU slot
 
 
+class Listeners(NamedTuple):
+    """Functions that are called in the run's thread with results of the single job of a survey."""
+
+    on_frame: Callable[[ScanFrame], None]  # with each frame
+    on_parts: Callable[[Sequence[Receipt]], None]  # with committed parts
+
+
 class RunLoop:
     """Takes the jobs of a run through the pipeline: the first job, and the jobs of `maker`.
 
@@ -57,14 +64,14 @@ class RunLoop:
     store
         Database of the run, and storage of its parts.
     page
-        Page of the run, to which parts and ended jobs are reported.
+        Page of the run, to which ended jobs are reported.
     maker
         Makes the jobs of a campaign after the first; None for the single job of a survey.
     dataset
         Data set into which the jobs of a campaign are written; None for a survey, whose parts are
         kept.
-    on_frame
-        Called with each frame of the single job of a survey.
+    listeners
+        Functions that are called with results of the single job of a survey.
     """
 
     def __init__(
@@ -74,13 +81,13 @@ class RunLoop:
         page: RunPage,
         maker: JobMaker | None,
         dataset: DataSet | None,
-        on_frame: Callable[[ScanFrame], None],
+        listeners: Listeners,
     ) -> None:
         self._cluster = cluster
         self._store = store
         self._page = page
         self._maker = maker
-        self._on_frame = on_frame
+        self._listeners = listeners
         options = cluster.options
         run_id = uuid.uuid4().hex[:8]
         mark = store.db.meta["mark"]
@@ -204,8 +211,8 @@ class RunLoop:
                 on_device=cluster.backend == "cuda",
             ),
             scans_of_run=len(job.scans) * jobs_left,
-            on_frame=partial(cluster.call, self._on_frame) if is_only else None,
-            on_parts=self._page.on_parts if is_only else None,
+            on_frame=partial(cluster.call, self._listeners.on_frame) if is_only else None,
+            on_parts=self._listeners.on_parts if is_only else None,
         )
         self._jobs_begun += 1
         self._scans_begun += len(job.scans)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -24,9 +24,9 @@ from .cluster.cluster import Cluster, start_local
 from .cluster.connection import StartedAhead
 from .job_source import JobMaker, Jobs
 from .options import RunOptions
-from .pipeline.messages import ScanFrame
+from .pipeline.messages import Receipt, ScanFrame
 from .progress import Screen
-from .run_loop import RunLoop
+from .run_loop import Listeners, RunLoop
 from .run_page import RunPage
 from .run_result import RunResult
 from .store.database import FILE
@@ -53,7 +53,10 @@ class Output(Generic[R]):
         """Load what writes the results, so that a missing library is reported at the start."""
 
     def look(self, run: Run[R]) -> None:
-        """Compare the files of the output with the jobs that the store calls done."""
+        """Compare the output with the results of an earlier run in the store."""
+
+    def on_parts(self, parts: Sequence[Receipt]) -> None:
+        """Note that parts of the only job were committed; return at once."""
 
     def finish(self, run: Run[R]) -> R:
         """Write the last files, and return the result."""
@@ -211,7 +214,8 @@ class Run(Generic[R]):
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)
-        self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, self._frame)
+        listeners = Listeners(self._frame, self._parts)
+        self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, listeners)
         with self.screen.progress() as show:
             self.loop.run(first, show)
 
@@ -219,6 +223,10 @@ class Run(Generic[R]):
         self.page.on_frame(frame)
         if self._on_frame is not None:
             self._on_frame(frame)
+
+    def _parts(self, parts: Sequence[Receipt]) -> None:
+        self.page.on_parts(parts)
+        self.output.on_parts(parts)
 
     # -- for outputs -------------------------------------------------------------------------
 

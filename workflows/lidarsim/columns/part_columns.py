@@ -87,8 +87,11 @@ class PartColumns:
         return Cloud(positions_of(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
-def positions_of(cells: Integers, precision_m: float, origin: Floats) -> Floats:
-    """Return world coordinates (n, 3), metres, of points in cells (n, 3) of `precision_m`."""
+def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
+    """Return world coordinates, metres, of points in cells of `precision_m`.
+
+    Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
+    """
     positions: Floats = cells * precision_m + origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
     digits = max(0, 3 - decade(precision_m))

@@ -33,7 +33,8 @@ from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
-from ..report import STAGES, CountedCloud, in_order
+from ..cloud_counts import CloudCounts
+from ..report import STAGES, in_order
 
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 WIDTH = 1000  # units of the drawing, which the page scales
@@ -52,7 +53,7 @@ def write_page(
     path: Path,
     report: Mapping[str, Any],
     result: RunResult,
-    cloud: CountedCloud,
+    cloud: CloudCounts,
     scenario: Scenario | None = None,
 ) -> None:
     """Write a report as a single HTML file, which needs no further files and no network.
