@@ -10,7 +10,7 @@ from lidarpool import LidarError, Material, Mounted, MujocoScanner, Pose, Sensor
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
 
 VLP16 = load_sensor("velodyne/vlp16")
-CENTRED = Sensor.grid(1800, 16, vertical_fov_deg=30)  # beams start at its centre
+CENTRED = Sensor.grid(1800, 16, vertical_fov_deg=30, max_range_m=130)  # beams start at a point
 
 GRID = Sensor.grid(rays_per_revolution=360, layers=16, step_deg=30, max_range_m=60)
 GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
