@@ -144,21 +144,6 @@ def test_a_look_at_all_fills_the_picture_and_the_sensor_can_be_seen(served, new_
     assert tab.errors == []
 
 
-def test_the_keyboard_alone_presses_buttons_and_keys_work_after_a_box_was_clicked(served, new_tab):
-    tab = opened(new_tab, served)
-    tab.wait_for(lambda _: drawn(tab) == COUNT)
-    tab.tick("shade by depth", on=False)
-    tab.value("document.querySelector('label.tick input').focus()")
-    tab.key("t")
-    tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
-    tab.value("document.querySelector('summary').focus({ focusVisible: true })")
-    for kind in ("keyDown", "keyUp"):
-        tab.call("Input.dispatchKeyEvent", type=kind, key=" ", code="Space", text=" ")
-    tab.wait_for(lambda _: not tab.value("document.querySelector('details').open"))
-    assert tab.value("lidarpool.playing") is False
-    assert tab.errors == []
-
-
 def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
     tab = opened(new_tab, served)
     tab.wait_for(lambda _: drawn(tab) == COUNT)
@@ -180,11 +165,86 @@ def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
     at = tab.value("lidarpool.chosen.time")
     assert -9 < tab.value(van) < 9
     tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") == at)
+    tab.click("Range image")
     image = "document.querySelector('#images canvas')"
     tab.wait_for(lambda _: (tab.value(f"{image}?.height") or 1) > 1)
     tab.tick("Sensor", False)
     tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
+
+
+def test_keys_work_wherever_the_focus_is_and_a_question_mark_shows_them(served, new_tab):
+    tab = opened(new_tab, served)
+    focus = "document.querySelector({!r}).focus({{ focusVisible: true }})"
+    controls = ("#time .icon", "select", "input[type=checkbox]", "summary", "input[type=range]")
+    boxes = "[...document.querySelectorAll('input[type=checkbox]')].map(box => box.checked)"
+    before = tab.value(boxes)
+    for number, control in enumerate(controls):
+        tab.value(focus.format(control))
+        tab.key("Home")
+        tab.key("ArrowRight")
+        tab.wait_for(lambda text: "sweep 2 of 10" in text)
+        tab.key(" ")
+        assert tab.value("lidarpool.playing"), control
+        tab.key(" ")
+        assert not tab.value("lidarpool.playing"), control
+        if number % 2:  # a letter, too
+            tab.key("t")
+            assert tab.value(f"{PICTURE}.isParallel")
+            tab.key("a")
+    assert tab.value(boxes) == before
+    tab.value(focus.format("input[type=checkbox]"))
+    tab.key("Enter")
+    assert tab.value(boxes)[0] != before[0]
+    tab.key("?")
+    tab.wait_for(lambda text: "play or pause" in text)
+    tab.key(" ")
+    assert not tab.value("lidarpool.playing"), "the page behind the list is left alone"
+    tab.key("?")
+    tab.wait_for(lambda text: "play or pause" not in text)
+    text_field = (
+        "document.body.append(Object.assign(document.createElement('input'), {id: 'text'}))"
+    )
+    tab.value(text_field)
+    tab.value(focus.format("#text"))
+    tab.key("?")
+    assert "play or pause" not in tab.text and tab.errors == []
+
+
+def test_the_range_image_is_off_and_filled_as_soon_as_it_is_on(served, new_tab):
+    tab = opened(new_tab, served)
+    assert tab.value("document.getElementById('images').hidden")
+    tab.click("Range image")
+    tab.wait_for(lambda _: (tab.value("document.querySelector('#images canvas')?.height") or 1) > 1)
+    assert "30,000 points" in tab.text and tab.errors == []
+
+
+def test_following_snaps_to_the_carrier_and_keeps_the_place_behind_it(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.key("a")
+    tab.click("Follow")
+    beside = f"{PICTURE}.camera.position.clone().sub({PICTURE}.carrier).toArray()"
+    x, y, z = at_start = tab.value(beside)
+    assert abs(x) < 1e-6 and y < -1 and z > 0, "it drives along y"
+    tab.key("End")
+    tab.wait_for(lambda text: "sweep 10 of 10" in text)
+    assert tab.value(beside) == pytest.approx(at_start, abs=1e-6)
+    assert tab.value(f"{PICTURE}.carrier.y") > -2 and tab.errors == []
+
+
+def test_an_object_fills_the_first_picture_and_no_rays_hide_it(view, new_tab):
+    around = [[x, y, 2.0] for x in (-60, 60) for y in (-60, 60)]
+    survey = Survey(Sensor.grid(layers=4), steps=9, poses=around)
+    ends = np.array([[[60, 60, 2], [0, 0, 0]]] * 9, np.float32)
+    scene = replace(view.pictured.scene, actors=())
+    hits = np.zeros(scene.triangles, np.int64)
+    pictured = PictureContent(scene, sensor_positions(survey), hits, ends)
+    with page_server(View(view.points, pictured).answer, port=0) as page:
+        tab = opened(new_tab, page)
+        assert tab.value(f"{PICTURE}.viewHeight") < 40  # of an object of 20 m
+        assert tab.value(f"{PICTURE}.rays.visible") is False
+        tab.tick("sample rays", on=True)
+        assert tab.value(f"{PICTURE}.rays.visible") and tab.errors == []
 
 
 def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, tmp_path):

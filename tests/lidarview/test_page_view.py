@@ -221,6 +221,18 @@ def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
     assert set(arrays["objects"].tolist()) == {0}
 
 
+def test_sensors_around_an_object_leave_the_picture_to_it(cloud):
+    scene = Scene.from_meshes([box("Block", (2, 4, 2))])
+    views = []
+    for poses in ([(9, 0, 1), (-9, 0, 1)], [(9, 0, 1), (0, 0, 0)]):
+        survey = Survey(Sensor.grid(layers=4), steps=9, poses=[(*p,) for p in poses])
+        content, _ = PictureContent.before_casting(scene, survey)
+        header, arrays = View(CloudFile(cloud), content).answer("state", {}, bool)
+        np.testing.assert_allclose(header["bounds"][1][0], 9)
+        views.append(arrays["corners"])
+    assert abs(views[0]).max() == 4 / 2 and abs(views[1]).max() == 9
+
+
 def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
     """The camera is near the way, and towers are cut above it."""
     scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), box("Tower", (9, 9, 90))])

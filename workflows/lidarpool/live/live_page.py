@@ -163,7 +163,8 @@ class LivePage(RunPage):
                 self._loads.append((time_s, stats))
 
     def ended(self, row: JobRow) -> None:
-        """Count a job, and add an entry to the last jobs."""
+        """Count a job, and move its entry from the jobs under way to the last jobs."""
+        self._under_way = [job for job in self._under_way if job["name"] != row.name]
         entry = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
         entry |= {"number": row.number, "opens": row.done and self._written is not None}
         entry["values"] = self._words(row.values)

@@ -214,20 +214,23 @@ class View:
         """Return the origin (3,), world metres; the box (2, 3) and points (k, 3) to be in sight.
 
         The box contains the points, local, metres. The points are the corners of the scene, the
-        positions of the sensors, and both ends of the planned path: closer together than the
-        corners of the box, which around an object is mostly empty.
+        positions of the sensors unless these are around an object, and both ends of the planned
+        path: closer together than the corners of the box, which around an object is mostly empty.
         """
         if self.pictured is None:
             origin, box = _cloud_extent(self.points)
             return origin, box, corners_of(box)
         scene = self.pictured.scene
         planning = self.pictured.planning
-        sensors = [sensor.positions for sensor in self.pictured.sensors]
-        corners = np.concatenate([corners_of(scene.bounds), *sensors])
+        sensors = np.concatenate([np.empty((0, 3)), *(s.positions for s in self.pictured.sensors)])
+        corners = corners_of(scene.bounds)
         if planning is not None:
             level = corners[:, 2].min()
             corners = np.vstack([corners, [*planning.start, level], [*planning.target, level]])
-        return scene.origin, np.stack([corners.min(axis=0), corners.max(axis=0)]), corners
+        all_corners = np.vstack([corners, sensors])
+        if not _are_around(sensors, scene.bounds):
+            corners = all_corners
+        return scene.origin, np.stack([all_corners.min(axis=0), all_corners.max(axis=0)]), corners
 
     # -- answers -------------------------------------------------------------------------
 
@@ -632,6 +635,12 @@ def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
     colours = np.full((len(ranges), 4), 255, np.uint8)
     colours[:, :3] = as_bytes(mapped("viridis_r", shade))
     return colours
+
+
+def _are_around(sensors: Floats, bounds: Floats) -> bool:
+    """Return True if all sensors (n, 3), n > 1, are beside or above an object's bounds (2, 3)."""
+    outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
+    return len(sensors) > 1 and bool(outside.all())
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats]:

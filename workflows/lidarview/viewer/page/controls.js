@@ -24,6 +24,7 @@ const ICONS = {
   link: '<path d="M6.5 9.5l3-3M7 5l1.5-1.5a2.8 2.8 0 0 1 4 4L11 9M9 11l-1.5 1.5a2.8 2.8 0 0 1-4-4L5 7"/>',
   picture: '<path d="M2 5h3l1-2h4l1 2h3v8H2z"/><circle cx="8" cy="8.7" r="2.3"/>',
   panel: '<path d="M2.5 4h11M2.5 8h11M2.5 12h11"/>',
+  help: '<path d="M5.5 6a2.5 2.5 0 1 1 3.6 2.2C8.3 8.7 8 9.2 8 10M8 12.7v.1"/>',
   theme: '<circle cx="8" cy="8" r="5.5"/><path class="full" d="M8 2.5a5.5 5.5 0 0 1 0 11z"/>',
 };
 

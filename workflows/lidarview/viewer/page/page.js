@@ -24,8 +24,8 @@ const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
 // What users have chosen; a link holds it.
 const chosen = {
-  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: true,
-  budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: true, follow: false,
+  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: false,
+  budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: false, follow: false,
 };
 let state = null; // of the server: {…, arrays}
 let sweeps = []; // [{first, last, begin, sensor, index}] in order of their beginnings
@@ -318,7 +318,7 @@ function buildPanel() {
     "header", {}, element("h1", { textContent: document.title, title: document.title }),
     iconButton("link", "Copy the link to this view", copyLink),
     iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
-    theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
+    iconButton("help", "Keys and mouse (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
   );
   panel.legend = element("div");
   const points = section("Points", true,
@@ -380,11 +380,6 @@ function buildPanel() {
     parts.push(section("Export", false, format, button("Download", () => download(format.menu.value).catch(failed)),
       element("div", { className: "note", textContent: "The points that are shown: filtered, clipped, at this time." })));
   }
-  parts.push(section("Keys", false, element("dl", { className: "keys", innerHTML: [
-    ["space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
-    ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
-    ["H", "hide or show the panel"], ...(state.results.length ? [["R", "the next result, or all"]] : []),
-  ].map(([keys, words]) => `<dt>${keys.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ")}</dt><dd>${words}</dd>`).join("") })));
   $("panel").replaceChildren(...parts.flatMap((part) => (part === panel.facts && state.note ? [part, element("div", { className: "note", style: { padding: "0 12px 8px" }, textContent: state.note })] : [part])));
   buildClip();
   tellFilter();
@@ -522,7 +517,7 @@ function buildTime() {
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
   clock.speed.title = "Speed; 1× is as fast as the survey";
   clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
-  clock.follow = button("Follow", () => { chosen.follow = picture.follow = !chosen.follow; showToggles(); });
+  clock.follow = button("Follow", () => setFollow(!chosen.follow));
   clock.follow.title = "Move the camera with the carrier";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
@@ -535,6 +530,13 @@ function buildTime() {
     element("div", { className: "options" }, clock.show, clock.follow, clock.images),
   );
   new ResizeObserver(drawTicks).observe(clock.ticks);
+  showToggles();
+}
+
+// The camera takes its place behind the carrier, and keeps it while the carrier drives and turns.
+function setFollow(on) {
+  chosen.follow = picture.follow = on;
+  if (on) look("sensor");
   showToggles();
 }
 
@@ -642,7 +644,7 @@ const MOST_IMAGES = 3;
 
 function showImages() {
   const box = $("images");
-  const on = chosen.images && !state.offline && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
+  const on = chosen.images && !state.offline && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
   box.hidden = !on;
   if (!on) return;
   const shown = [...picture.sensors.entries()].filter(([, sensor]) => sensor.shown && sensor.sweeps.length).slice(0, MOST_IMAGES);
@@ -688,6 +690,7 @@ function linkText() {
   const words = {
     camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, opacity: chosen.opacity, time: chosen.time.toFixed(6),
     clip: chosen.clip.map((pair) => pair.map((value) => value ?? "").join(",")).join(";"), size: chosen.size.toFixed(3),
+    images: chosen.images, follow: chosen.follow, rays: chosen.rays,
   };
   if (picture.isParallel) words.parallel = picture.viewHeight.toPrecision(7);
   if (chosen.filter.length) words.filter = filterText();
@@ -715,6 +718,8 @@ function readLink() {
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
   chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "grey" ? FAINT : 1;
   chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
+  for (const name of ["images", "follow", "rays"]) if (words.has(name)) chosen[name] = get(name) === "true";
+  picture.follow = chosen.follow;
   for (const entry of get("filter").split(";").filter(Boolean)) {
     const [name, low, high] = entry.split(",");
     if (columns.includes(name) && Number.isFinite(+low) && Number.isFinite(+high)) chosen.filter.push([name, +low, +high]);
@@ -814,23 +819,60 @@ function tellRun(told) {
   replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
 
+// -- keys and the mouse ------------------------------------------------------------------
+
+const isTextField = (target) => target.isContentEditable || target.tagName === "TEXTAREA" || (target.tagName === "INPUT" && ["text", "number", "search"].includes(target.type));
+
+// Keys act wherever the focus is, except in text fields. Enter presses the focused control, and the
+// keys up and down change a focused slider or menu.
 function keys(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
-  // Controls keep the keys that they need; a button its space if the keyboard, not the mouse, led there.
-  const { target, key } = event, letter = key.length === 1 && key !== " ";
-  if (target.tagName === "SELECT" || (target.type === "range" && target !== clock.slider && !letter)) return;
-  if (key === " " && (target.type === "checkbox" || target.matches("button:focus-visible, summary:focus-visible"))) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || isTextField(event.target)) return;
+  const { target, key } = event;
+  if ($("keys").open && !["?", "Escape"].includes(key)) return;
   const acts = {
+    "?": showKeys, Enter: target.type === "checkbox" ? () => target.click() : null,
     " ": () => setPlaying(!playing), ArrowLeft: () => stepBy(event.shiftKey ? -10 : -1), ArrowRight: () => stepBy(event.shiftKey ? 10 : 1),
     Home: () => stepBy(-1e9), End: () => stepBy(1e9), a: () => look("all"), t: () => look("top"), s: () => look("side"), f: () => look("front"),
     h: () => showPanel(document.documentElement.classList.contains("no-panel")), r: nextResult, p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
   };
   const timed = [" ", "ArrowLeft", "ArrowRight", "Home", "End"];
-  const act = acts[letter ? key.toLowerCase() : key];
+  const act = acts[key.length === 1 ? key.toLowerCase() : key];
   if (!act || (timed.includes(key) && $("time").hidden)) return;
-  if (target.tagName === "BUTTON" && key === " ") target.blur();
   event.preventDefault();
   act();
+}
+
+// A button acts on its space when the key is released.
+function releaseKey(event) {
+  if (event.key === " " && !$("time").hidden && !isTextField(event.target)) event.preventDefault();
+}
+
+const KEYS = [
+  ["Space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
+  ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
+  ["H", "hide or show the panel"], ["R", "the next result, or all"], ["Enter", "press the focused button"],
+  ["↑ ↓", "change the focused slider or menu"], ["?", "show or hide these keys"],
+];
+const GESTURES = [
+  ["drag", "turn; with two fingers, the right button or Shift, move"], ["wheel, pinch", "closer or farther"],
+  ["click", "what a point is"], ["Shift-click", "measure to another point"],
+];
+
+function showKeys() {
+  const box = $("keys");
+  if (box.open) {
+    box.close();
+    return;
+  }
+  const shown = KEYS.filter(([names]) => names !== "R" || state?.results.length);
+  const kbd = (names) => names.split(" ").flatMap((name, k) => [...(k ? [" "] : []), element("kbd", { textContent: name })]);
+  const line = (head, words) => [element("dt", {}, ...head), element("dd", { textContent: words })];
+  box.replaceChildren(
+    element("h2", { textContent: "Keys" }), element("dl", {}, ...shown.flatMap(([names, words]) => line(kbd(names), words))),
+    element("h2", { textContent: "Mouse and fingers" }), element("dl", {}, ...GESTURES.flatMap(([name, words]) => line([name], words))),
+    button("Close", () => box.close()),
+  );
+  box.showModal();
 }
 
 let pressed = null;
@@ -861,7 +903,7 @@ async function begin() {
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
   drives = !told.live && told.sensors.some((sensor) => sensor.moves);
-  chosen.rays = !drives; // they would hide the road
+  chosen.rays = Boolean(told.live); // they show how a run goes on, and hide the points of a result
   if (told.results.length) chosen.colour = "result";
   takeState(told);
   const words = readLink();
@@ -881,6 +923,7 @@ async function begin() {
   say("");
   mouse();
   addEventListener("keydown", keys);
+  addEventListener("keyup", releaseKey);
   addEventListener("hashchange", () => location.reload()); // another link was entered
   document.addEventListener("visibilitychange", () => { if (document.hidden) setPlaying(false); });
   let before = performance.now();

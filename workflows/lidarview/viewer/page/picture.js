@@ -447,12 +447,28 @@ export class Picture {
     }
     const moving = this.sensors.find((sensor) => sensor.moves) ?? this.sensors[0];
     this.carrier = moving ? new THREE.Vector3(...moving.at) : null;
-    if (this.follow && before && this.carrier) {
-      const way = this.carrier.clone().sub(before);
-      this.camera.position.add(way);
-      this.controls.target.add(way);
-    }
+    const heading = this.heading;
+    this.heading = this.headingOf(moving);
+    if (this.follow && before && this.carrier) this.moveWith(before, heading ?? this.heading);
     this.dirty = true;
+  }
+
+  // Moves and turns the camera as the carrier has moved from a place and turned from a heading.
+  moveWith(before, heading) {
+    const turn = Math.atan2(this.heading.y, this.heading.x) - Math.atan2(heading.y, heading.x);
+    for (const place of [this.camera.position, this.controls.target])
+      place.sub(before).applyAxisAngle(this.camera.up, turn).add(this.carrier);
+    this.controls.update();
+  }
+
+  // Horizontal direction in which a moving sensor moves now; along x if it does not move.
+  headingOf(moving) {
+    const ahead = new THREE.Vector3(1, 0, 0);
+    if (!moving?.moves) return ahead;
+    const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
+    const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
+    const way = b.sub(a).setZ(0);
+    return way.length() > 1e-6 ? way.normalize() : this.heading ?? ahead;
   }
 
   get labelled() {
@@ -505,15 +521,8 @@ export class Picture {
   lookFromSensor() {
     if (!this.carrier) return;
     const moving = this.sensors.find((sensor) => sensor.moves);
-    const ahead = new THREE.Vector3(1, 0, 0);
     const inwards = this.middle.clone().sub(this.carrier);
-    if (!moving && inwards.length() > 0.1 * this.extent) ahead.copy(inwards.normalize());
-    if (moving) {
-      const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
-      const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
-      const way = b.sub(a).setZ(0);
-      if (way.length() > 1e-6) ahead.copy(way.normalize());
-    }
+    const ahead = !moving && inwards.length() > 0.1 * this.extent ? inwards.normalize() : this.heading;
     const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
     if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
@@ -618,7 +627,8 @@ export class Picture {
     for (const [text, place] of this.labelled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
-      const x = ((at.x + 1) / 2) * width + 8, y = ((1 - at.y) / 2) * height - 24, wide = 7 * text.length + 14;
+      const wide = 7 * text.length + 14, y = ((1 - at.y) / 2) * height - 24;
+      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + 8, width - wide));
       if (taken.some(([a, b, c]) => x < a + c && a < x + wide && Math.abs(y - b) < 22)) continue;
       taken.push([x, y, wide]);
       shown.push([text, x, y]);
