@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from lidarpool import LidarError, Pose, Scene, Sensor, Survey, Track
-from lidarpool.live.opened import open_finished
+from lidarpool.live.opened import open_views
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
@@ -91,8 +91,9 @@ def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
 
 def test_what_is_no_result_is_refused(tmp_path):
     for name, words in (
-        ("", "no cloud.ply"),
-        ("none.ply", "none.ply"),
+        ("", "give the folder of a result"),
+        ("nothing", "does not exist"),
+        ("none.ply", "none.ply does not exist"),
         ("cut.ply", "cut.ply"),
         ("run", "continue it with"),
     ):
@@ -100,7 +101,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
         with pytest.raises(LidarError, match=words):
-            show_view(open_finished([tmp_path / name]), port=0, browser=False)
+            show_view(open_views([tmp_path / name]), port=0, browser=False)
 
 
 @pytest.fixture(scope="module")
@@ -344,9 +345,9 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
     result = result_in(tmp_path / "one", spun)
     with monkeypatch.context() as without:
         without.setattr("lidarpool.export.format_table.find_spec", lambda package: None)
-        view = open_finished([result])
+        view = open_views([result])
         assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
-    view = open_finished([result])
+    view = open_views([result])
     assert kind in told(view, "state")[0]["exports"]
     asked = {"scans": "0-3,36-71", "filter": "ring,0,4;channel,0,4;x,3,3e38"}
     told_, arrays = told(view, "export", format=kind, **asked)

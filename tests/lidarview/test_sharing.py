@@ -213,13 +213,13 @@ def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
     film = tmp_path / "film.mp4"
     page = tmp_path / "page.htm"
     with pytest.raises(LidarError, match=r"film.mp4 does not end with .gif or .webp"):
-        share(drive, film, None)
+        share(open_result(drive), film, None)
     with pytest.raises(LidarError, match=r"page.htm does not end with .html"):
-        share(drive, None, page)
+        share(open_result(drive), None, page)
     with pytest.raises(LidarError, match="cannot be written"):
-        share(drive, None, tmp_path / "none" / "page.html")
+        share(open_result(drive), None, tmp_path / "none" / "page.html")
     rows = np.zeros(0, row_type(np.dtype(np.float32), (SCAN,)))
     (drive / "cloud.ply").write_bytes(header(rows.dtype, 0) + rows.tobytes())
     with pytest.raises(LidarError, match="no points to show"):
-        share(drive, tmp_path / "film.gif", None)
+        share(open_result(drive), tmp_path / "film.gif", None)
     assert not film.exists() and not page.exists()

@@ -53,7 +53,7 @@ from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, wait
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobUnderWay
-from .opened import downloads
+from .downloads import downloads
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points

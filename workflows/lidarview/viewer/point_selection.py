@@ -49,6 +49,19 @@ class HeldPoints:
         return 0, len(self)
 
 
+class OrderedPoints(HeldPoints):
+    """All points of a recording in memory, in the order of their scans."""
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """Return the first row of a range of scans, and one past its last row."""
+        if "scan" not in self._cloud.columns:
+            return super().rows_of(scans)
+        first, last = scans
+        column = self._cloud["scan"]
+        start, stop = np.searchsorted(column, first), np.searchsorted(column, last, "right")
+        return int(start), int(stop)
+
+
 class JoinedPoints:
     """Points of several results in turn, with the columns that all results have."""
 

@@ -30,7 +30,7 @@ from ..render.colouring import TURBO
 from ..render.film import Film
 from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
-from .view import MAX_POINTS, View, open_result
+from .view import MAX_POINTS, View
 
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
 _MIN_FRAMES = 30
@@ -52,12 +52,12 @@ def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
 
 
 def share(
-    path: Path,
+    view: View,
     film: Path | None,
     page: Path | None,
     writing: Callable[[str], AbstractContextManager[WritingProgress]] | None = None,
 ) -> None:
-    """Write a result's folder, or a cloud, as a film, a page or both; files are replaced.
+    """Write a view as a film, a page or both; files are replaced.
 
     `writing` opens the display of an output's progress, with a caption; none by default.
 
@@ -66,9 +66,8 @@ def share(
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
-    view = open_result(path)
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
-        raise LidarError(f"{path} has no points to show: its rays hit nothing.")
+        raise LidarError("There are no points to show: rays hit nothing.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     for file in filter(None, (film, page)):

@@ -7,7 +7,7 @@ import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -60,6 +60,7 @@ from .point_selection import (
     Filter,
     HeldPoints,
     JoinedPoints,
+    OrderedPoints,
     PointFinder,
     Points,
     ScanRanges,
@@ -72,6 +73,7 @@ from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
 _SAMPLE = 100_000  # points from which colour scales and limits are computed
+_CORNERS = 1000  # points of a cloud that are in the first picture
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
@@ -122,6 +124,9 @@ class View:
     hits: Callable[[], AnyArray] | None = None
     triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
     downloads: Downloads | None = None  # None if points are not offered as files
+    # {column: names of the values 0, 1, 2, …}, beside those of the scene and the sweeps.
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    preview: bool = False  # whether the points are those of first sweeps, before a run
 
     def __post_init__(self) -> None:
         self.version = 0  # counts the replacements of the points by `show`
@@ -130,7 +135,7 @@ class View:
         self.path: Floats | None = None  # (w, 2): corners of the planned path, local, metres
         sources = (source for source in (self.pictured, self.sweeps) if source is not None)
         if any(source.coordinates != "world" for source in sources):
-            self.note = self.note or IN_SENSOR_AXES
+            self.note = f"{self.note} {IN_SENSOR_AXES}".strip()
         if self.sweeps is not None and self.sweeps.coordinates != "world":
             self.pictured = None
         if (pictured := self.pictured) is not None:
@@ -197,6 +202,8 @@ class View:
         """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
         if column == RESULT.name and self.results:
             return self.results
+        if column in self.names:
+            return self.names[column]
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
         if (sweeps := self.sweeps) is not None:
@@ -218,8 +225,7 @@ class View:
         path: closer together than the corners of the box, which around an object is mostly empty.
         """
         if self.pictured is None:
-            origin, box = _cloud_extent(self.points)
-            return origin, box, corners_of(box)
+            return _cloud_extent(self.points)
         scene = self.pictured.scene
         planning = self.pictured.planning
         sensors = np.concatenate([np.empty((0, 3)), *(s.positions for s in self.pictured.sensors)])
@@ -268,10 +274,11 @@ class View:
             arrays[f"sensor{number}_times"] = sensor.times_ns / _NS
             arrays[f"sensor{number}_places"] = sensor.positions
         arrays |= self._actor_arrays()
-        if self.sweeps is not None:
-            arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
-            arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
-            arrays["sweep_sensor"] = self.sweeps.sensor
+        sweeps = self.sweeps
+        if sweeps is not None:
+            arrays["sweep_scans"] = sweeps.scans.astype(np.float64)
+            arrays["sweep_begins"] = sweeps.begins_ns / _NS
+            arrays["sweep_sensor"] = sweeps.sensor
         pictured = self.pictured
         object_count = len(self._names("object"))
         static_count = object_count - len(self.actors)
@@ -311,6 +318,9 @@ class View:
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
+            "preview": self.preview,
+            # Sweeps in the axes of a sensor that moves do not fit each other.
+            "by_sweep": sweeps is not None and sweeps.coordinates != "world" and len(sweeps) > 1,
         }
         return header, arrays
 
@@ -407,7 +417,10 @@ class View:
     @property
     def _export_formats(self) -> Sequence[str]:
         """Formats of a download; none for a sample of a run under way."""
-        if self.downloads is None or isinstance(self.points, HeldPoints):
+        is_sample = isinstance(self.points, HeldPoints) and not isinstance(
+            self.points, OrderedPoints
+        )
+        if self.downloads is None or is_sample or self.preview:
             return ()
         return self.downloads.formats
 
@@ -643,17 +656,21 @@ def _are_around(sensors: Floats, bounds: Floats) -> bool:
     return len(sensors) > 1 and bool(outside.all())
 
 
-def _cloud_extent(points: Points) -> tuple[Floats, Floats]:
-    """Return an origin (3,) for points, and their local box (2, 3) without outliers, metres.
+def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
+    """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), metres.
 
+    The box is without outliers; the points are a sample within the box.
     Each coordinate of the origin is 0, or whole metres for points farther than 10 km from 0.
     """
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
-        return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        empty_box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        return np.zeros(3), empty_box, corners_of(empty_box)
     box = np.percentile(sample, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
-    return origin, box - origin
+    inside = sample[((sample >= box[0]) & (sample <= box[1])).all(axis=1)]
+    few = inside[:: len(inside) // _CORNERS + 1] if len(inside) else corners_of(box)
+    return origin, box - origin, few - origin
 
 
 class ShownSurface:
@@ -807,12 +824,23 @@ def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> V
     The view can be played if the sweeps of all results start at the same times. LidarError if a
     result has no cloud, a damaged cloud, or points in the frames of the sensors.
     """
-    first, *other_views = views = [open_result(path, downloads) for path in paths]
+    return join_views(paths, [open_result(path, downloads) for path in paths], downloads)
+
+
+def join_views(
+    paths: Sequence[Path], views: Sequence[View], downloads: Downloads | None = None
+) -> View:
+    """Return a view of all points of the views of results, see `open_results`."""
+    first, *other_views = views
     if not other_views:
         return first
-    if IN_SENSOR_AXES in (notes := [view.note for view in views]):
+    notes = [view.note for view in views]
+    in_sensor_axes = [
+        path for path, note in zip(paths, notes, strict=True) if IN_SENSOR_AXES in note
+    ]
+    if in_sensor_axes:
         raise LidarError(
-            f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
+            f"{in_sensor_axes[0]} has points in the axes of its sensors, which "
             "fit no other result: show it alone, or run it with cloud.coordinates: world."
         )
     names = [path.resolve().name for path in paths]

@@ -577,7 +577,7 @@ function setShow(value) {
 
 // Playing and stepping shows single sweeps, unless a user has chosen what is shown.
 function leaveAll() {
-  if (chosen.show === "all" && !clock.own) setShow("sweep");
+  if (chosen.show === "all" && !clock.own && !state.preview) setShow("sweep");
 }
 
 function setTime(time) {
@@ -906,6 +906,8 @@ async function begin() {
   chosen.rays = Boolean(told.live); // they show how a run goes on, and hide the points of a result
   if (told.results.length) chosen.colour = "result";
   takeState(told);
+  if (told.by_sweep) chosen.show = "sweep";
+  if (!told.points && told.scene) chosen.scene = ["colour", "object"].find((name) => told.scene.includes(name));
   const words = readLink();
   picture.opacity = chosen.opacity;
   buildPanel();

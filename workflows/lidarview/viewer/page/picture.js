@@ -198,7 +198,8 @@ export class Picture {
     this.box = box.map((corner) => new THREE.Vector3(...corner));
     this.bounds = bounds.map((corner) => new THREE.Vector3(...corner));
     this.extent = this.box[0].distanceTo(this.box[1]) || 1;
-    this.middle = this.corners[0].clone().add(this.corners[7]).multiplyScalar(0.5); // of the scene
+    const ends = ["x", "y", "z"].map((axis) => this.corners.map((corner) => corner[axis]).reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]));
+    this.middle = new THREE.Vector3(...ends.map(([low, high]) => (low + high) / 2)); // of the first picture
     this.reach = this.bounds[0].distanceTo(this.bounds[1]) || 1;
     this.setClip([[null, null], [null, null], [null, null]]);
     this.addGrid();
