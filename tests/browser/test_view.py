@@ -274,6 +274,113 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
     assert tab.errors == other.errors == []
 
 
+PLACE = (
+    f"(k => {{ const p = {PICTURE}.layers.base.told.arrays.positions.subarray(3*k, 3*k+3);"
+    f" const m = {PICTURE}.matrix.elements, c = {PICTURE}.canvas;"
+    " const [x, y, w] = [0, 1, 3].map(r => m[r]*p[0] + m[r+4]*p[1] + m[r+8]*p[2] + m[r+12]);"
+    " return [(x / w + 1) / 2 * c.clientWidth, (1 - y / w) / 2 * c.clientHeight]; })"
+)
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+def test_distances_angles_and_areas_are_measured_with_mouse_and_fingers(served, new_tab, width):
+    tab = opened(new_tab, served)
+    tab.call(
+        "Emulation.setDeviceMetricsOverride", width=width, height=720, deviceScaleFactor=1,
+        mobile=width == 420,
+    )  # fmt: skip
+    shown_width = f"{PICTURE}.renderer.domElement.width"
+    tab.wait_for(lambda _: drawn(tab) == COUNT and tab.value(shown_width) in (420, 980))
+    tab.wait_for(lambda _: (tab.value(shown_width) == 420) == (width == 420))
+    tab.key("t")  # all points can be seen
+    rows = (29_000, 28_000, 27_000)  # 60 degrees of a circle apart, with a radius of 9 m
+
+    def press(x, y):
+        if width == 1280:
+            tab.press(x, y)
+            return
+        for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
+            tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    turns = 20 * np.pi * np.array(rows) / (COUNT - 1)
+    places = np.stack([9 * np.cos(turns), 9 * np.sin(turns), turns / 8], axis=1)
+    sides = places - places[[1, 2, 0]]
+    cosine = -sides[0] @ sides[1] / np.prod(np.linalg.norm(sides[:2], axis=1))
+    values = {
+        2: np.linalg.norm(sides[0]),
+        3: np.degrees(np.arccos(cosine)),
+        4: np.linalg.norm(np.cross(sides[0], sides[1])) / 2,
+    }
+    words = "document.querySelector('#measured b').textContent"
+    for tool, value in values.items():
+        tab.value(f"document.querySelectorAll('#tools button')[{tool - 1}].click()")
+        for row in rows[: 2 if tool == 2 else 3]:
+            press(*tab.value(f"{PLACE}({row})"))
+        told = tab.wait_for(lambda _: re.search(r" ([\d.]+) (m|°|m²)$", tab.value(words) or ""))
+        assert float(told[1]) == pytest.approx(value, rel=0.02), (tool, told[0])
+    link = tab.wait_for(
+        lambda _: re.search(
+            "measure=area(%3B[^%]+%2C[^%]+%2C[^%&]+){3}", tab.value("location.hash")
+        )
+    )
+    other = opened(new_tab, served, "#" + link[0])
+    again = other.value(words).split()[1]
+    assert float(again) == pytest.approx(values[4], rel=0.02), "the link has the measurement"
+    press(5, 700 if width == 1280 else 300)
+    tab.key("Escape")
+    tab.wait_for(lambda _: tab.value("document.getElementById('measured').hidden"))
+    assert tab.errors == other.errors == []
+
+
+def test_colour_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_tab):
+    tab = opened(new_tab, served, "#colour=wetness")
+    inputs = "document.querySelectorAll('.limits input')"
+    tab.wait_for(lambda _: tab.value(f"{inputs}.length") == 2)
+    low = f"{inputs}[0]"
+    tab.value(f"{{ const low = {low}; low.value = 50; low.onchange(); }}")
+    tab.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
+    first = f"[...{PICTURE}.layers.base.told.arrays.colours.slice(0, 4)]"
+    colours = {str(tab.value(first))}
+    assert tab.value(f"{PICTURE}.layers.base.told.legend.limits[0]") == 50
+    tab.key("f")  # from the front, z is up in the picture
+    tab.key("b")
+    handles = "document.querySelectorAll('#handles button')"
+    top = f"[...{handles}].find(one => one.ariaLabel === 'clip box, z, highest')"
+    tab.wait_for(lambda _: tab.value(f"{handles}.length") == 6)
+    corner = f"(({{ x, y }}) => [x + 14, y + 14])({top}.getBoundingClientRect())"
+    x, y = tab.value(corner)
+    for kind, shift in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
+        tab.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y + shift, button="left", buttons=1,
+            clickCount=1,
+        )  # fmt: skip
+    cut = tab.wait_for(lambda _: tab.value("lidarpool.chosen.clip[2][1]"))
+    assert 0 < cut < 8
+    tab.value(f"{top}.focus()")
+    tab.key("ArrowUp")
+    assert tab.value("lidarpool.chosen.clip[2][1]") > cut
+    link = tab.wait_for(
+        lambda _: (
+            "limits=50%2C" in (link := tab.value("location.hash")) and "box=true" in link and link
+        )
+    )
+    other = opened(new_tab, served, link)
+    other.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
+    assert {str(other.value(first))} == colours
+    assert other.value(f"{handles}.length") == 6
+    tab.click("Auto")
+    tab.wait_for(lambda text: re.search(r"0\s+50\s+100", text))
+    assert tab.errors == other.errors == []
+
+
+def test_a_click_beside_all_points_is_answered(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.key("t")
+    tab.press(800, 600)
+    tab.wait_for(lambda text: "No point here." in text)
+    assert tab.errors == []
+
+
 def test_a_drive_opens_behind_its_carrier_above_it_and_looks_ahead(served, new_tab):
     tab = opened(new_tab, served)  # it drives along y, 4 m up
     x, y, z = tab.value(f"{PICTURE}.camera.position.toArray()")
@@ -364,6 +471,16 @@ def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab)
     tab.wait_for(lambda text: "15,000 points of 30,000" in text)
     pressed = "document.querySelectorAll('.legend button[aria-pressed=true]').length"
     assert tab.wait_for(lambda _: tab.value(pressed)) == 1
+    tab.click("Show all")
+    box = "document.querySelector('.legend input[aria-label=\"show car\"]')"
+    tab.wait_for(lambda text: "30,000 points" in text and text.count("15,000") == 2)
+    tab.value(f"{box}.click()")
+    tab.wait_for(lambda text: "15,000 points of 30,000" in text and "without car" in text)
+    assert tab.value(f"{box}.checked") is False
+    assert tab.value("document.querySelectorAll('.legend li').length") == 2
+    tab.wait_for(lambda _: "filter=%21class%2C1%2C1" in tab.value("location.hash"))
+    tab.value(f"{box}.click()")
+    tab.wait_for(lambda text: "30,000 points\n" in text)
     assert tab.errors == []
 
 

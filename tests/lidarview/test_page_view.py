@@ -162,7 +162,7 @@ def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
     state, arrays = told(view, "state")
     assert (state["title"], state["points"]) == ("a room", 10_000)
     assert state["origin"] == ORIGIN.tolist()
-    assert [*state["scene"]] == ["grey", "hits", "object"]
+    assert [*state["scene"]] == ["grey", "hits", "object", "normals"]
     assert arrays["sensor0_places"].shape == (POSES, 3)
     assert arrays["rays"].shape == (18, 2, 3)
     assert state["path"] == {"corners": [[1, 1], [5, 7]], "discs": [[1, 6, 0.5]]}
@@ -204,7 +204,7 @@ def test_points_are_shown_in_their_own_colours(tmp_path):
     assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
     answer, arrays = told(view, "points", colour="rgb", most=ALL, filter="x,10,19")
     assert arrays["colours"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
-    assert answer["legend"]["labels"] == []
+    assert answer["legend"]["title"] == "colours of the surfaces"
 
 
 def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
@@ -470,6 +470,42 @@ def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):
         told(view, "point", row=10_000)
 
 
+def test_labels_are_counted_and_switched_off(tmp_path, monkeypatch):
+    rows = np.zeros(9000, row_type(np.dtype(np.float32), (SCAN, TABLE["class"])))
+    rows["x"] = np.arange(9000)
+    rows["class"] = np.arange(9000) % 3
+    (tmp_path / "c.ply").write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+    view = View(CloudFile(tmp_path / "c.ply"))
+    counts, _ = view.answer("counts", {"name": "class"}, bool)
+    assert counts == {"counts": [(0, 3000), (1, 3000), (2, 3000)], "exact": True}
+    asked = {"colour": "class", "most": "9000", "filter": "!class,1,1;!class,2,2;x,0,2999"}
+    told, arrays = view.answer("points", asked, bool)
+    assert told["count"] == 1000 and set(arrays["rows"] % 3) == {0}
+    assert [label[2] for label in told["legend"]["labels"]] == [0, 1, 2], "all can be switched on"
+    monkeypatch.setattr("lidarview.viewer.view._MAX_COUNTED", 8000)
+    counts, _ = View(view.points).answer("counts", {"name": "class"}, bool)
+    assert not counts["exact"] and sum(n for _, n in counts["counts"]) == 9000
+    with pytest.raises(KeyError):
+        view.answer("counts", {"name": "x"}, bool)
+
+
+def test_normals_are_colours_of_points_and_of_the_scene(tmp_path, cloud, pictured):
+    names = ("normal_x", "normal_y", "normal_z")
+    normals = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [np.nan] * 3]
+    columns = dict(zip(names, np.array(normals, np.float32).T, strict=True))
+    view = View(HeldPoints(Cloud(np.zeros((4, 3)), columns)))
+    told, arrays = view.answer("points", {"colour": "normals", "most": "9"}, bool)
+    shown = arrays["colours"][:, :3].tolist()
+    assert shown == [[255, 128, 128], [128, 0, 128], [128, 128, 255], [128, 128, 128]]
+    assert "x red, y green, z blue" in told["legend"]["title"]
+    surface = View(CloudFile(cloud), pictured).answer("surface", {"colour": "normals"}, bool)[1]
+    assert not surface["colours"].std(axis=1).any(), "of flat faces"
+    edges = np.diff(surface["corners"][:, [0, 1, 2]], axis=1)
+    across = np.abs(np.cross(edges[:, 0], edges[:, 1])).argmax(axis=1)
+    far_from_grey = np.abs(surface["colours"][:, 0].astype(int) - 128).argmax(axis=1)
+    assert (across == far_from_grey).all()
+
+
 def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
     asked = []
 
@@ -510,8 +546,8 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
 def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
     scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
     share = np.array([1.0, 0.0])
-    assert colours_for(scene, share) == ("grey", "hits", "object", "reflectance")
-    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object")
+    assert colours_for(scene, share) == ("grey", "hits", "object", "normals", "reflectance")
+    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object", "normals")
     arrays, legend = ShownSurface(scene, share).coloured("reflectance", share, NOWHERE)
     colours = arrays["colours"]
     assert np.unique(colours[scene.face_object == 0]).tolist() == [255]

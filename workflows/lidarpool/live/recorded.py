@@ -45,7 +45,7 @@ class Pieces:
 
     def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
         """Add points at finite positions (n, 3); columns are those of a number for each point."""
-        valid = np.isfinite(positions).all(axis=1)
+        valid = np.asarray(np.isfinite(positions).all(axis=1))
         self.positions.append(positions[valid])
         self.columns.append(
             {
@@ -150,7 +150,7 @@ def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
         times: Sequence[float] = [] if recording.times is None else [*recording.times()]
         if len(times) < recording.count:
             is_timed = False
-            times = _SWEEP_NS * np.arange(recording.count)
+            times = [_SWEEP_NS * number for number in range(recording.count)]
         sweeps += [
             _TimedSweep(float(times[number]), sensor, number) for number in range(recording.count)
         ]

@@ -299,7 +299,7 @@ def _open_sweep_files(
     is_cloud = files.point_count is not None
     return Recording(
         name,
-        files.count,
+        files.sweeps,
         files.read,
         intensity,
         is_cloud,

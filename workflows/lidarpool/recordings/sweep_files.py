@@ -46,9 +46,9 @@ _E57_COLUMNS = {
 class SweepFiles(NamedTuple):
     """Sweeps of a sensor, or parts of a cloud."""
 
-    count: int
+    sweeps: int  # or parts
     read: Callable[[int], Read]
-    times_ns: Floats | None = None  # (count,): start of each sweep; None if unknown
+    times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
     point_count: int | None = None  # of a cloud in parts; None of sweeps
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
 

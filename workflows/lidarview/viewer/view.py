@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -44,18 +45,23 @@ from ..picture_file import (
 from ..render.closeup import floor_and_cut, surrounding_box
 from ..render.colouring import (
     MAX_UNNAMED_LABELS,
+    NORMALS,
+    RGB,
     TURBO,
     Colouring,
     colours_of,
+    colours_of_normals,
     values_of,
-    with_rgb,
+    with_composed,
     word_of,
 )
 from ..render.hit_density import HITS_TITLE, hit_colours
 from ..render.surface import separate_objects
 from ..render.theme import mapped, object_colours
 from .point_selection import (
+    BLOCK_ROWS,
     RESULT,
+    Abandoned,
     Eye,
     Filter,
     HeldPoints,
@@ -73,6 +79,7 @@ from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
 _SAMPLE = 100_000  # points from which colour scales and limits are computed
+_MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
 _CORNERS = 1000  # points of a cloud that are in the first picture
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
@@ -147,17 +154,19 @@ class View:
             column.name: column for column in self.points.table if column not in POSITION
         }
         self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # to colour and filter by
-        self._coloured = with_rgb(self.columns)
+        self._coloured = with_composed(self.columns)
         self._lock = threading.Lock()
         self._surface: ShownSurface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
+        self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the last answer
         self.show(self.points)
 
     def show(self, points: Points) -> None:
         """Replace the points."""
         self.points = points
         self._finder = PointFinder(points, self.origin)
-        self._colourings: dict[tuple[str, Filter], Colouring] = {}
+        # {(column, filter, limits of the scale): colour scale}
+        self._colourings: dict[tuple[Any, ...], Colouring] = {}
         self.version += 1
 
     # -- properties of the survey ---------------------------------------------------------
@@ -251,6 +260,7 @@ class View:
             "points": self._points,
             "point": lambda arguments, _: self._point(int(arguments["row"])),
             "column": lambda arguments, _: self._column(arguments["name"]),
+            "counts": lambda arguments, gone: self._label_counts(arguments["name"], gone),
             "surface": lambda arguments, _: self._scene(arguments["colour"]),
             "range": lambda arguments, _: self._range(int(arguments["sweep"])),
             "export": self._export,
@@ -443,7 +453,8 @@ class View:
         eye = Eye.read(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
         rows, count = finder.find(max_points, *selection, eye, abandoned)
-        colouring = self._colouring(finder, name, selection[0], abandoned)
+        limits = _read_limits(arguments["limits"]) if "limits" in arguments else None
+        colouring = self._colouring(finder, name, selection[0].without(name), limits, abandoned)
         values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
@@ -457,24 +468,33 @@ class View:
             legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
         return {"version": version, "count": count, "legend": legend}, arrays
 
+    def colouring(self, name: str) -> Colouring:
+        """Return the colour scale of a column for all points."""
+        return self._colouring(self._finder, name, Filter(), None, bool)
+
     def _colouring(
-        self, finder: PointFinder, name: str, point_filter: Filter, abandoned: Callable[[], bool]
+        self,
+        finder: PointFinder,
+        name: str,
+        point_filter: Filter,
+        limits: tuple[float, float] | None,
+        abandoned: Callable[[], bool],
     ) -> Colouring:
         """Return the colour scale of a column, the same for all scans.
 
-        The scale is taken from a sample of all points that the filter keeps.
+        The scale is taken from a sample of all points that the filter keeps, or has given limits.
         """
         colourings = self._colourings
-        colouring = colourings.get((name, point_filter))
+        colouring = colourings.get((name, point_filter, limits))
         if colouring is None:
             rows, _ = finder.find(_SAMPLE, point_filter, None, None, abandoned)
             column = self._coloured[name]
             values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
-            colouring = colours_of(values, column, self._names(name))
+            colouring = colours_of(values, column, self._names(name), limits)
             with self._lock:
                 while len(colourings) >= _MAX_COLOURINGS:
                     del colourings[next(iter(colourings))]  # the oldest
-                colourings[name, point_filter] = colouring
+                colourings[name, point_filter, limits] = colouring
         return colouring
 
     def _column(self, name: str) -> Answer:
@@ -495,6 +515,34 @@ class View:
         lower, upper = (float(distinct[0]), float(distinct[-1])) if len(distinct) else (0.0, 1.0)
         is_integer = values.dtype.kind in "iu" and unit == 1.0
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
+
+    def _label_counts(self, name: str, abandoned: Callable[[], bool]) -> Answer:
+        """Return [value, points] of each value of a column of labels, of all points.
+
+        "exact" is False if they are estimated from a sample, because the points are many.
+        """
+        if self.columns[name].kind != "label":
+            raise KeyError(name)
+        finder = self._finder
+        key = (name, self.version)
+        if key not in self._label_counts_of:
+            total = len(finder.points)
+            is_exact = total <= _MAX_COUNTED
+            counts = Counter[int]()
+            if is_exact:
+                for start in range(0, total, BLOCK_ROWS):
+                    if abandoned():
+                        raise Abandoned
+                    _add_counts(
+                        counts, finder.points.values(name, slice(start, start + BLOCK_ROWS))
+                    )
+            else:
+                rows, _ = finder.find(_SAMPLE)
+                _add_counts(counts, finder.points.values(name, rows))
+                scale = total / max(len(rows), 1)
+                counts = Counter({value: round(scale * n) for value, n in counts.items()})
+            self._label_counts_of = {key: {"counts": sorted(counts.items()), "exact": is_exact}}
+        return self._label_counts_of[key], {}
 
     def _point(self, row: int) -> Answer:
         """Return the position of a point, world coordinates, and all its columns in words."""
@@ -656,6 +704,20 @@ def _are_around(sensors: Floats, bounds: Floats) -> bool:
     return len(sensors) > 1 and bool(outside.all())
 
 
+def _read_limits(text: str) -> tuple[float, float]:
+    """Read the ends of a colour scale, ``lowest,highest``; ValueError if they are in disorder."""
+    lower, upper = map(float, text.split(","))
+    if not -math.inf < lower < upper < math.inf:
+        raise ValueError(f"{text!r} are no ends of a colour scale")
+    return lower, upper
+
+
+def _add_counts(counts: Counter[int], values: AnyArray) -> None:
+    """Add the number of points of each value (n,) to counts."""
+    labels, numbers = np.unique(values, return_counts=True)
+    counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
+
+
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), metres.
 
@@ -717,6 +779,12 @@ class ShownSurface:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
             legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "normals":
+            a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
+            normals = np.cross(b - a, c - a)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            colours = colours_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
+            legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
         elif by == "colour" and self.coarse.colours is not None:
             colours = self.coarse.colours.means() / 255
         else:
@@ -757,11 +825,13 @@ def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     )
-    return ("grey", "hits", "object", *reflectances, *scene_colours)
+    return ("grey", "hits", "object", "normals", *reflectances, *scene_colours)
 
 
 def legend_of(colouring: Colouring) -> Legend:
     """Return the legend of colours: a scale with numbers, or labels with their values."""
+    if colouring.name in (RGB.name, NORMALS.name):
+        return scale_legend(colouring.meaning, (), np.empty((0, 3)))
     if colouring.limits is None:
         labels = [
             [name, as_bytes(colour).tolist(), value]
@@ -780,7 +850,10 @@ def legend_of(colouring: Colouring) -> Legend:
             f"{round(number, digits) + 0.0:,.{digits}f}"
             for number in (lower, (lower + upper) / 2, upper)
         ]
-    return scale_legend(title, marks, colouring.scale[::15])
+    return scale_legend(title, marks, colouring.scale[::15]) | {
+        "limits": [float(lower), float(upper)],
+        "logarithmic": colouring.logarithmic,
+    }
 
 
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
