@@ -369,7 +369,7 @@ def test_colour_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_t
     assert {str(other.value(first))} == colours
     assert other.value(f"{handles}.length") == 6
     tab.click("Auto")
-    tab.wait_for(lambda text: re.search(r"0\s+50\s+100", text))
+    tab.wait_for(lambda text: re.search(r"\n1\s+50\s+100", text))
     assert tab.errors == other.errors == []
 
 
@@ -463,7 +463,7 @@ def classed(view):
 
 def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab):
     tab = opened(new_tab, classed, "#colour=class")
-    tab.wait_for(lambda text: re.search(r"class 0\ncar\n", text))
+    tab.wait_for(lambda text: re.search(r"class 0\s+15,000\s+car\s", text))
     tab.value("document.querySelectorAll('.legend button')[1].focus({ focusVisible: true })")
     press = {"key": "Enter", "code": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
     for kind in ("keyDown", "keyUp"):

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 from lidarpool import (
-    Campaign,
-    Job,
     LidarError,
     Mounted,
     Noise,
@@ -231,28 +230,28 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             open_view(folder / name)
 
 
-def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path):
-    def make(number, rng):
-        if number == 1:
-            raise ValueError("no such place")
-        survey = Survey(Sensor.grid(layers=4), poses=[(0, 0, 2.0 + number)], steps=36)
-        return Job(Scene.seed(), survey, values={"height": 2.0 + number})
-
-    Campaign(make, 3, keep="kitti", title="Heights").run(tmp_path / "set", gpu_workers=1)
+@pytest.mark.parametrize("kind", ["folder", "kitti", "mcap", "webdataset"])
+def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind):
+    scene = the_scene()
+    write_set(tmp_path / "set", kind, scene, the_sweeps(scene))
     assert is_data_set(tmp_path / "set") and not is_data_set(tmp_path)
     jobs = JobList(tmp_path / "set")
     told, _ = jobs.answer("jobs", {}, bool)
-    assert (told["count"], told["done"], told["failed"], told["over"]) == (3, 2, 1, True)
-    assert [job["name"] for job in told["ended"]] == ["0000", "0002"]
-    assert told["newest"] == [0, "0000"]
-    assert told["failures"][0]["error"].endswith("no such place")
-    for job in told["ended"]:
-        state, _ = jobs.answer(f"job/{job['number']}/state", {}, bool)
-        assert state["points"] == job["points"] > 0 and not state["note"]
-        assert job["values"] == [f"{2 + job['number']}"]
-        point, _ = jobs.answer(f"job/{job['number']}/point", {"row": "0"}, bool)
-        assert "Ground" in str(point["columns"]) or "object" in str(point["columns"])
-    for question in ("job/1/state", "job/9/state", "news"):
+    assert (told["count"], told["done"], told["failed"], told["over"]) == (6, 5, 1, True)
+    assert [job["name"] for job in told["ended"]] == ["00", "01", "02", "04", "05"]
+    assert [job["error"] for job in told["failures"]] == ["failed"]
+    assert told["ended"][1]["values"] == ["0.5"] and told["names"] == ["rain"]
+    for number in (0, 4):
+        state, _ = jobs.answer(f"job/{number}/state", {}, bool)
+        points = points_of(scene, number)
+        assert state["points"] == len(points) and not state["note"]
+        view = jobs.view_of(number)
+        for axis, name in enumerate("xyz"):  # sweeps of one time may be in another order
+            found, expected = view.points.values(name, slice(None)), np.asarray(points)[:, axis]
+            np.testing.assert_allclose(np.sort(found), np.sort(expected), atol=2e-3)
+        words = dict(jobs.answer(f"job/{number}/point", {"row": "0"}, bool)[0]["columns"])
+        assert kind == "mcap" or words["object"] in scene.all_names
+    for question in ("job/3/state", "job/9/state", "news"):
         with pytest.raises(KeyError):
             jobs.answer(question, {}, bool)
     result = CliRunner().invoke(view_command, [str(tmp_path / "set"), "--export", "page.html"])
