@@ -64,7 +64,8 @@ class JobList:
         sums = Counter(points=0, rays=0)
         for row in done:
             sums.update(points=row.points, rays=row.rays)
-        newest = next(([row.number, row.name] for row in done if row.points), None)
+        # The first with points is shown beside the list.
+        shown = next((row for row in done if row.points), done[0] if done else None)
         return {
             "title": self.title,
             "names": self._names,
@@ -83,7 +84,7 @@ class JobList:
             "failures": [self._entry(row) for row in failed[:MAX_LISTED]],
             "ended": [self._entry(row) for row in done[:MAX_LISTED]],
             "charts": 0,
-            "newest": newest,
+            "newest": None if shown is None else [shown.number, shown.name],
             **sums,
         }
 
