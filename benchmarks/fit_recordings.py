@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from lidarpool import LidarError, Noise, fit
 from lidarpool.compare.fit import SweepStack, find_surfaces, select_smooth_rays
-from lidarpool.compare.recordings import Recording, open_recording
+from lidarpool.recordings.recordings import Recording, open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.angle_noise import angle_errors
 from lidarsim.simulator.detection import detected

@@ -132,8 +132,10 @@ class Tab:
 
     def key(self, name: str) -> None:
         """Press a key."""
+        text = {" ": " ", "Enter": "\r"}.get(name)
+        given = {"text": text, "windowsVirtualKeyCode": ord(text)} if text else {}
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=name)
+            self.call("Input.dispatchKeyEvent", type=kind, key=name, **given)
 
     def press(self, x: float, y: float, *, shift: bool = False) -> None:
         """Click at a place of the window, pixels."""

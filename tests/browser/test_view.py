@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Column, Scene, Sensor, Survey, Track
+from lidarpool.live.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import OBJECT, SCAN, TABLE
@@ -144,21 +145,6 @@ def test_a_look_at_all_fills_the_picture_and_the_sensor_can_be_seen(served, new_
     assert tab.errors == []
 
 
-def test_the_keyboard_alone_presses_buttons_and_keys_work_after_a_box_was_clicked(served, new_tab):
-    tab = opened(new_tab, served)
-    tab.wait_for(lambda _: drawn(tab) == COUNT)
-    tab.tick("shade by depth", on=False)
-    tab.value("document.querySelector('label.tick input').focus()")
-    tab.key("t")
-    tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
-    tab.value("document.querySelector('summary').focus({ focusVisible: true })")
-    for kind in ("keyDown", "keyUp"):
-        tab.call("Input.dispatchKeyEvent", type=kind, key=" ", code="Space", text=" ")
-    tab.wait_for(lambda _: not tab.value("document.querySelector('details').open"))
-    assert tab.value("lidarpool.playing") is False
-    assert tab.errors == []
-
-
 def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
     tab = opened(new_tab, served)
     tab.wait_for(lambda _: drawn(tab) == COUNT)
@@ -180,11 +166,86 @@ def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
     at = tab.value("lidarpool.chosen.time")
     assert -9 < tab.value(van) < 9
     tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") == at)
+    tab.click("Range image")
     image = "document.querySelector('#images canvas')"
     tab.wait_for(lambda _: (tab.value(f"{image}?.height") or 1) > 1)
     tab.tick("Sensor", False)
     tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
+
+
+def test_keys_work_wherever_the_focus_is_and_a_question_mark_shows_them(served, new_tab):
+    tab = opened(new_tab, served)
+    focus = "document.querySelector({!r}).focus({{ focusVisible: true }})"
+    controls = ("#time .icon", "select", "input[type=checkbox]", "summary", "input[type=range]")
+    boxes = "[...document.querySelectorAll('input[type=checkbox]')].map(box => box.checked)"
+    before = tab.value(boxes)
+    for number, control in enumerate(controls):
+        tab.value(focus.format(control))
+        tab.key("Home")
+        tab.key("ArrowRight")
+        tab.wait_for(lambda text: "sweep 2 of 10" in text)
+        tab.key(" ")
+        assert tab.value("lidarpool.playing"), control
+        tab.key(" ")
+        assert not tab.value("lidarpool.playing"), control
+        if number % 2:  # a letter, too
+            tab.key("t")
+            assert tab.value(f"{PICTURE}.isParallel")
+            tab.key("a")
+    assert tab.value(boxes) == before
+    tab.value(focus.format("input[type=checkbox]"))
+    tab.key("Enter")
+    assert tab.value(boxes)[0] != before[0]
+    tab.key("?")
+    tab.wait_for(lambda text: "play or pause" in text)
+    tab.key(" ")
+    assert not tab.value("lidarpool.playing"), "the page behind the list is left alone"
+    tab.key("?")
+    tab.wait_for(lambda text: "play or pause" not in text)
+    text_field = (
+        "document.body.append(Object.assign(document.createElement('input'), {id: 'text'}))"
+    )
+    tab.value(text_field)
+    tab.value(focus.format("#text"))
+    tab.key("?")
+    assert "play or pause" not in tab.text and tab.errors == []
+
+
+def test_the_range_image_is_off_and_filled_as_soon_as_it_is_on(served, new_tab):
+    tab = opened(new_tab, served)
+    assert tab.value("document.getElementById('images').hidden")
+    tab.click("Range image")
+    tab.wait_for(lambda _: (tab.value("document.querySelector('#images canvas')?.height") or 1) > 1)
+    assert "30,000 points" in tab.text and tab.errors == []
+
+
+def test_following_snaps_to_the_carrier_and_keeps_the_place_behind_it(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.key("a")
+    tab.click("Follow")
+    beside = f"{PICTURE}.camera.position.clone().sub({PICTURE}.carrier).toArray()"
+    x, y, z = at_start = tab.value(beside)
+    assert abs(x) < 1e-6 and y < -1 and z > 0, "it drives along y"
+    tab.key("End")
+    tab.wait_for(lambda text: "sweep 10 of 10" in text)
+    assert tab.value(beside) == pytest.approx(at_start, abs=1e-6)
+    assert tab.value(f"{PICTURE}.carrier.y") > -2 and tab.errors == []
+
+
+def test_an_object_fills_the_first_picture_and_no_rays_hide_it(view, new_tab):
+    around = [[x, y, 2.0] for x in (-60, 60) for y in (-60, 60)]
+    survey = Survey(Sensor.grid(layers=4), steps=9, poses=around)
+    ends = np.array([[[60, 60, 2], [0, 0, 0]]] * 9, np.float32)
+    scene = replace(view.pictured.scene, actors=())
+    hits = np.zeros(scene.triangles, np.int64)
+    pictured = PictureContent(scene, sensor_positions(survey), hits, ends)
+    with page_server(View(view.points, pictured).answer, port=0) as page:
+        tab = opened(new_tab, page)
+        assert tab.value(f"{PICTURE}.viewHeight") < 40  # of an object of 20 m
+        assert tab.value(f"{PICTURE}.rays.visible") is False
+        tab.tick("sample rays", on=True)
+        assert tab.value(f"{PICTURE}.rays.visible") and tab.errors == []
 
 
 def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, tmp_path):
@@ -212,6 +273,113 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
     both = [one.value(f"{PICTURE}.camera.position.toArray()") for one in (tab, other)]
     assert both[0] == pytest.approx(both[1], abs=1e-2)
     assert tab.errors == other.errors == []
+
+
+PLACE = (
+    f"(k => {{ const p = {PICTURE}.layers.base.told.arrays.positions.subarray(3*k, 3*k+3);"
+    f" const m = {PICTURE}.matrix.elements, c = {PICTURE}.canvas;"
+    " const [x, y, w] = [0, 1, 3].map(r => m[r]*p[0] + m[r+4]*p[1] + m[r+8]*p[2] + m[r+12]);"
+    " return [(x / w + 1) / 2 * c.clientWidth, (1 - y / w) / 2 * c.clientHeight]; })"
+)
+
+
+@pytest.mark.parametrize("width", [1280, 420])
+def test_distances_angles_and_areas_are_measured_with_mouse_and_fingers(served, new_tab, width):
+    tab = opened(new_tab, served)
+    tab.call(
+        "Emulation.setDeviceMetricsOverride", width=width, height=720, deviceScaleFactor=1,
+        mobile=width == 420,
+    )  # fmt: skip
+    shown_width = f"{PICTURE}.renderer.domElement.width"
+    tab.wait_for(lambda _: drawn(tab) == COUNT and tab.value(shown_width) in (420, 980))
+    tab.wait_for(lambda _: (tab.value(shown_width) == 420) == (width == 420))
+    tab.key("t")  # all points can be seen
+    rows = (29_000, 28_000, 27_000)  # 60 degrees of a circle apart, with a radius of 9 m
+
+    def press(x, y):
+        if width == 1280:
+            tab.press(x, y)
+            return
+        for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
+            tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    turns = 20 * np.pi * np.array(rows) / (COUNT - 1)
+    places = np.stack([9 * np.cos(turns), 9 * np.sin(turns), turns / 8], axis=1)
+    sides = places - places[[1, 2, 0]]
+    cosine = -sides[0] @ sides[1] / np.prod(np.linalg.norm(sides[:2], axis=1))
+    values = {
+        2: np.linalg.norm(sides[0]),
+        3: np.degrees(np.arccos(cosine)),
+        4: np.linalg.norm(np.cross(sides[0], sides[1])) / 2,
+    }
+    words = "document.querySelector('#measured b').textContent"
+    for tool, value in values.items():
+        tab.value(f"document.querySelectorAll('#tools button')[{tool - 1}].click()")
+        for row in rows[: 2 if tool == 2 else 3]:
+            press(*tab.value(f"{PLACE}({row})"))
+        told = tab.wait_for(lambda _: re.search(r" ([\d.]+) (m|°|m²)$", tab.value(words) or ""))
+        assert float(told[1]) == pytest.approx(value, rel=0.02), (tool, told[0])
+    link = tab.wait_for(
+        lambda _: re.search(
+            "measure=area(%3B[^%]+%2C[^%]+%2C[^%&]+){3}", tab.value("location.hash")
+        )
+    )
+    other = opened(new_tab, served, "#" + link[0])
+    again = other.value(words).split()[1]
+    assert float(again) == pytest.approx(values[4], rel=0.02), "the link has the measurement"
+    press(5, 700 if width == 1280 else 300)
+    tab.key("Escape")
+    tab.wait_for(lambda _: tab.value("document.getElementById('measured').hidden"))
+    assert tab.errors == other.errors == []
+
+
+def test_colour_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_tab):
+    tab = opened(new_tab, served, "#colour=wetness")
+    inputs = "document.querySelectorAll('.limits input')"
+    tab.wait_for(lambda _: tab.value(f"{inputs}.length") == 2)
+    low = f"{inputs}[0]"
+    tab.value(f"{{ const low = {low}; low.value = 50; low.onchange(); }}")
+    tab.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
+    first = f"[...{PICTURE}.layers.base.told.arrays.colours.slice(0, 4)]"
+    colours = {str(tab.value(first))}
+    assert tab.value(f"{PICTURE}.layers.base.told.legend.limits[0]") == 50
+    tab.key("f")  # from the front, z is up in the picture
+    tab.key("b")
+    handles = "document.querySelectorAll('#handles button')"
+    top = f"[...{handles}].find(one => one.ariaLabel === 'clip box, z, highest')"
+    tab.wait_for(lambda _: tab.value(f"{handles}.length") == 6)
+    corner = f"(({{ x, y }}) => [x + 14, y + 14])({top}.getBoundingClientRect())"
+    x, y = tab.value(corner)
+    for kind, shift in (("mousePressed", 0), ("mouseMoved", 60), ("mouseReleased", 60)):
+        tab.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y + shift, button="left", buttons=1,
+            clickCount=1,
+        )  # fmt: skip
+    cut = tab.wait_for(lambda _: tab.value("lidarpool.chosen.clip[2][1]"))
+    assert 0 < cut < 8
+    tab.value(f"{top}.focus()")
+    tab.key("ArrowUp")
+    assert tab.value("lidarpool.chosen.clip[2][1]") > cut
+    link = tab.wait_for(
+        lambda _: (
+            "limits=50%2C" in (link := tab.value("location.hash")) and "box=true" in link and link
+        )
+    )
+    other = opened(new_tab, served, link)
+    other.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
+    assert {str(other.value(first))} == colours
+    assert other.value(f"{handles}.length") == 6
+    tab.click("Auto")
+    tab.wait_for(lambda text: re.search(r"\n1\s+50\s+100", text))
+    assert tab.errors == other.errors == []
+
+
+def test_a_click_beside_all_points_is_answered(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.key("t")
+    tab.press(800, 600)
+    tab.wait_for(lambda text: "No point here." in text)
+    assert tab.errors == []
 
 
 def test_a_drive_opens_behind_its_carrier_above_it_and_looks_ahead(served, new_tab):
@@ -296,7 +464,7 @@ def classed(view):
 
 def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab):
     tab = opened(new_tab, classed, "#colour=class")
-    tab.wait_for(lambda text: re.search(r"class 0\ncar\n", text))
+    tab.wait_for(lambda text: re.search(r"class 0\s+15,000\s+car\s", text))
     tab.value("document.querySelectorAll('.legend button')[1].focus({ focusVisible: true })")
     press = {"key": "Enter", "code": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
     for kind in ("keyDown", "keyUp"):
@@ -304,6 +472,17 @@ def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab)
     tab.wait_for(lambda text: "15,000 points of 30,000" in text)
     pressed = "document.querySelectorAll('.legend button[aria-pressed=true]').length"
     assert tab.wait_for(lambda _: tab.value(pressed)) == 1
+    tab.value("document.querySelector('.legend button[aria-pressed=true]').click()")
+    box = "document.querySelector('.legend input[aria-label=\"show car\"]')"
+    tab.wait_for(lambda text: "30,000 points" in text and text.count("15,000") == 2)
+    tab.value(f"{box}.click()")
+    tab.wait_for(lambda text: "15,000 points of 30,000" in text)
+    assert "class: without car" in tab.value("document.body.textContent")
+    assert tab.value(f"{box}.checked") is False
+    assert tab.value("document.querySelectorAll('.legend li').length") == 2
+    tab.wait_for(lambda _: "filter=%21class%2C1%2C1" in tab.value("location.hash"))
+    tab.value(f"{box}.click()")
+    tab.wait_for(lambda text: "30,000 points\n" in text)
     assert tab.errors == []
 
 
@@ -340,8 +519,14 @@ def test_several_results_have_a_switch(cloud, new_tab, tmp_path):
         assert tab.errors == []
 
 
-def test_the_points_that_are_filtered_and_clipped_are_downloaded(served, new_tab, tmp_path):
-    tab = opened(new_tab, served, "#filter=scan,100,299&clip=,;,;,3&colour=wetness")
+def test_the_points_that_are_filtered_and_clipped_are_downloaded(view, new_tab, tmp_path):
+    view.downloads = downloads()
+    with page_server(view.answer, port=0) as page:
+        check_download(new_tab, page, tmp_path)
+
+
+def check_download(new_tab, page, tmp_path):
+    tab = opened(new_tab, page, "#filter=scan,100,299&clip=,;,;,3&colour=wetness")
     tab.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "kept"))
     summaries = "[...document.querySelectorAll('summary')]"
     tab.value(f"{summaries}.find(one => one.textContent === 'Export').click()")
@@ -374,7 +559,7 @@ def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise
         tab.wait_for(lambda text: "30,000 points" in text)
         assert tab.value(theme) == name
         tab.wait_for(lambda _, tab=tab: colourful(tab.picture(tmp_path / "a.png")) > 3000)
-        corner = tab.picture(tmp_path / "a.png")[5:40, 5:40].mean()
+        corner = tab.picture(tmp_path / "a.png")[5:40, 300:335].mean()
         assert (corner > 200) == (name == "light")
         tab.value("document.querySelector('button[title=\"Light or dark\"]').click()")
         assert tab.value(theme) == other

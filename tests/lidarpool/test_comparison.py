@@ -15,9 +15,9 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.compare import comparison
-from lidarpool.compare.recordings import open_recording
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.export.formats import Format
+from lidarpool.recordings.recordings import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS = 16
@@ -466,8 +466,8 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     laspy.LasData(header).write(tmp_path / "none.las")
     for path, says in (
         ("nowhere.pcd", "does not exist, or is empty: give the folder of a result"),
-        ("notes.txt", "cannot be compared: give the folder of a result"),
-        ("empty", "cannot be compared"),
+        ("notes.txt", "is not read: give the folder of a result"),
+        ("empty", "is not read"),
         ("none.las", "has no points: there is nothing to compare"),
     ):
         with pytest.raises(LidarError, match=says):

@@ -12,8 +12,8 @@ from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.fit import Estimate, _with_performance
-from lidarpool.compare.recordings import Recording, open_recording
 from lidarpool.export.formats import Format
+from lidarpool.recordings.recordings import Recording, open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.sensor.models import read_model
 from lidarsim.sweeps.sweeps import Sweeps

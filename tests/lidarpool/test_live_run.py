@@ -279,6 +279,10 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert [told["under_way"][4][name] for name in ("stored", "scans")] == [4, 40]
         assert told["under_way"][4]["values"] == ["2", "left"]
         assert told["under_way"][4]["points"] == 40
+        live.ended(row(5003))
+        told = ask(live.page.url, "jobs")
+        assert told["ended"][0]["name"] == "5003"
+        assert "5003" not in [job["name"] for job in told["under_way"]], "it is listed once"
         wait_for_charts(live, 2)
         assert not told["over"]
 

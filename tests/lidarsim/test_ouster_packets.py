@@ -29,8 +29,8 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.compare.recordings import open_recording
 from lidarpool.export.navigation_files import write_instruments
+from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.ouster import PROFILES

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from lidarpool import LidarError, Pose, Scene, Sensor, Survey, Track
-from lidarpool.live.opened import open_finished
+from lidarpool.live.opened import open_views
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
@@ -91,8 +91,9 @@ def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
 
 def test_what_is_no_result_is_refused(tmp_path):
     for name, words in (
-        ("", "no cloud.ply"),
-        ("none.ply", "none.ply"),
+        ("", "give the folder of a result"),
+        ("nothing", "does not exist"),
+        ("none.ply", "none.ply does not exist"),
         ("cut.ply", "cut.ply"),
         ("run", "continue it with"),
     ):
@@ -100,7 +101,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
         with pytest.raises(LidarError, match=words):
-            show_view(open_finished([tmp_path / name]), port=0, browser=False)
+            show_view(open_views([tmp_path / name]), port=0, browser=False)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +162,7 @@ def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
     state, arrays = told(view, "state")
     assert (state["title"], state["points"]) == ("a room", 10_000)
     assert state["origin"] == ORIGIN.tolist()
-    assert [*state["scene"]] == ["grey", "hits", "object"]
+    assert [*state["scene"]] == ["grey", "hits", "object", "normals"]
     assert arrays["sensor0_places"].shape == (POSES, 3)
     assert arrays["rays"].shape == (18, 2, 3)
     assert state["path"] == {"corners": [[1, 1], [5, 7]], "discs": [[1, 6, 0.5]]}
@@ -203,7 +204,7 @@ def test_points_are_shown_in_their_own_colours(tmp_path):
     assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
     answer, arrays = told(view, "points", colour="rgb", most=ALL, filter="x,10,19")
     assert arrays["colours"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
-    assert answer["legend"]["labels"] == []
+    assert answer["legend"]["title"] == "colours of the surfaces"
 
 
 def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
@@ -219,6 +220,18 @@ def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
     objects, arrays = told(view, "surface", colour="object")
     assert objects["legend"]["labels"][0][0] == "room"
     assert set(arrays["objects"].tolist()) == {0}
+
+
+def test_sensors_around_an_object_leave_the_picture_to_it(cloud):
+    scene = Scene.from_meshes([box("Block", (2, 4, 2))])
+    views = []
+    for poses in ([(9, 0, 1), (-9, 0, 1)], [(9, 0, 1), (0, 0, 0)]):
+        survey = Survey(Sensor.grid(layers=4), steps=9, poses=[(*p,) for p in poses])
+        content, _ = PictureContent.before_casting(scene, survey)
+        header, arrays = View(CloudFile(cloud), content).answer("state", {}, bool)
+        np.testing.assert_allclose(header["bounds"][1][0], 9)
+        views.append(arrays["corners"])
+    assert abs(views[0]).max() == 4 / 2 and abs(views[1]).max() == 9
 
 
 def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
@@ -332,9 +345,9 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
     result = result_in(tmp_path / "one", spun)
     with monkeypatch.context() as without:
         without.setattr("lidarpool.export.format_table.find_spec", lambda package: None)
-        view = open_finished([result])
+        view = open_views([result])
         assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
-    view = open_finished([result])
+    view = open_views([result])
     assert kind in told(view, "state")[0]["exports"]
     asked = {"scans": "0-3,36-71", "filter": "ring,0,4;channel,0,4;x,3,3e38"}
     told_, arrays = told(view, "export", format=kind, **asked)
@@ -457,6 +470,42 @@ def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):
         told(view, "point", row=10_000)
 
 
+def test_labels_are_counted_and_switched_off(tmp_path, monkeypatch):
+    rows = np.zeros(9000, row_type(np.dtype(np.float32), (SCAN, TABLE["class"])))
+    rows["x"] = np.arange(9000)
+    rows["class"] = np.arange(9000) % 3
+    (tmp_path / "c.ply").write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+    view = View(CloudFile(tmp_path / "c.ply"))
+    counts, _ = view.answer("counts", {"name": "class"}, bool)
+    assert counts == {"counts": [(0, 3000), (1, 3000), (2, 3000)], "exact": True}
+    asked = {"colour": "class", "most": "9000", "filter": "!class,1,1;!class,2,2;x,0,2999"}
+    told, arrays = view.answer("points", asked, bool)
+    assert told["count"] == 1000 and set(arrays["rows"] % 3) == {0}
+    assert [label[2] for label in told["legend"]["labels"]] == [0, 1, 2], "all can be switched on"
+    monkeypatch.setattr("lidarview.viewer.view._MAX_COUNTED", 8000)
+    counts, _ = View(view.points).answer("counts", {"name": "class"}, bool)
+    assert not counts["exact"] and sum(n for _, n in counts["counts"]) == 9000
+    with pytest.raises(KeyError):
+        view.answer("counts", {"name": "x"}, bool)
+
+
+def test_normals_are_colours_of_points_and_of_the_scene(tmp_path, cloud, pictured):
+    names = ("normal_x", "normal_y", "normal_z")
+    normals = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [np.nan] * 3]
+    columns = dict(zip(names, np.array(normals, np.float32).T, strict=True))
+    view = View(HeldPoints(Cloud(np.zeros((4, 3)), columns)))
+    told, arrays = view.answer("points", {"colour": "normals", "most": "9"}, bool)
+    shown = arrays["colours"][:, :3].tolist()
+    assert shown == [[255, 128, 128], [128, 0, 128], [128, 128, 255], [128, 128, 128]]
+    assert "x red, y green, z blue" in told["legend"]["title"]
+    surface = View(CloudFile(cloud), pictured).answer("surface", {"colour": "normals"}, bool)[1]
+    assert not surface["colours"].std(axis=1).any(), "of flat faces"
+    edges = np.diff(surface["corners"][:, [0, 1, 2]], axis=1)
+    across = np.abs(np.cross(edges[:, 0], edges[:, 1])).argmax(axis=1)
+    far_from_grey = np.abs(surface["colours"][:, 0].astype(int) - 128).argmax(axis=1)
+    assert (across == far_from_grey).all()
+
+
 def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
     asked = []
 
@@ -497,8 +546,8 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
 def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
     scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
     share = np.array([1.0, 0.0])
-    assert colours_for(scene, share) == ("grey", "hits", "object", "reflectance")
-    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object")
+    assert colours_for(scene, share) == ("grey", "hits", "object", "normals", "reflectance")
+    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object", "normals")
     arrays, legend = ShownSurface(scene, share).coloured("reflectance", share, NOWHERE)
     colours = arrays["colours"]
     assert np.unique(colours[scene.face_object == 0]).tolist() == [255]

@@ -18,12 +18,13 @@ import lidarview.viewer.sharing
 from lidarpool import LidarError, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
 from lidarsim.columns.ply_format import header, row_type
-from lidarsim.columns.table import CHANNEL, SCAN
+from lidarsim.columns.table import CHANNEL, SCAN, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent, sensor_positions
 from lidarview.render.film import ACTOR, SURFACE, Film
 from lidarview.render.theme import rgb
+from lidarview.viewer.packing import pack_column
 from lidarview.viewer.sharing import film_of, page_of, share
 from lidarview.viewer.view import open_result
 
@@ -177,16 +178,78 @@ def answers(page):
     return {name.decode(): unpacked(zlib.decompress(base64.b64decode(t))) for name, t in found}
 
 
+def unpacked_column(cloud, name):
+    """Return the values of a column, as the page computes them."""
+    how = cloud["packed"][name]
+    planes = cloud["arrays"][name].reshape(-1, cloud["count"]).astype(np.int64)
+    zigzag = sum(plane << (8 * k) for k, plane in enumerate(planes))
+    codes = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
+    values = how["base"] + how["step"] * (codes - how["fractions"])
+    values = np.exp(values) if how["logarithmic"] else values
+    return np.where(codes == 0, np.nan, values) if how["fractions"] else values
+
+
+def test_columns_are_packed_within_their_steps():
+    random = np.random.default_rng(0)
+    times = np.sort(random.integers(0, 2**40, 1000)) + 10**18
+    for values, tolerance in (
+        (random.integers(-5, 70_000, 1000), 0),
+        (random.random(1000).astype(np.float32), 1 / 4000),
+        (np.float32(10) ** random.uniform(-4, 4, 1000).astype(np.float32), 0),
+        (np.full(1000, np.nan), 0),
+        (np.r_[np.nan, np.ones(999)], 0),
+        (times, 1024),
+        (np.zeros(0), 0),
+    ):
+        column = pack_column(values)
+        how = column._asdict()
+        cloud = {"packed": {"a": how}, "arrays": {"a": how.pop("planes")}, "count": len(values)}
+        found = unpacked_column(cloud, "a") if len(values) else np.zeros(0)
+        np.testing.assert_allclose(
+            found, values, atol=tolerance, rtol=3e-3 if column.logarithmic else 1e-12
+        )
+
+
+@pytest.mark.slow
+def test_a_page_holds_three_million_points(tmp_path):
+    """Of a noisy drive: a ground of many sweeps, with ranges, intensities and labels."""
+    count = 3_300_000
+    random = np.random.default_rng(0)
+    columns = [SCAN, TABLE["channel"], TABLE["object"], TABLE["intensity"], TABLE["time"]]
+    rows = np.zeros(count, row_type(np.dtype(np.float32), tuple(columns)))
+    steps = np.arange(count)
+    angle = 2 * np.pi * (steps // 32) / 1800
+    ring = steps % 32
+    rows[TABLE["channel"].in_files] = ring
+    rows["scan"] = steps // 320
+    distance = 3 + 1.5 * ring + random.normal(0, 0.01, count)
+    rows["x"] = distance * np.cos(angle)
+    rows["y"] = distance * np.sin(angle) + steps * 1e-5
+    rows["z"] = random.normal(0, 0.01, count)
+    rows["object"] = (angle % 6).astype(int)
+    rows["intensity"] = random.random(count) / distance
+    rows["time"] = steps * 600
+    (tmp_path / "cloud.ply").write_bytes(header(rows.dtype, count) + rows.tobytes())
+    page = page_of(open_result(tmp_path / "cloud.ply"))
+    assert len(page) < 25_000_000
+    assert answers(page)["cloud?"]["count"] >= 3_000_000
+
+
 def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
     page = page_of(open_result(drive))
     held = answers(page)
     assert held["state?"]["points"] == COUNT and held["state?"]["offline"]
     assert {"column?name=z", "column?name=channel", "surface?colour=grey"} < {*held}
-    cloud = held["cloud?"]["arrays"]
-    assert cloud["positions"].shape == (COUNT, 3) and cloud["scan"].max() == SCANS - 1
+    view = open_result(drive)
+    for axis, name in enumerate("xyz"):
+        exact = np.sort(view.points.values(name, slice(None)) - view.origin[axis])
+        held_values = np.sort(unpacked_column(held["cloud?"], name))
+        assert np.abs(held_values - exact).max() < 1e-4 * np.ptp(exact) + 1e-3
+    scans = unpacked_column(held["cloud?"], "scan")
+    assert np.array_equal(np.sort(scans), np.sort(view.points.values("scan", slice(None))))
     for name in held["state?"]["colours"]:
-        assert cloud[f"{name} shades"].max() < len(cloud[f"{name} palette"])
         assert held["cloud?"]["legends"][name]
+        assert {f"{name} scale", f"{name} palette"} & {*held["cloud?"]["arrays"]}
     assert not re.search(rb'(src|href)="(?!data:)', page) and b'from "./' not in page
     assert page_of(open_result(drive)) == page
 
@@ -201,7 +264,8 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
     monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", whole - 200_000)
     page = page_of(open_result(drive))
     assert len(page) <= whole - 200_000
-    places = answers(page)["cloud?"]["arrays"]["positions"]
+    cloud = answers(page)["cloud?"]
+    places = np.stack([unpacked_column(cloud, axis) for axis in "xyz"], axis=1)
     far = [np.linalg.norm(some, axis=1) > 15 for some in (places, dense)]
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
     monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", 500_000)
@@ -213,13 +277,13 @@ def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
     film = tmp_path / "film.mp4"
     page = tmp_path / "page.htm"
     with pytest.raises(LidarError, match=r"film.mp4 does not end with .gif or .webp"):
-        share(drive, film, None)
+        share(open_result(drive), film, None)
     with pytest.raises(LidarError, match=r"page.htm does not end with .html"):
-        share(drive, None, page)
+        share(open_result(drive), None, page)
     with pytest.raises(LidarError, match="cannot be written"):
-        share(drive, None, tmp_path / "none" / "page.html")
+        share(open_result(drive), None, tmp_path / "none" / "page.html")
     rows = np.zeros(0, row_type(np.dtype(np.float32), (SCAN,)))
     (drive / "cloud.ply").write_bytes(header(rows.dtype, 0) + rows.tobytes())
     with pytest.raises(LidarError, match="no points to show"):
-        share(drive, tmp_path / "film.gif", None)
+        share(open_result(drive), tmp_path / "film.gif", None)
     assert not film.exists() and not page.exists()

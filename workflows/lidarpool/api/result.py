@@ -138,7 +138,7 @@ class Result(RunResult):
         from lidarsim.columns.cloud_file import CloudFile
         from lidarview.viewer.view import View, result_page, wait_for_interrupt
 
-        from ..live.opened import downloads
+        from ..live.downloads import downloads
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.extra_columns)

@@ -210,14 +210,18 @@ def view(
     film: Path | None,
     export: Path | None,
 ) -> None:
-    """Show a result or a cloud in the browser, or write a file to share.
+    """Show a file or folder in the browser, or write a file to share.
 
-    Several results are shown in one view, with a colour each.
+    RESULT: a result; a data set of a campaign; a cloud or recording (.ply, .las, .laz, .pcd, .e57,
+    .parquet, .mcap, .pcap, .osf, .bin, or a folder of rosbag2, KITTI, nuScenes, WebDataset, PCD or
+    range images); or a scenario or mesh, before its run. Several are shown in one view, with a
+    colour each.
 
     \b
     Examples:
       lidarpool view lidarpool-out
-      lidarpool view lidarpool-out/cloud.ply --no-browser
+      lidarpool view drive.yaml
+      lidarpool view recording.mcap --no-browser
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - click wants the character, not its name
@@ -227,19 +231,28 @@ def view(
     from lidarview.viewer.view import CLOUD, show_view
 
     from ..export.folder import local_result
-    from ..live.opened import open_finished, refuse_unfinished
+    from ..live.job_list import JobList, show_jobs
+    from ..live.opened import is_data_set, open_views
     from .terminal import Terminal
 
     if (film or export) and len(results) > 1:
         raise LidarError("--film and --export take one result: give them one after the other.")
+    if data_sets := [result for result in results if is_data_set(result)]:
+        if len(results) > 1 or film or export:
+            raise LidarError(
+                f"{data_sets[0]} is a data set of many jobs: view it alone, without --film and "
+                "--export."
+            )
+        show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
+        return
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
+        shown = open_views(folders)
         if film or export:
-            refuse_unfinished(folders[0])
-            share(folders[0], film, export, Terminal().writing)
+            share(shown, film, export, Terminal().writing)
         else:
-            show_view(open_finished(folders), port=port, browser=not no_browser)
+            show_view(shown, port=port, browser=not no_browser)
 
 
 @click.command()

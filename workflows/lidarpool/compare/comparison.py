@@ -28,9 +28,9 @@ from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
+from ..recordings.recordings import RecordedPoints, Recording, open_recording
 from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
-from .recordings import RecordedPoints, Recording, open_recording
 
 MAX_POINTS = 10_000_000  # of each cloud in memory
 MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken

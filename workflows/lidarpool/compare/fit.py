@@ -39,9 +39,9 @@ from lidarview.render.picture_page import Page, label_logarithms
 
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
+from ..recordings.recordings import RecordedPoints, Recording, open_recording
 from ..report.page.rendering import rendered
 from .range_image import RangeImages, range_images
-from .recordings import RecordedPoints, Recording, open_recording
 
 
 class _Chart(NamedTuple):

@@ -20,6 +20,8 @@ from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Entry
 
+_NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are no images
+
 # Columns of points that images have for every ray, or that follow from the pixel.
 _RAY_COLUMNS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")
 
@@ -71,23 +73,24 @@ class Reader(reading.Reader):
         """Return the points of a sweep, in the order of their rays."""
         file = self.files(sweep)[0]
         with open_archive(self.storage.path(file), partial(self.storage.read, file)) as images:
-            del images["pose"], images["scan"], images["frame"]
-        planes = next(n for n in count(1) if _key("range", n) not in images)
-        keys_of_later_returns = {_key(name, plane) for name in images for plane in range(1, planes)}
-        returned = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))
+            return points_of_images(images)
 
-        def values_of_points(name: str) -> AnyArray:
-            images_of_returns = [
-                images.get(_key(name, plane), images[name]) for plane in range(planes)
-            ]
-            return np.stack(images_of_returns).T[returned.T]
 
-        columns = {
-            name: values_of_points(name) for name in images if name not in keys_of_later_returns
-        }
-        images["channel"] = np.indices(returned.shape[1:], np.uint16)[0]
-        columns["channel"] = values_of_points("channel")
-        return np.stack([columns.pop(axis) for axis in "xyz"], axis=1), columns
+def points_of_images(images: dict[str, AnyArray]) -> reading.PointColumns:
+    """Return the points of the images of a sweep, in the order of their rays."""
+    images = {name: image for name, image in images.items() if name not in _NO_IMAGES}
+    planes = next(n for n in count(1) if _key("range", n) not in images)
+    keys_of_later_returns = {_key(name, plane) for name in images for plane in range(1, planes)}
+    returned = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))
+
+    def values_of_points(name: str) -> AnyArray:
+        images_of_returns = [images.get(_key(name, plane), images[name]) for plane in range(planes)]
+        return np.stack(images_of_returns).T[returned.T]
+
+    columns = {name: values_of_points(name) for name in images if name not in keys_of_later_returns}
+    images["channel"] = np.indices(returned.shape[1:], np.uint16)[0]
+    columns["channel"] = values_of_points("channel")
+    return np.stack([columns.pop(axis) for axis in "xyz"], axis=1), columns
 
 
 def _key(name: str, plane: int) -> str:

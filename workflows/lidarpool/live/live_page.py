@@ -53,7 +53,7 @@ from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, wait
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobUnderWay
-from .opened import downloads
+from .downloads import downloads
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points
@@ -163,7 +163,8 @@ class LivePage(RunPage):
                 self._loads.append((time_s, stats))
 
     def ended(self, row: JobRow) -> None:
-        """Count a job, and add an entry to the last jobs."""
+        """Count a job, and move its entry from the jobs under way to the last jobs."""
+        self._under_way = [job for job in self._under_way if job["name"] != row.name]
         entry = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
         entry |= {"number": row.number, "opens": row.done and self._written is not None}
         entry["values"] = self._words(row.values)

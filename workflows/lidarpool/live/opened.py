@@ -1,33 +1,83 @@
-"""Results that the page shows: unfinished runs are refused, points are offered as files."""
+"""Opens for the viewer whatever lidarpool reads or writes; points are offered as files.
+
+Results, clouds, recordings and exports of lidarpool and other programs, meshes and scenarios are a
+view each; a data set is a list of jobs with a view each (`job_list.py`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError
-from lidarview.viewer.view import CLOUD, Downloads, View, open_results
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.input_files import open_input
+from lidarsim.base.storage import Storage
+from lidarsim.scene.files.mesh_formats import format_of
+from lidarview.viewer.view import CLOUD, View, join_views, open_result
 
-from ..export.formats import Format, save_cloud
+from ..datasets.dataset import INDEX_FILE
+from ..recordings.recordings import open_sensors
 from ..run.store.database import FILE
 from ..run.store.run_store import RUN_FOLDER
+from .downloads import downloads
+from .preview import scenario_view
+from .recorded import recorded_view
 
-DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
-
-
-def downloads() -> Downloads:
-    """Return the formats of a download whose packages are installed, and their writer."""
-    return Downloads([name for name in DOWNLOADS if Format(name).installed], save_cloud)
+_HEADER_BYTES = 1 << 16  # of a .ply, in which its elements are named
 
 
-def open_finished(paths: Sequence[Path]) -> View:
-    """Open results of the same scene as a view whose points can be downloaded.
+def is_data_set(place: Path | Storage) -> bool:
+    """Return True if a folder or URL has a data set of many jobs, finished or not."""
+    if isinstance(place, Storage):
+        with explained(f"{place.url} cannot be read"):
+            return INDEX_FILE in place.entries()
+    return not (place / CLOUD).exists() and (
+        (place / INDEX_FILE).exists() or (place / ".jobs").is_dir()
+    )
 
-    LidarError if a folder holds an unfinished run, or `open_results` cannot open it.
+
+def open_views(paths: Sequence[Path]) -> View:
+    """Open files and folders of the same place as a view of all their points.
+
+    LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
+    others.
     """
-    for path in paths:
+    return join_views(paths, [open_view(path) for path in paths])
+
+
+def open_view(path: Path) -> View:
+    """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
+
+    LidarError if the path has an unfinished run, or nothing that is read.
+    """
+    if not path.exists():
+        raise LidarError(f"{path} does not exist: give a result, a cloud, a mesh or a scenario.")
+    title = f"{path.resolve().name} - lidarpool"
+    if path.is_dir():
         refuse_unfinished(path)
-    return open_results(paths, downloads())
+        if (path / CLOUD).exists():
+            return open_result(path, downloads())
+        return recorded_view(open_sensors(path), title, downloads())
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        return scenario_view(path)
+    if suffix == ".ply" and not _has_faces(path):
+        try:
+            return open_result(path, downloads())
+        except LidarError:  # text, or of another program
+            return recorded_view(open_sensors(path), title, downloads())
+    mesh_format = format_of(path)
+    if mesh_format is not None and not mesh_format.advice:
+        return scenario_view(path)
+    return recorded_view(open_sensors(path), title, downloads())
+
+
+def _has_faces(path: Path) -> bool:
+    """Return True if the header of a .ply file names faces, so that the file is a mesh."""
+    with open_input(path) as file:
+        header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
+    lines = (line.split() for line in header.splitlines())
+    return any(line[:2] == [b"element", b"face"] and line[2:] != [b"0"] for line in lines)
 
 
 def refuse_unfinished(path: Path) -> None:

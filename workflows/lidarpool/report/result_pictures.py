@@ -27,7 +27,7 @@ from lidarsim.columns.table import TABLE, Z
 from lidarsim.scene.scene import Scene
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
-from lidarview.render.colouring import with_rgb
+from lidarview.render.colouring import with_composed
 from lidarview.render.picture_page import FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
@@ -134,7 +134,7 @@ def _picture_makers(
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
-        columns_by_name = with_rgb(
+        columns_by_name = with_composed(
             {name: c for c in (Z, *file.table) for name in (c.name, c.in_files)}
         )
         if colour not in columns_by_name:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.columns.table import COLOURS, NO_SURFACE, OBJECT, Column
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
+from lidarsim.columns.table import COLOURS, NO_SURFACE, NORMAL, OBJECT, Column
 from lidarsim.scene.colours import packed, unpacked
 
 from .theme import mapped, object_colours
@@ -19,7 +19,12 @@ DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle i
 MAX_UNNAMED_LABELS = 12  # labels without names that have a colour each
 MAX_COLOURS = 1 << 16  # of labels
 
-RGB = Column("rgb", "uint32", "", "colours of the surfaces")  # see `values_of`
+# Columns that are composed of others, see `values_of`.
+RGB = Column("rgb", "uint32", "", "colours of the surfaces")
+NORMALS = Column(
+    "normals", "uint32", "", "directions of the surfaces: x red, y green, z blue, -1 dark, 1 bright"
+)
+_COMPOSED = {RGB.name: (RGB, COLOURS), NORMALS.name: (NORMALS, NORMAL)}  # {name: (column, parts)}
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 # The scale is logarithmic if numbers differ by the first factor and the median is this low in their
@@ -45,19 +50,35 @@ class Colouring:
     labels: tuple[tuple[str, Floats], ...] = ()
     values: tuple[int, ...] = ()  # of the column, one for each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
+    divisor: float = 1.0  # of values, to the unit of the limits
 
 
-def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
-    """Add `RGB` to columns that have red, green and blue, for points in their own colours."""
-    has_colours = {*COLOURS} <= {*columns} and RGB.name not in columns
-    return {**columns, **({RGB.name: RGB} if has_colours else {})}
+def with_composed(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """Add `RGB` and `NORMALS` to columns that have all of their parts."""
+    composed = {
+        name: column
+        for name, (column, parts) in _COMPOSED.items()
+        if {*parts} <= {*columns} and name not in columns
+    }
+    return {**columns, **composed}
 
 
 def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
-    """Return the values of a column, or packed colours for `RGB`; `read` returns a named column."""
+    """Return the values of a column, or packed colours for `RGB` and `NORMALS`.
+
+    `read` returns a named column.
+    """
     if column is RGB:
         return packed(np.stack([read(name) for name in COLOURS], axis=1))
+    if column is NORMALS:
+        return packed(colours_of_normals(np.stack([read(name) for name in NORMAL], axis=1)))
     return read(column.name)
+
+
+def colours_of_normals(normals: AnyArray) -> Bytes:
+    """Return the colours (n, 3) of unit vectors (n, 3); grey for NaN, of points on no surface."""
+    known = np.isfinite(normals).all(axis=1, keepdims=True)
+    return np.asarray(np.where(known, 127.5 * (1 + normals), 127.5).round().astype(np.uint8))
 
 
 def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
@@ -67,15 +88,22 @@ def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
-def colours_of(values: AnyArray, column: Column, names: Sequence[str] = ()) -> Colouring:
+def colours_of(
+    values: AnyArray,
+    column: Column,
+    names: Sequence[str] = (),
+    limits: tuple[float, float] | None = None,
+) -> Colouring:
     """Choose colours for the values (n,) of a column.
+
+    `limits` are the ends of a scale of numbers in its unit, in place of those of the values.
 
     `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
     without names and with too many values for a legend are on a scale like numbers. Numbers that
     are mostly small with a few large numbers, and intensities of a wide range, have a logarithmic
     scale. Velocities are blue below 0 and red above. NaN is grey, and so are points on no surface.
     """
-    if column is RGB:
+    if column in (RGB, NORMALS):
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
     spread: tuple[float, float] = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
@@ -86,7 +114,7 @@ def colours_of(values: AnyArray, column: Column, names: Sequence[str] = ()) -> C
                 labels = labels[np.argsort(-counts, kind="stable")]
             return _label_colouring(labels, column, names)
         spread = (0, 100)
-    return _number_colouring(values, column, spread)
+    return _number_colouring(values, column, spread, limits)
 
 
 def _label_colouring(labels: Ints, column: Column, names: Sequence[str]) -> Colouring:
@@ -123,9 +151,12 @@ class _Range(NamedTuple):
 
 
 def _number_colouring(
-    values: AnyArray, column: Column, percentiles: tuple[float, float]
+    values: AnyArray,
+    column: Column,
+    percentiles: tuple[float, float],
+    chosen_limits: tuple[float, float] | None,
 ) -> Colouring:
-    """Return a scale for values (n,) between two percentiles."""
+    """Return a scale for values (n,) between two percentiles, or chosen limits."""
     finite = np.isfinite(values)
     lower = 0.0
     middle = 0.5
@@ -147,10 +178,20 @@ def _number_colouring(
         limits = _Range(-max_speed, limits.middle, max_speed)
         scale = DIVERGING
     logarithmic = limits.is_logarithmic(unit)
+    if chosen_limits is not None:
+        limits = _Range(chosen_limits[0], limits.middle, chosen_limits[1])
+        logarithmic = logarithmic and limits.lower > 0
     paint = _scale_painter(limits, divisor, logarithmic, scale)
     range_limits = float(limits.lower), float(limits.upper)
     return Colouring(
-        paint, column.name, unit, column.meaning, range_limits, logarithmic, scale=scale
+        paint,
+        column.name,
+        unit,
+        column.meaning,
+        range_limits,
+        logarithmic,
+        scale=scale,
+        divisor=divisor,
     )
 
 

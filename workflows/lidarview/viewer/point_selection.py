@@ -49,6 +49,19 @@ class HeldPoints:
         return 0, len(self)
 
 
+class OrderedPoints(HeldPoints):
+    """All points of a recording in memory, in the order of their scans."""
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """Return the first row of a range of scans, and one past its last row."""
+        if "scan" not in self._cloud.columns:
+            return super().rows_of(scans)
+        first, last = scans
+        column = self._cloud["scan"]
+        start, stop = np.searchsorted(column, first), np.searchsorted(column, last, "right")
+        return int(start), int(stop)
+
+
 class JoinedPoints:
     """Points of several results in turn, with the columns that all results have."""
 
@@ -84,34 +97,49 @@ class Filter:
     """Filter: points whose columns are within limits, (column, lowest, highest) each.
 
     Limits of one column are joined when a filter is read, so that a long filter takes no longer
-    than one limit of each column.
+    than one limit of each column. `hidden` are values of columns that are left out.
     """
 
     limits: tuple[tuple[str, float, float], ...] = ()
+    hidden: tuple[tuple[str, tuple[float, ...]], ...] = ()  # (column, values)
 
     @classmethod
     def read(cls, text: str, names: Sequence[str]) -> Filter:
         """Read limits of known columns from an address, ``column,lowest,highest;…``.
 
-        `names` are the known columns. ValueError if a limit is not a number.
+        An entry ``!column,value,value`` leaves a value out. `names` are the known columns.
+        ValueError if a limit is not a number.
 
         Examples
         --------
         >>> Filter.read("z,0,1.5;what,1,2", ["z"])
-        Filter(limits=(('z', 0.0, 1.5),))
-        >>> Filter.read("z,0,1.5;z,1,2", ["z"])
-        Filter(limits=(('z', 1.0, 1.5),))
+        Filter(limits=(('z', 0.0, 1.5),), hidden=())
+        >>> Filter.read("z,0,1.5;z,1,2;!class,3,3", ["z", "class"])
+        Filter(limits=(('z', 1.0, 1.5),), hidden=(('class', (3.0,)),))
         """
+        hidden = dict[str, set[float]]()
         limits = dict[str, tuple[float, float]]()
         for entry in filter(None, text.split(";")):
             name, *texts = entry.rsplit(",", 2)
             lower, upper = map(float, texts)
             if math.isnan(lower) or math.isnan(upper):
                 raise ValueError(f"{entry!r} has a limit that is not a number")
-            if name in names:
+            if name.startswith("!"):
+                hidden.setdefault(name[1:], set()).add(lower)
+            elif name in names:
                 lowest, highest = limits.get(name, (lower, upper))
                 limits[name] = max(lower, lowest), min(upper, highest)
-        return cls(tuple((name, *texts) for name, texts in limits.items()))
+        return cls(
+            tuple((name, *ends) for name, ends in limits.items()),
+            tuple((name, tuple(sorted(hidden[name]))) for name in hidden if name in names),
+        )
+
+    def without(self, column: str) -> Filter:
+        """Return the filter without what concerns a column."""
+        return Filter(
+            tuple(limit for limit in self.limits if limit[0] != column),
+            tuple(values for values in self.hidden if values[0] != column),
+        )
 
     def keeps(self, points: Points, rows: Ints | slice) -> Bools:
         """Return a mask (n,) of the points at rows that are within all limits."""
@@ -120,6 +148,8 @@ class Filter:
         for name, lower, upper in self.limits:
             values = points.values(name, rows)
             is_kept &= (values >= lower) & (values <= upper)  # False for NaN
+        for name, hidden_values in self.hidden:
+            is_kept &= ~np.isin(points.values(name, rows), hidden_values)
         return is_kept
 
 
@@ -258,7 +288,7 @@ class PointFinder:
             )
             ranges = sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
         total = sum(stop - start for start, stop in ranges)
-        if not point_filter.limits and (eye is None or total <= max_points):
+        if point_filter == Filter() and (eye is None or total <= max_points):
             numbers = even_indices(total, max_points)
             offsets = np.cumsum([0, *(stop - start for start, stop in ranges)])[:-1]
             part = np.searchsorted(offsets, numbers, "right") - 1

@@ -18,19 +18,20 @@ import click
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.writing_progress import WritingProgress
-from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.colours import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..picture_file import SensorPositions
 from ..render.colouring import TURBO
 from ..render.film import Film
-from .point_selection import HeldPoints, PointFinder, ScanRanges, even_shares, positions
+from .packing import pack_column, pack_positions
+from .point_selection import PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
-from .view import MAX_POINTS, View, open_result
+from .view import View, legend_of
 
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
 _MIN_FRAMES = 30
@@ -41,7 +42,7 @@ _FILM_TRIANGLES = 3_000_000
 _FILM_POINTS = 800_000  # that a film shows at a time
 _FRAME_POINTS = 200_000  # that a frame adds
 PAGE_BYTES = 25_000_000  # maximum of a page in one file
-_PAGE_POINTS = 1_000_000
+_PAGE_POINTS = 4_000_000
 _PAGE_TRIANGLES = 60_000
 _SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
 _CELLS = 300  # along the diagonal of the points, in which their density is counted
@@ -52,12 +53,12 @@ def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
 
 
 def share(
-    path: Path,
+    view: View,
     film: Path | None,
     page: Path | None,
     writing: Callable[[str], AbstractContextManager[WritingProgress]] | None = None,
 ) -> None:
-    """Write a result's folder, or a cloud, as a film, a page or both; files are replaced.
+    """Write a view as a film, a page or both; files are replaced.
 
     `writing` opens the display of an output's progress, with a caption; none by default.
 
@@ -66,9 +67,8 @@ def share(
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
-    view = open_result(path)
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
-        raise LidarError(f"{path} has no points to show: its rays hit nothing.")
+        raise LidarError("There are no points to show: rays hit nothing.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     for file in filter(None, (film, page)):
@@ -246,6 +246,8 @@ def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
     answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
     questions = [("surface", "colour", value) for value in header["scene"] or ()]
     questions += [("column", "name", value) for value in view.columns]
+    labels = [name for name, column in view.columns.items() if column.kind == "label"]
+    questions += [("counts", "name", name) for name in labels]
     for number, (question, key, value) in enumerate(questions, 1):
         answers[f"{question}?{key}={value}"] = _packed(*view.answer(question, {key: value}, bool))
         show("page", number, len(questions), "answers")
@@ -258,7 +260,7 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 
 
 def _thinned(view: View, max_points: int) -> Answer:
-    """Choose points, fewer where points are dense, with all columns and the colours by each."""
+    """Choose points, fewer where points are dense, and pack all their columns."""
     rows, _ = PointFinder(view.points, view.origin).find(_SAMPLE_POINTS)
     world = positions(view.points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
@@ -267,20 +269,43 @@ def _thinned(view: View, max_points: int) -> Answer:
     shares = even_shares(counts, max_points)[cell_of_point]
     chosen = np.random.default_rng(0).random(len(rows)) < shares
     columns = {c.name: view.points.values(c.name, rows[chosen]) for c in view.points.table}
-    held = HeldPoints(Cloud(world[chosen], columns, view.points.table))
-    return _coloured_points(replace(view, points=held), columns)
+    order = _compact_order(columns, int(chosen.sum()))
+    return _packed_points(
+        view,
+        world[chosen][order] - view.origin,
+        {name: values[order] for name, values in columns.items()},
+    )
 
 
-def _coloured_points(view: View, columns: Mapping[str, AnyArray]) -> Answer:
-    """Return all points of a view with their columns, and colours and legends by each column."""
+def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
+    """Return an order in which neighbours are alike: by sensor and channel, then as they are."""
+    keys = [columns[name] for name in ("channel", "sensor") if name in columns]
+    return np.lexsort(keys) if keys else np.arange(count)
+
+
+def _packed_points(view: View, local: Floats, columns: Mapping[str, AnyArray]) -> Answer:
+    """Return points with their packed columns, and the colours and legend of each column."""
+    packed_columns = dict(zip("xyz", pack_positions(local), strict=True))
+    packed_columns |= {name: pack_column(values) for name, values in columns.items()}
+    arrays: dict[str, AnyArray] = {name: c.planes for name, c in packed_columns.items()}
     legends = dict[str, Any]()
-    arrays: dict[str, AnyArray] = {n: values.astype(np.float64) for n, values in columns.items()}
     for name in view.answer("state", {}, bool)[0]["colours"]:
-        question = {"colour": name, "most": str(MAX_POINTS)}
-        header, points = view.answer("points", question, bool)
-        palette, shades = np.unique(points["colours"].view(np.uint32), return_inverse=True)
-        dtype = np.uint8 if len(palette) <= 1 << 8 else np.uint32
-        arrays |= {f"{name} palette": palette, f"{name} shades": shades.ravel().astype(dtype)}
-        legends[name] = header["legend"]
-        arrays["positions"] = points["positions"]
-    return {"legends": legends, "origin": view.origin.tolist()}, arrays
+        colouring = view.colouring(name)
+        legends[name] = legend_of(colouring) | {"column": name, "divisor": colouring.divisor}
+        if colouring.limits is not None:
+            arrays[f"{name} scale"] = as_bytes(colouring.scale)
+        elif name in columns:
+            values = np.unique(columns[name])
+            arrays[f"{name} labels"] = values.astype(np.float64)
+            arrays[f"{name} palette"] = as_bytes(colouring.paint(values))
+    described = {
+        name: {
+            "base": column.base,
+            "step": column.step,
+            "fractions": column.fractions,
+            "logarithmic": column.logarithmic,
+        }
+        for name, column in packed_columns.items()
+    }
+    header = {"legends": legends, "origin": view.origin.tolist(), "count": len(local)}
+    return header | {"packed": described}, arrays

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,22 +45,28 @@ from ..picture_file import (
 from ..render.closeup import floor_and_cut, surrounding_box
 from ..render.colouring import (
     MAX_UNNAMED_LABELS,
+    NORMALS,
+    RGB,
     TURBO,
     Colouring,
     colours_of,
+    colours_of_normals,
     values_of,
-    with_rgb,
+    with_composed,
     word_of,
 )
 from ..render.hit_density import HITS_TITLE, hit_colours
 from ..render.surface import separate_objects
 from ..render.theme import mapped, object_colours
 from .point_selection import (
+    BLOCK_ROWS,
     RESULT,
+    Abandoned,
     Eye,
     Filter,
     HeldPoints,
     JoinedPoints,
+    OrderedPoints,
     PointFinder,
     Points,
     ScanRanges,
@@ -72,6 +79,8 @@ from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
 _SAMPLE = 100_000  # points from which colour scales and limits are computed
+_MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
+_CORNERS = 1000  # points of a cloud that are in the first picture
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
@@ -122,6 +131,9 @@ class View:
     hits: Callable[[], AnyArray] | None = None
     triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
     downloads: Downloads | None = None  # None if points are not offered as files
+    # {column: names of the values 0, 1, 2, …}, beside those of the scene and the sweeps.
+    names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    preview: bool = False  # whether the points are those of first sweeps, before a run
 
     def __post_init__(self) -> None:
         self.version = 0  # counts the replacements of the points by `show`
@@ -130,7 +142,7 @@ class View:
         self.path: Floats | None = None  # (w, 2): corners of the planned path, local, metres
         sources = (source for source in (self.pictured, self.sweeps) if source is not None)
         if any(source.coordinates != "world" for source in sources):
-            self.note = self.note or IN_SENSOR_AXES
+            self.note = f"{self.note} {IN_SENSOR_AXES}".strip()
         if self.sweeps is not None and self.sweeps.coordinates != "world":
             self.pictured = None
         if (pictured := self.pictured) is not None:
@@ -142,17 +154,19 @@ class View:
             column.name: column for column in self.points.table if column not in POSITION
         }
         self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # to colour and filter by
-        self._coloured = with_rgb(self.columns)
+        self._coloured = with_composed(self.columns)
         self._lock = threading.Lock()
         self._surface: ShownSurface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
+        self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the last answer
         self.show(self.points)
 
     def show(self, points: Points) -> None:
         """Replace the points."""
         self.points = points
         self._finder = PointFinder(points, self.origin)
-        self._colourings: dict[tuple[str, Filter], Colouring] = {}
+        # {(column, filter, limits of the scale): colour scale}
+        self._colourings: dict[tuple[Any, ...], Colouring] = {}
         self.version += 1
 
     # -- properties of the survey ---------------------------------------------------------
@@ -197,6 +211,8 @@ class View:
         """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
         if column == RESULT.name and self.results:
             return self.results
+        if column in self.names:
+            return self.names[column]
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
         if (sweeps := self.sweeps) is not None:
@@ -214,20 +230,22 @@ class View:
         """Return the origin (3,), world metres; the box (2, 3) and points (k, 3) to be in sight.
 
         The box contains the points, local, metres. The points are the corners of the scene, the
-        positions of the sensors, and both ends of the planned path: closer together than the
-        corners of the box, which around an object is mostly empty.
+        positions of the sensors unless these are around an object, and both ends of the planned
+        path: closer together than the corners of the box, which around an object is mostly empty.
         """
         if self.pictured is None:
-            origin, box = _cloud_extent(self.points)
-            return origin, box, corners_of(box)
+            return _cloud_extent(self.points)
         scene = self.pictured.scene
         planning = self.pictured.planning
-        sensors = [sensor.positions for sensor in self.pictured.sensors]
-        corners = np.concatenate([corners_of(scene.bounds), *sensors])
+        sensors = np.concatenate([np.empty((0, 3)), *(s.positions for s in self.pictured.sensors)])
+        corners = corners_of(scene.bounds)
         if planning is not None:
             level = corners[:, 2].min()
             corners = np.vstack([corners, [*planning.start, level], [*planning.target, level]])
-        return scene.origin, np.stack([corners.min(axis=0), corners.max(axis=0)]), corners
+        all_corners = np.vstack([corners, sensors])
+        if not _are_around(sensors, scene.bounds):
+            corners = all_corners
+        return scene.origin, np.stack([all_corners.min(axis=0), all_corners.max(axis=0)]), corners
 
     # -- answers -------------------------------------------------------------------------
 
@@ -242,6 +260,7 @@ class View:
             "points": self._points,
             "point": lambda arguments, _: self._point(int(arguments["row"])),
             "column": lambda arguments, _: self._column(arguments["name"]),
+            "counts": lambda arguments, gone: self._label_counts(arguments["name"], gone),
             "surface": lambda arguments, _: self._scene(arguments["colour"]),
             "range": lambda arguments, _: self._range(int(arguments["sweep"])),
             "export": self._export,
@@ -265,10 +284,11 @@ class View:
             arrays[f"sensor{number}_times"] = sensor.times_ns / _NS
             arrays[f"sensor{number}_places"] = sensor.positions
         arrays |= self._actor_arrays()
-        if self.sweeps is not None:
-            arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
-            arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
-            arrays["sweep_sensor"] = self.sweeps.sensor
+        sweeps = self.sweeps
+        if sweeps is not None:
+            arrays["sweep_scans"] = sweeps.scans.astype(np.float64)
+            arrays["sweep_begins"] = sweeps.begins_ns / _NS
+            arrays["sweep_sensor"] = sweeps.sensor
         pictured = self.pictured
         object_count = len(self._names("object"))
         static_count = object_count - len(self.actors)
@@ -308,6 +328,9 @@ class View:
             "duration": self.duration_ns / _NS,
             "path": self.planned,
             "note": self.note,
+            "preview": self.preview,
+            # Sweeps in the axes of a sensor that moves do not fit each other.
+            "by_sweep": sweeps is not None and sweeps.coordinates != "world" and len(sweeps) > 1,
         }
         return header, arrays
 
@@ -404,7 +427,10 @@ class View:
     @property
     def _export_formats(self) -> Sequence[str]:
         """Formats of a download; none for a sample of a run under way."""
-        if self.downloads is None or isinstance(self.points, HeldPoints):
+        is_sample = isinstance(self.points, HeldPoints) and not isinstance(
+            self.points, OrderedPoints
+        )
+        if self.downloads is None or is_sample or self.preview:
             return ()
         return self.downloads.formats
 
@@ -427,7 +453,8 @@ class View:
         eye = Eye.read(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
         rows, count = finder.find(max_points, *selection, eye, abandoned)
-        colouring = self._colouring(finder, name, selection[0], abandoned)
+        limits = _read_limits(arguments["limits"]) if "limits" in arguments else None
+        colouring = self._colouring(finder, name, selection[0].without(name), limits, abandoned)
         values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
@@ -441,24 +468,33 @@ class View:
             legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
         return {"version": version, "count": count, "legend": legend}, arrays
 
+    def colouring(self, name: str) -> Colouring:
+        """Return the colour scale of a column for all points."""
+        return self._colouring(self._finder, name, Filter(), None, bool)
+
     def _colouring(
-        self, finder: PointFinder, name: str, point_filter: Filter, abandoned: Callable[[], bool]
+        self,
+        finder: PointFinder,
+        name: str,
+        point_filter: Filter,
+        limits: tuple[float, float] | None,
+        abandoned: Callable[[], bool],
     ) -> Colouring:
         """Return the colour scale of a column, the same for all scans.
 
-        The scale is taken from a sample of all points that the filter keeps.
+        The scale is taken from a sample of all points that the filter keeps, or has given limits.
         """
         colourings = self._colourings
-        colouring = colourings.get((name, point_filter))
+        colouring = colourings.get((name, point_filter, limits))
         if colouring is None:
             rows, _ = finder.find(_SAMPLE, point_filter, None, None, abandoned)
             column = self._coloured[name]
             values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
-            colouring = colours_of(values, column, self._names(name))
+            colouring = colours_of(values, column, self._names(name), limits)
             with self._lock:
                 while len(colourings) >= _MAX_COLOURINGS:
                     del colourings[next(iter(colourings))]  # the oldest
-                colourings[name, point_filter] = colouring
+                colourings[name, point_filter, limits] = colouring
         return colouring
 
     def _column(self, name: str) -> Answer:
@@ -479,6 +515,34 @@ class View:
         lower, upper = (float(distinct[0]), float(distinct[-1])) if len(distinct) else (0.0, 1.0)
         is_integer = values.dtype.kind in "iu" and unit == 1.0
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
+
+    def _label_counts(self, name: str, abandoned: Callable[[], bool]) -> Answer:
+        """Return [value, points] of each value of a column of labels, of all points.
+
+        "exact" is False if they are estimated from a sample, because the points are many.
+        """
+        if self.columns[name].kind != "label":
+            raise KeyError(name)
+        finder = self._finder
+        key = (name, self.version)
+        if key not in self._label_counts_of:
+            total = len(finder.points)
+            is_exact = total <= _MAX_COUNTED
+            counts = Counter[int]()
+            if is_exact:
+                for start in range(0, total, BLOCK_ROWS):
+                    if abandoned():
+                        raise Abandoned
+                    _add_counts(
+                        counts, finder.points.values(name, slice(start, start + BLOCK_ROWS))
+                    )
+            else:
+                rows, _ = finder.find(_SAMPLE)
+                _add_counts(counts, finder.points.values(name, rows))
+                scale = total / max(len(rows), 1)
+                counts = Counter({value: round(scale * n) for value, n in counts.items()})
+            self._label_counts_of = {key: {"counts": sorted(counts.items()), "exact": is_exact}}
+        return self._label_counts_of[key], {}
 
     def _point(self, row: int) -> Answer:
         """Return the position of a point, world coordinates, and all its columns in words."""
@@ -634,17 +698,41 @@ def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
     return colours
 
 
-def _cloud_extent(points: Points) -> tuple[Floats, Floats]:
-    """Return an origin (3,) for points, and their local box (2, 3) without outliers, metres.
+def _are_around(sensors: Floats, bounds: Floats) -> bool:
+    """Return True if all sensors (n, 3), n > 1, are beside or above an object's bounds (2, 3)."""
+    outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
+    return len(sensors) > 1 and bool(outside.all())
 
+
+def _read_limits(text: str) -> tuple[float, float]:
+    """Read the ends of a colour scale, ``lowest,highest``; ValueError if they are in disorder."""
+    lower, upper = map(float, text.split(","))
+    if not -math.inf < lower < upper < math.inf:
+        raise ValueError(f"{text!r} are no ends of a colour scale")
+    return lower, upper
+
+
+def _add_counts(counts: Counter[int], values: AnyArray) -> None:
+    """Add the number of points of each value (n,) to counts."""
+    labels, numbers = np.unique(values, return_counts=True)
+    counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
+
+
+def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
+    """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), metres.
+
+    The box is without outliers; the points are a sample within the box.
     Each coordinate of the origin is 0, or whole metres for points farther than 10 km from 0.
     """
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
-        return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        empty_box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+        return np.zeros(3), empty_box, corners_of(empty_box)
     box = np.percentile(sample, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
-    return origin, box - origin
+    inside = sample[((sample >= box[0]) & (sample <= box[1])).all(axis=1)]
+    few = inside[:: len(inside) // _CORNERS + 1] if len(inside) else corners_of(box)
+    return origin, box - origin, few - origin
 
 
 class ShownSurface:
@@ -691,6 +779,12 @@ class ShownSurface:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
             legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "normals":
+            a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
+            normals = np.cross(b - a, c - a)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            colours = colours_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
+            legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
         elif by == "colour" and self.coarse.colours is not None:
             colours = self.coarse.colours.means() / 255
         else:
@@ -731,11 +825,13 @@ def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     )
-    return ("grey", "hits", "object", *reflectances, *scene_colours)
+    return ("grey", "hits", "object", "normals", *reflectances, *scene_colours)
 
 
 def legend_of(colouring: Colouring) -> Legend:
     """Return the legend of colours: a scale with numbers, or labels with their values."""
+    if colouring.name in (RGB.name, NORMALS.name):
+        return scale_legend(colouring.meaning, (), np.empty((0, 3)))
     if colouring.limits is None:
         labels = [
             [name, as_bytes(colour).tolist(), value]
@@ -754,7 +850,10 @@ def legend_of(colouring: Colouring) -> Legend:
             f"{round(number, digits) + 0.0:,.{digits}f}"
             for number in (lower, (lower + upper) / 2, upper)
         ]
-    return scale_legend(title, marks, colouring.scale[::15])
+    return scale_legend(title, marks, colouring.scale[::15]) | {
+        "limits": [float(lower), float(upper)],
+        "logarithmic": colouring.logarithmic,
+    }
 
 
 def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
@@ -798,12 +897,23 @@ def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> V
     The view can be played if the sweeps of all results start at the same times. LidarError if a
     result has no cloud, a damaged cloud, or points in the frames of the sensors.
     """
-    first, *other_views = views = [open_result(path, downloads) for path in paths]
+    return join_views(paths, [open_result(path, downloads) for path in paths], downloads)
+
+
+def join_views(
+    paths: Sequence[Path], views: Sequence[View], downloads: Downloads | None = None
+) -> View:
+    """Return a view of all points of the views of results, see `open_results`."""
+    first, *other_views = views
     if not other_views:
         return first
-    if IN_SENSOR_AXES in (notes := [view.note for view in views]):
+    notes = [view.note for view in views]
+    in_sensor_axes = [
+        path for path, note in zip(paths, notes, strict=True) if IN_SENSOR_AXES in note
+    ]
+    if in_sensor_axes:
         raise LidarError(
-            f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
+            f"{in_sensor_axes[0]} has points in the axes of its sensors, which "
             "fit no other result: show it alone, or run it with cloud.coordinates: world."
         )
     names = [path.resolve().name for path in paths]

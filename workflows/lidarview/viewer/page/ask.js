@@ -40,33 +40,97 @@ async function read(question) {
   return unpacked(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
 }
 
-async function pointsOf({ colour, filter = "", scans, most }) {
-  const { arrays, origin, legends } = await held("cloud?");
-  const ranges = scans?.split(",").filter(Boolean).map((range) => range.split("-").map(Number));
-  const limits = filter.split(";").filter(Boolean).map((limit) => limit.split(","));
-  const tests = limits.map(([name, low, high]) => {
-    const axis = "xyz".indexOf(name), values = arrays[name];
-    return axis < 0 ? (k) => values[k] >= +low && values[k] <= +high : (k) => {
-      const value = arrays.positions[3 * k + axis] + origin[axis];
-      return value >= +low && value <= +high;
-    };
+// Values of a column, as `packing.py` has packed them: planes of bytes of differences in zigzag.
+const columns = new Map(); // {name: values}
+function column(cloud, name) {
+  if (columns.has(name)) return columns.get(name);
+  const { base, step, fractions, logarithmic } = cloud.packed[name], bytes = cloud.arrays[name], { count } = cloud;
+  const planes = count ? bytes.length / count : 0, isWhole = !fractions && Number.isInteger(base) && Number.isInteger(step);
+  const values = isWhole ? new Float64Array(count) : new Float32Array(count);
+  for (let k = 0, code = 0; k < count; k++) {
+    let zigzag = 0;
+    for (let plane = planes - 1; plane >= 0; plane--) zigzag = 256 * zigzag + bytes[plane * count + k];
+    code += zigzag % 2 ? -(zigzag + 1) / 2 : zigzag / 2;
+    const scaled = base + step * (fractions ? code - 1 : code);
+    values[k] = !fractions ? scaled : !code ? NaN : logarithmic ? Math.exp(scaled) : scaled;
+  }
+  columns.set(name, values);
+  return values;
+}
+
+// A function that writes the colour of a row to an array, 4 bytes each.
+function painter(cloud, name, limits) {
+  const legend = cloud.legends[name], { arrays } = cloud, of = (part) => column(cloud, part);
+  if (name === "rgb" && !cloud.packed.rgb) {
+    const parts = ["red", "green", "blue"].map(of);
+    return (row, to, at) => parts.forEach((part, k) => { to[at + k] = part[row]; });
+  }
+  if (name === "normals" && !cloud.packed.normals) {
+    const parts = ["normal_x", "normal_y", "normal_z"].map(of);
+    return (row, to, at) => parts.forEach((part, k) => { to[at + k] = Number.isNaN(part[row]) ? 128 : 127.5 * (1 + part[row]); });
+  }
+  const values = of(name), start = "xyz".includes(name) ? cloud.origin["xyz".indexOf(name)] : 0;
+  if (!legend.limits) {
+    const palette = new Map(Array.from(arrays[`${name} labels`], (value, k) => [value, 3 * k])), colours = arrays[`${name} palette`];
+    return (row, to, at) => { const k = palette.get(values[row]); for (let part = 0; part < 3; part++) to[at + part] = colours[k + part]; };
+  }
+  const scale = arrays[`${name} scale`], logarithmic = legend.logarithmic && !(limits && limits[0] <= 0), as = logarithmic ? Math.log : (value) => value;
+  const [low, high] = (limits ?? legend.limits).map(as), least = (limits ?? legend.limits)[0];
+  return (row, to, at) => {
+    const value = (values[row] + start) / legend.divisor;
+    const share = (as(logarithmic ? Math.max(value, least) : value) - low) / (high - low || 1);
+    const k = 3 * Math.min(255, Math.max(0, Math.floor(255 * share)));
+    for (let part = 0; part < 3; part++) to[at + part] = Number.isNaN(value) ? 128 : scale[k + part];
+  };
+}
+
+// Whether the values of a row are within the limits of a filter.
+function testsOf(cloud, filter) {
+  return filter.split(";").filter(Boolean).map((limit) => {
+    const [text, low, high] = limit.split(","), name = text.replace(/^!/, ""), values = column(cloud, name);
+    if (text !== name) return (k) => values[k] !== +low;
+    const start = "xyz".includes(name) ? cloud.origin["xyz".indexOf(name)] : 0;
+    return (k) => values[k] + start >= +low && values[k] + start <= +high;
   });
-  if (ranges && arrays.scan) tests.push((k) => ranges.some(([first, last]) => arrays.scan[k] >= first && arrays.scan[k] <= last));
-  const found = [];
-  for (let k = 0; k < arrays.positions.shape[0]; k++) if (tests.every((test) => test(k))) found.push(k);
-  const step = Math.ceil(found.length / most), rows = Uint32Array.from(found.filter((_, k) => k % step === 0));
-  const positions = Float32Array.from({ length: 3 * rows.length }, (_, k) => arrays.positions[3 * rows[(k / 3) | 0] + (k % 3)]);
-  const shades = arrays[`${colour} shades`], palette = arrays[`${colour} palette`];
-  const colours = new Uint8Array(Uint32Array.from(rows, (k) => palette[shades[k]]).buffer);
-  return { count: found.length, legend: legends[colour], arrays: { positions, colours, rows } };
+}
+
+function chosenRows(cloud, filter, scans) {
+  const tests = testsOf(cloud, filter), { count } = cloud;
+  if (scans !== undefined && cloud.packed.scan) {
+    const ranges = scans.split(",").filter(Boolean).map((range) => range.split("-").map(Number)), scan = column(cloud, "scan");
+    tests.push((k) => ranges.some(([first, last]) => scan[k] >= first && scan[k] <= last));
+  }
+  const rows = new Uint32Array(count);
+  let found = 0;
+  for (let k = 0; k < count; k++) if (tests.every((test) => test(k))) rows[found++] = k;
+  return rows.subarray(0, found);
+}
+
+async function pointsOf({ colour, filter = "", scans, most, limits }) {
+  const cloud = await held("cloud?"), all = chosenRows(cloud, filter, scans);
+  const step = Math.max(1, Math.ceil(all.length / most)), rows = step === 1 ? all.slice() : all.filter((_, k) => k % step === 0);
+  const positions = new Float32Array(3 * rows.length), colours = new Uint8Array(4 * rows.length).fill(255);
+  const axes = ["x", "y", "z"].map((axis) => column(cloud, axis)), ends = limits?.split(",").map(Number), paint = painter(cloud, colour, ends);
+  rows.forEach((row, k) => {
+    for (let axis = 0; axis < 3; axis++) positions[3 * k + axis] = axes[axis][row];
+    paint(row, colours, 4 * k);
+  });
+  return { count: all.length, legend: legendWith(cloud.legends[colour], ends), arrays: { positions, colours, rows } };
+}
+
+// The legend of a colour scale whose limits were set by hand.
+function legendWith(legend, limits) {
+  if (!limits || !legend.limits) return legend;
+  const [low, high] = limits, middle = legend.logarithmic && low > 0 ? Math.sqrt(low * high) : (low + high) / 2;
+  return { ...legend, limits, marks: [low, middle, high].map((value) => `${+value.toPrecision(3)}`) };
 }
 
 async function pointOf(row) {
-  const { arrays, origin } = await held("cloud?"), { columns } = await held("state?");
-  const told = columns.filter(({ name }) => arrays[name]).map(async ({ name, unit }) => {
-    const { labels, unit: size } = await held(`column?name=${name}`), value = arrays[name][row];
-    const digits = size > 1 ? (value / size).toFixed(9) : Number.isInteger(value) ? value : +value.toPrecision(6);
+  const cloud = await held("cloud?"), { columns: listed } = await held("state?");
+  const told = listed.filter(({ name }) => cloud.packed[name] && !"xyz".includes(name)).map(async ({ name, unit }) => {
+    const { labels, unit: size } = await held(`column?name=${name}`), value = column(cloud, name)[row];
+    const digits = size > 1 ? (value / size).toFixed(9) : Number.isInteger(value) ? value : +value.toPrecision(cloud.packed[name].fractions ? 4 : 6);
     return [name, labels?.find(([, label]) => label === value)?.[0] ?? `${digits} ${unit}`.trim()];
   });
-  return { place: origin.map((start, axis) => arrays.positions[3 * row + axis] + start), columns: await Promise.all(told) };
+  return { place: cloud.origin.map((start, axis) => column(cloud, "xyz"[axis])[row] + start), columns: await Promise.all(told) };
 }

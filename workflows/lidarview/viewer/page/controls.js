@@ -24,6 +24,13 @@ const ICONS = {
   link: '<path d="M6.5 9.5l3-3M7 5l1.5-1.5a2.8 2.8 0 0 1 4 4L11 9M9 11l-1.5 1.5a2.8 2.8 0 0 1-4-4L5 7"/>',
   picture: '<path d="M2 5h3l1-2h4l1 2h3v8H2z"/><circle cx="8" cy="8.7" r="2.3"/>',
   panel: '<path d="M2.5 4h11M2.5 8h11M2.5 12h11"/>',
+  point: '<path d="M3 2l4 11 1.6-4.6L13 7z"/>',
+  distance: '<path d="M2 11L11 2l3 3-9 9zM5 8l1.5 1.5M7.5 5.5L9 7"/>',
+  angle: '<path d="M13 13H3L10 3M7.5 13a5 5 0 0 0-1.7-4"/>',
+  area: '<path d="M3 5l6-2 4 5-3 5H4z"/>',
+  clip: '<path d="M2.5 5L8 2.5 13.5 5v6L8 13.5 2.5 11zM2.5 5L8 7.5 13.5 5M8 7.5v6"/>',
+  close: '<path d="M4 4l8 8M12 4l-8 8"/>',
+  help: '<path d="M5.5 6a2.5 2.5 0 1 1 3.6 2.2C8.3 8.7 8 9.2 8 10M8 12.7v.1"/>',
   theme: '<circle cx="8" cy="8" r="5.5"/><path class="full" d="M8 2.5a5.5 5.5 0 0 1 0 11z"/>',
 };
 
@@ -134,15 +141,16 @@ export function dual(title, low, high, step, ends, words, act) {
 }
 
 // only: value of the label that is shown alone, or null; act(value) when a label is pressed; names:
-// {value: name} of those that the server knows by their numbers only.
-export function legend(told, only, act, names = {}) {
+// {value: name} of those that the server knows by their numbers only; hidden: values that are off;
+// change(value) when one is switched on or off.
+export function legend(told, only, act, names = {}, hidden = new Set(), change = null) {
   const box = element("div", { className: "legend" });
   if (!told) return box;
   if (!told.labels) {
     const stops = told.colours.map((colour) => `rgb(${colour})`).join(",");
     box.append(
       element("div", { textContent: told.title }),
-      element("div", { className: "bar", style: { background: `linear-gradient(to right,${stops})` } }),
+      ...(told.colours.length ? [element("div", { className: "bar", style: { background: `linear-gradient(to right,${stops})` } })] : []),
       element("div", { className: "marks" }, ...told.marks.map((text) => element("span", { textContent: text }))),
     );
     return box;
@@ -155,7 +163,10 @@ export function legend(told, only, act, names = {}) {
       element("i", { style: { background: `rgb(${colour})` } }), element("span", { textContent: shown }),
     );
     press.setAttribute("aria-pressed", value === only);
-    list.append(element("li", {}, press));
+    press.append(element("span", { className: "number", dataset: { value } }));
+    const box = element("input", { type: "checkbox", checked: !hidden.has(value), title: hidden.has(value) ? "Switch on" : "Switch off", onchange: () => change(value) });
+    box.setAttribute("aria-label", `show ${shown}`);
+    list.append(element("li", {}, ...(change ? [box] : []), press));
   }
   if (told.more) list.append(element("li", { textContent: `and ${told.more.toLocaleString("en")} more` }));
   box.append(list);

@@ -22,6 +22,7 @@ const inSeconds = (value) => `${value >= 100 ? whole(value) : value.toPrecision(
 // -- the run -----------------------------------------------------------------------------
 
 function showRun(told) {
+  if (told.still && shown === null) $("cloud").querySelector("p").textContent = "Reading the points of a job …";
   document.title = `${told.over ? "" : `${Math.floor((100 * (told.done + told.failed)) / told.count)}% `}${told.title} - lidarpool`;
   $("title").textContent = told.title;
   $("state").textContent = told.state;
@@ -75,7 +76,7 @@ function showJobs(told) {
     return [own, element("tr", {}, reason)];
   });
   const ended = told.ended.map((job) => line(job, cell("done", "text"), whole(job.points), inSeconds(job.seconds)));
-  const last = (jobs, listed) => (jobs > listed ? `the last ${listed} of ${whole(jobs)}` : whole(jobs));
+  const last = (jobs, listed) => (jobs > listed ? `the ${told.still ? "first" : "last"} ${whole(listed)} of ${whole(jobs)}` : whole(jobs));
   const bodies = [
     ...group("Under way", told.busy > underWay.length ? `the first ${underWay.length} of ${whole(told.busy)}` : whole(told.busy), width, underWay),
     ...group("Failed", last(told.failed, told.failures.length), width, failed),
@@ -89,6 +90,7 @@ function showJobs(told) {
 // -- points of a job ---------------------------------------------------------------------
 
 let shown = null, follows = true, isLoading = false;
+let isStill = false; // of a data set, whose jobs are all there
 
 // The viewer of a job takes the place of the one before once it has drawn.
 function showCloud(newest) {
@@ -106,7 +108,7 @@ function showCloud(newest) {
     $("shown").replaceChildren(
       element("span", {}, "Points of ", element("b", { textContent: `job ${name}` })),
       element("a", { href: `job/${number}/`, target: "_blank", textContent: "open with all controls" }),
-      element("label", {}, box, "go on to newer jobs"),
+      ...(isStill ? [] : [element("label", {}, box, "go on to newer jobs")]),
     );
   }, SETTLED_MS);
   $("frames").append(frame);
@@ -116,8 +118,9 @@ function showCloud(newest) {
 
 let charts = 0;
 async function show(told) {
+  isStill = Boolean(told.still);
   showRun(told);
-  showJobs(told);
+  if (!isStill || !$("jobs").querySelector("tbody")) showJobs(told);
   showCloud(told.newest);
   if (told.charts !== charts) {
     charts = told.charts;

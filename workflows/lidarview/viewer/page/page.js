@@ -19,13 +19,13 @@ const FAINT = 0.2; // opacity of grey surfaces before points, so that these come
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
 const $ = (id) => document.getElementById(id);
-const picture = new Picture($("canvas"), $("labels"), $("axes"), $("scale"), () => moved());
+const picture = new Picture($("canvas"), $("labels"), $("handles"), $("axes"), $("scale"), () => moved());
 const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
 // What users have chosen; a link holds it.
 const chosen = {
-  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: true,
-  budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: true, follow: false,
+  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: false,
+  budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: false, follow: false, tool: "point", limits: null, clipBox: false,
 };
 let state = null; // of the server: {…, arrays}
 let sweeps = []; // [{first, last, begin, sensor, index}] in order of their beginnings
@@ -82,6 +82,7 @@ const filterText = () => chosen.filter.map(String).join(";");
 function questionAt(time) {
   const asked = { colour: chosen.colour === HIDDEN ? "z" : chosen.colour };
   if (chosen.filter.length) asked.filter = filterText();
+  if (chosen.limits) asked.limits = chosen.limits.join(",");
   const every = picture.sensors.every((sensor) => sensor.shown);
   if (sweeps.length && !(chosen.show === "all" && every)) asked.scans = rangesAt(time);
   return asked;
@@ -210,6 +211,10 @@ const onlyObject = (name) => {
   return limits && limits[1] === limits[2] ? limits[1] : null;
 };
 
+// Values of a column that are switched off: entries of the filter whose names begin with "!".
+const hiddenOf = (name) => new Set(chosen.filter.filter(([column]) => column === `!${name}`).map(([, value]) => value));
+const ofColumn = (name) => ([column]) => column === name || column === `!${name}`;
+
 let legendText = "";
 function showLegend(told) {
   const text = JSON.stringify([told, chosen.filter]);
@@ -217,11 +222,52 @@ function showLegend(told) {
   legendText = text;
   const column = told?.column;
   panel.legend.replaceChildren(labels([HIDDEN, "result"].includes(chosen.colour) ? null : told, column));
+  if (told?.limits && chosen.colour !== HIDDEN) panel.legend.append(limitInputs(told.limits));
+  if (told?.labels?.length && column !== "result") tellCounts(panel.legend, column).catch(failed);
 }
 
-// A legend whose labels choose values of a column.
+// The ends of the colour scale, to be set by hand.
+function limitInputs(limits) {
+  const inputs = limits.map((value, end) => {
+    const input = element("input", { type: "number", step: "any", value: +value.toPrecision(6) });
+    input.setAttribute("aria-label", end ? "highest of the colours" : "lowest of the colours");
+    input.onchange = () => {
+      const ends = inputs.map((other) => other.valueAsNumber);
+      if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return sayBriefly("The first limit has to be lower than the second.");
+      return setColourLimits(ends);
+    };
+    return input;
+  });
+  const reset = chosen.limits ? [button("Auto", () => setColourLimits(null))] : [];
+  return element("div", { className: "limits" }, ...inputs, ...reset);
+}
+
+function setColourLimits(limits) {
+  chosen.limits = limits;
+  legendText = "";
+  refresh();
+}
+
+// Writes beside each label how many points it has.
+async function tellCounts(box, column) {
+  const { counts, exact } = await ask("counts", { name: column });
+  const known = new Map(counts);
+  for (const shown of box.querySelectorAll(".legend .number"))
+    shown.textContent = `${exact ? "" : "≈ "}${(known.get(+shown.dataset.value) ?? 0).toLocaleString("en")}`;
+}
+
+// A legend whose labels choose values of a column, or switch them off.
 const labels = (told, column) => legend(
-  told, onlyObject(column), (value) => toggle(column, value), column === "class" ? state.classes : {});
+  told, onlyObject(column), (value) => toggle(column, value), column === "class" ? state.classes : {},
+  hiddenOf(column), (value) => switchValue(column, value));
+
+function switchValue(column, value) {
+  const hidden = hiddenOf(column);
+  if (hidden.has(value)) hidden.delete(value);
+  else hidden.add(value);
+  chosen.filter = [...chosen.filter.filter((entry) => !ofColumn(column)(entry)), ...[...hidden].map((each) => [`!${column}`, each, each])];
+  afterFilter(column);
+}
 
 function toggle(column, value) {
   setLimits(column, onlyObject(column) === value ? null : [value, value]);
@@ -241,9 +287,20 @@ function tellFacts() {
 }
 
 function setLimits(name, limits) {
-  chosen.filter = chosen.filter.filter(([column]) => column !== name);
+  chosen.filter = chosen.filter.filter((entry) => !ofColumn(name)(entry));
   if (limits) chosen.filter.push([name, ...limits]);
-  if (name === "object") picture.showObjects(limits);
+  afterFilter(name);
+}
+
+const objectLimits = () => chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null;
+
+const showSceneLegend = () => panel.sceneLegend?.replaceChildren(labels(panel.sceneTold, "object"));
+
+function afterFilter(name) {
+  if (name === "object") {
+    picture.showObjects(objectLimits(), hiddenOf("object"));
+    showSceneLegend();
+  }
   legendText = "";
   tellFilter();
   tellResults();
@@ -265,7 +322,7 @@ function tellFilter() {
     ...chosen.filter.map(([name, low, high]) => element("div", { className: "note", textContent: limitWords(name, low, high) })),
     ...(chosen.filter.length ? [button("Show all", () => {
       chosen.filter = [];
-      picture.showObjects(null);
+      picture.showObjects(null, new Set());
       legendText = "";
       tellFilter();
       tellResults();
@@ -277,6 +334,10 @@ function tellFilter() {
 
 const filterNames = {}; // {column: {value: name}}
 function limitWords(name, low, high) {
+  if (name.startsWith("!")) {
+    const column = name.slice(1), names = column === "class" ? state.classes : filterNames[column] ?? {};
+    return `${column}: without ${names[low] ?? number(low)}`;
+  }
   const names = filterNames[name] ?? {};
   if (low === high) return `${name}: only ${names[low] ?? number(low)}`;
   const column = state.columns.find((one) => one.name === name), size = column?.unit === "s" ? 1e9 : 1;
@@ -318,11 +379,11 @@ function buildPanel() {
     "header", {}, element("h1", { textContent: document.title, title: document.title }),
     iconButton("link", "Copy the link to this view", copyLink),
     iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
-    theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
+    iconButton("help", "Keys and mouse (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
   );
   panel.legend = element("div");
   const points = section("Points", true,
-    (panel.colour = menu("colour", [...state.colours, HIDDEN], chosen.colour, (value) => { chosen.colour = value; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
+    (panel.colour = menu("colour", [...state.colours, HIDDEN], chosen.colour, (value) => { chosen.colour = value; chosen.limits = null; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
     panel.legend,
     slider("size", -1, 1, 0.05, Math.log10(chosen.size), (value) => `${(10 ** value).toFixed(1)}×`, (value) => {
       chosen.size = picture.pointScale = 10 ** value;
@@ -366,7 +427,7 @@ function buildPanel() {
   if (picture.sensors.length) sides.push(button("Sensor", () => look("sensor")));
   panel.parallel = tick("parallel projection", false, (on) => picture.useParallel(on));
   parts.push(section("View", true, element("div", { className: "buttons" }, ...sides), panel.parallel));
-  panel.point = element("div", { className: "note", textContent: "Click a point; Shift and click another to measure." });
+  panel.point = element("div", { className: "note" });
   parts.push(section("Point", true, panel.point));
   panel.limits = element("div");
   panel.filterInput = element("div");
@@ -380,11 +441,6 @@ function buildPanel() {
     parts.push(section("Export", false, format, button("Download", () => download(format.menu.value).catch(failed)),
       element("div", { className: "note", textContent: "The points that are shown: filtered, clipped, at this time." })));
   }
-  parts.push(section("Keys", false, element("dl", { className: "keys", innerHTML: [
-    ["space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
-    ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
-    ["H", "hide or show the panel"], ...(state.results.length ? [["R", "the next result, or all"]] : []),
-  ].map(([keys, words]) => `<dt>${keys.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ")}</dt><dd>${words}</dd>`).join("") })));
   $("panel").replaceChildren(...parts.flatMap((part) => (part === panel.facts && state.note ? [part, element("div", { className: "note", style: { padding: "0 12px 8px" }, textContent: state.note })] : [part])));
   buildClip();
   tellFilter();
@@ -392,6 +448,7 @@ function buildPanel() {
 }
 
 function showPanel(on) {
+  if (state && panel.point) queueMicrotask(() => tellMeasured(measured(chosen.tool, picked.map((one) => one.place))));
   document.documentElement.classList.toggle("no-panel", !on);
 }
 
@@ -439,8 +496,9 @@ async function loadSurface() {
   const told = hidden ? null : await ask("surface", { colour: chosen.scene });
   if (hidden !== (chosen.scene === HIDDEN)) return;
   picture.setSurface(told);
-  picture.showObjects(picture.onlyObjects);
-  panel.sceneLegend.replaceChildren(labels(told?.legend, "object"));
+  picture.showObjects(picture.onlyObjects, picture.hiddenObjects);
+  panel.sceneTold = told?.legend;
+  showSceneLegend();
   if (told && !loadSurface.looked) {
     loadSurface.looked = true;
     loadSurface.floor = told.floor;
@@ -457,41 +515,133 @@ async function loadSurface() {
 // Rays are of all sweeps.
 function showRays() {
   picture.raysShown = chosen.rays && (chosen.show === "all");
-  picture.showObjects(picture.onlyObjects);
+  picture.showObjects(picture.onlyObjects, picture.hiddenObjects);
 }
 
 const showPath = () => picture.setPath(state.path, loadSurface.floor ?? state.box[0][2]);
 
-// -- picked points -----------------------------------------------------------------------
+// -- picked points and measurements ------------------------------------------------------
 
+// {tool: [title, most points, what to click]}
+const TOOLS = {
+  point: ["What a point is (1)", 1, "Click a point; Shift and click another to measure."],
+  distance: ["Measure a distance (2)", 2, "Click two points."],
+  angle: ["Measure an angle (3)", 3, "Click three points: the second is the corner."],
+  area: ["Measure an area (4)", 100, "Click the corners of an area."],
+};
+
+function buildTools() {
+  const tools = Object.entries(TOOLS).map(([name, [title]]) => [name, iconButton(name, title, () => setTool(name))]);
+  const clip = iconButton("clip", "Clip box (B): drag its sides", () => showClipBox(!chosen.clipBox));
+  $("tools").replaceChildren(...tools.map(([, press]) => press), clip);
+  panel.tools = { ...Object.fromEntries(tools), clip };
+  tellTools();
+}
+
+function tellTools() {
+  for (const name of Object.keys(TOOLS)) panel.tools[name].setAttribute("aria-pressed", chosen.tool === name);
+  panel.tools.clip.setAttribute("aria-pressed", chosen.clipBox);
+}
+
+function setTool(name) {
+  chosen.tool = name;
+  picked = picked.slice(-1).slice(0, name === "point" ? 1 : 0);
+  tellTools();
+  showPicked();
+}
+
+function clearPicked() {
+  picked = [];
+  showPicked();
+}
+
+const less = (a, b) => a.map((value, axis) => value - b[axis]);
+const length = (vector) => Math.hypot(...vector);
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const digits = (value, unit, places = 3) => `${value.toLocaleString("en", { minimumFractionDigits: places, maximumFractionDigits: places })} ${unit}`;
+
+// What is measured between places: [name, words], the result first.
+function measured(tool, places) {
+  if (tool === "distance" && places.length === 2) {
+    const way = less(places[1], places[0]);
+    return [["distance", digits(length(way), "m")], ["horizontal", digits(Math.hypot(way[0], way[1]), "m")],
+      ...["x", "y", "z"].map((axis, k) => [`Δ${axis}`, digits(way[k], "m")])];
+  }
+  if (tool === "angle" && places.length === 3) {
+    const [a, b] = [less(places[0], places[1]), less(places[2], places[1])];
+    const cosine = a.reduce((sum, value, k) => sum + value * b[k], 0) / (length(a) * length(b) || 1);
+    return [["angle", digits((Math.acos(Math.min(1, Math.max(-1, cosine))) * 180) / Math.PI, "°", 2)],
+      ["sides", `${digits(length(a), "m")}, ${digits(length(b), "m")}`]];
+  }
+  if (tool === "area" && places.length > 2) { // half of the sum of cross products, for any plane
+    const round = places.map((place, k) => [less(place, places[0]), less(places[(k + 1) % places.length], places[0])]);
+    const sum = round.map(([a, b]) => cross(a, b)).reduce((a, b) => a.map((value, k) => value + b[k]));
+    return [["area", digits(length(sum) / 2, "m²")], ["seen from above", digits(Math.abs(sum[2]) / 2, "m²")],
+      ["outline", digits(round.reduce((total, [a, b]) => total + length(less(b, a)), 0), "m")]];
+  }
+  return [];
+}
+
+// A click is answered at once: by a mark on the point, or by words where no point is.
 async function pick(x, y, measure) {
   const found = picture.pick(x, y);
   if (!found) {
-    picked = [];
-    return showPicked();
+    if (chosen.tool === "point") clearPicked();
+    return sayBriefly("No point here.");
   }
+  if (measure && chosen.tool === "point" && picked.length) {
+    chosen.tool = "distance";
+    tellTools();
+  }
+  const one = { local: found.place, place: found.place.map((value, axis) => value + state.origin[axis]), columns: [["", "…"]] };
+  const isFull = picked.length >= TOOLS[chosen.tool][1];
+  picked = isFull && chosen.tool !== "area" ? [one] : [...picked, one];
+  showPicked();
   const told = await ask("point", { row: found.row });
-  const one = { local: found.place, place: told.place, columns: told.columns };
-  picked = measure && picked.length ? [picked[0], one] : [one];
-  return showPicked();
+  Object.assign(one, { place: told.place, columns: told.columns });
+  if (picked.includes(one)) showPicked();
 }
 
 function showPicked() {
-  const rows = [], metres = (value) => `${value.toLocaleString("en", { minimumFractionDigits: 3, maximumFractionDigits: 3 })} m`;
-  let text = "";
-  if (picked.length === 2) {
-    const way = picked[1].place.map((value, axis) => value - picked[0].place[axis]);
-    text = metres(Math.hypot(...way));
-    rows.push(["distance", text], ["horizontal", metres(Math.hypot(way[0], way[1]))]);
-    ["x", "y", "z"].forEach((axis, k) => rows.push([`Δ${axis}`, metres(way[k])]));
-  }
-  const point = picked.at(-1);
-  if (point) ["x", "y", "z"].forEach((axis, k) => rows.push([axis, metres(point.place[k])]));
+  const rows = measured(chosen.tool, picked.map((one) => one.place)), text = rows[0]?.[1] ?? "";
+  const point = picked.at(-1), advice = TOOLS[chosen.tool][2];
+  tellMeasured(rows);
+  if (point) ["x", "y", "z"].forEach((axis, k) => rows.push([axis, digits(point.place[k], "m")]));
   if (point) rows.push(...point.columns);
-  picture.mark(picked.map((one) => one.local), text);
-  if (!rows.length) panel.point.replaceChildren("Click a point; Shift and click another to measure.");
+  picture.mark(picked.map((one) => one.local), text, chosen.tool === "area");
+  if (!rows.length) panel.point.replaceChildren(advice);
   else panel.point.replaceChildren(element("table", { className: "point" }, ...rows.map(([name, value]) =>
     element("tr", {}, element("td", { textContent: name }), element("td", { textContent: value })))));
+}
+
+// The result beside the tools, where the panel may be hidden.
+function tellMeasured(rows) {
+  const point = picked.at(-1), box = $("measured");
+  const lines = rows.length ? rows.map(([name, words]) => `${name} ${words}`)
+    : point && chosen.tool === "point" ? [point.place.map((value) => digits(value, "m")).join(", "), ...point.columns.map((pair) => pair.join(" "))]
+      : [TOOLS[chosen.tool][2]];
+  box.hidden = chosen.tool === "point" && !(point && document.documentElement.classList.contains("no-panel"));
+  const clear = iconButton("close", "Clear (Esc)", () => { clearPicked(); if (chosen.tool !== "point") setTool("point"); });
+  box.replaceChildren(element("div", {}, ...lines.map((line, k) => element(k ? "div" : "b", { textContent: line }))), clear);
+}
+
+let briefly = 0;
+function sayBriefly(words) {
+  say(words);
+  clearTimeout(briefly);
+  briefly = setTimeout(() => say(""), 2500);
+}
+
+// -- the clip box ------------------------------------------------------------------------
+
+function showClipBox(on) {
+  chosen.clipBox = on;
+  picture.showClipBox(on, (axis, end, value) => {
+    chosen.clip[axis][end] = value;
+    picture.setClip(chosen.clip);
+    buildClip();
+  });
+  tellTools();
 }
 
 // -- time --------------------------------------------------------------------------------
@@ -522,7 +672,7 @@ function buildTime() {
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
   clock.speed.title = "Speed; 1× is as fast as the survey";
   clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
-  clock.follow = button("Follow", () => { chosen.follow = picture.follow = !chosen.follow; showToggles(); });
+  clock.follow = button("Follow", () => setFollow(!chosen.follow));
   clock.follow.title = "Move the camera with the carrier";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
@@ -535,6 +685,13 @@ function buildTime() {
     element("div", { className: "options" }, clock.show, clock.follow, clock.images),
   );
   new ResizeObserver(drawTicks).observe(clock.ticks);
+  showToggles();
+}
+
+// The camera takes its place behind the carrier, and keeps it while the carrier drives and turns.
+function setFollow(on) {
+  chosen.follow = picture.follow = on;
+  if (on) look("sensor");
   showToggles();
 }
 
@@ -575,7 +732,7 @@ function setShow(value) {
 
 // Playing and stepping shows single sweeps, unless a user has chosen what is shown.
 function leaveAll() {
-  if (chosen.show === "all" && !clock.own) setShow("sweep");
+  if (chosen.show === "all" && !clock.own && !state.preview) setShow("sweep");
 }
 
 function setTime(time) {
@@ -642,7 +799,7 @@ const MOST_IMAGES = 3;
 
 function showImages() {
   const box = $("images");
-  const on = chosen.images && !state.offline && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
+  const on = chosen.images && !state.offline && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
   box.hidden = !on;
   if (!on) return;
   const shown = [...picture.sensors.entries()].filter(([, sensor]) => sensor.shown && sensor.sweeps.length).slice(0, MOST_IMAGES);
@@ -688,7 +845,11 @@ function linkText() {
   const words = {
     camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, opacity: chosen.opacity, time: chosen.time.toFixed(6),
     clip: chosen.clip.map((pair) => pair.map((value) => value ?? "").join(",")).join(";"), size: chosen.size.toFixed(3),
+    images: chosen.images, follow: chosen.follow, rays: chosen.rays,
   };
+  if (chosen.limits) words.limits = chosen.limits.join(",");
+  if (chosen.clipBox) words.box = true;
+  if (chosen.tool !== "point" || picked.length) words.measure = [chosen.tool, ...picked.map((one) => one.place.map((value) => +value.toFixed(4)).join(","))].join(";");
   if (picture.isParallel) words.parallel = picture.viewHeight.toPrecision(7);
   if (chosen.filter.length) words.filter = filterText();
   if (chosen.off.size) words.off = [...chosen.off].join(",");
@@ -699,11 +860,19 @@ async function copyLink() {
   history.replaceState(null, "", `#${linkText()}`);
   try {
     await navigator.clipboard.writeText(location.href);
-    say("The link to this view was copied.");
+    sayBriefly("The link to this view was copied.");
   } catch {
-    say("The link is in the address bar.");
+    sayBriefly("The link is in the address bar.");
   }
-  setTimeout(() => say(""), 2500);
+}
+
+// The address holds the view, so that it can be shared and opened again.
+let linked = "";
+function keepLink() {
+  if (playing || lost || state.live || document.documentElement.classList.contains("plain")) return;
+  const words = linkText();
+  if (words !== linked && linked) history.replaceState(null, "", `#${words}`);
+  linked = words;
 }
 
 function readLink() {
@@ -715,9 +884,20 @@ function readLink() {
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
   chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "grey" ? FAINT : 1;
   chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
+  for (const name of ["images", "follow", "rays"]) if (words.has(name)) chosen[name] = get(name) === "true";
+  picture.follow = chosen.follow;
+  const ends = get("limits").split(",").map(Number);
+  if (ends.length === 2 && ends[0] < ends[1]) chosen.limits = ends;
+  chosen.clipBox = get("box") === "true";
+  const [tool, ...corners] = get("measure").split(";");
+  if (TOOLS[tool]) {
+    chosen.tool = tool;
+    picked = corners.map((corner) => corner.split(",").map(Number)).filter((place) => place.length === 3 && place.every(Number.isFinite))
+      .map((place) => ({ place, local: less(place, state.origin), columns: [] }));
+  }
   for (const entry of get("filter").split(";").filter(Boolean)) {
     const [name, low, high] = entry.split(",");
-    if (columns.includes(name) && Number.isFinite(+low) && Number.isFinite(+high)) chosen.filter.push([name, +low, +high]);
+    if (columns.includes(name.replace(/^!/, "")) && Number.isFinite(+low) && Number.isFinite(+high)) chosen.filter.push([name, +low, +high]);
   }
   for (const k of get("off").split(",").filter(Boolean)) if (picture.sensors[k]) { chosen.off.add(+k); picture.sensors[k].shown = false; }
   if (words.has("clip")) {
@@ -814,23 +994,63 @@ function tellRun(told) {
   replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
 
+// -- keys and the mouse ------------------------------------------------------------------
+
+const isTextField = (target) => target.isContentEditable || target.tagName === "TEXTAREA" || (target.tagName === "INPUT" && ["text", "number", "search"].includes(target.type));
+
+// Keys act wherever the focus is, except in text fields. Enter presses the focused control, and the
+// keys up and down change a focused slider or menu.
 function keys(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
-  // Controls keep the keys that they need; a button its space if the keyboard, not the mouse, led there.
-  const { target, key } = event, letter = key.length === 1 && key !== " ";
-  if (target.tagName === "SELECT" || (target.type === "range" && target !== clock.slider && !letter)) return;
-  if (key === " " && (target.type === "checkbox" || target.matches("button:focus-visible, summary:focus-visible"))) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || isTextField(event.target)) return;
+  const { target, key } = event;
+  if ($("keys").open && key !== "?") return;
   const acts = {
+    "?": showKeys, Enter: target.type === "checkbox" ? () => target.click() : null,
     " ": () => setPlaying(!playing), ArrowLeft: () => stepBy(event.shiftKey ? -10 : -1), ArrowRight: () => stepBy(event.shiftKey ? 10 : 1),
     Home: () => stepBy(-1e9), End: () => stepBy(1e9), a: () => look("all"), t: () => look("top"), s: () => look("side"), f: () => look("front"),
-    h: () => showPanel(document.documentElement.classList.contains("no-panel")), r: nextResult, p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
+    h: () => showPanel(document.documentElement.classList.contains("no-panel")), r: nextResult, 1: () => setTool("point"), 2: () => setTool("distance"), 3: () => setTool("angle"), 4: () => setTool("area"), b: () => showClipBox(!chosen.clipBox),
+    Escape: () => { clearPicked(); if (chosen.tool !== "point") setTool("point"); },
+    p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
   };
   const timed = [" ", "ArrowLeft", "ArrowRight", "Home", "End"];
-  const act = acts[letter ? key.toLowerCase() : key];
+  const act = acts[key.length === 1 ? key.toLowerCase() : key];
   if (!act || (timed.includes(key) && $("time").hidden)) return;
-  if (target.tagName === "BUTTON" && key === " ") target.blur();
   event.preventDefault();
   act();
+}
+
+// A button acts on its space when the key is released.
+function releaseKey(event) {
+  if (event.key === " " && !$("time").hidden && !isTextField(event.target)) event.preventDefault();
+}
+
+const KEYS = [
+  ["Space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
+  ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
+  ["1 2 3 4", "read a point, measure a distance, an angle, an area"], ["Esc", "clear what is measured"], ["B", "clip box"],
+  ["H", "hide or show the panel"], ["R", "the next result, or all"], ["Enter", "press the focused button"],
+  ["↑ ↓", "change the focused slider or menu"], ["?", "show or hide these keys"],
+];
+const GESTURES = [
+  ["drag", "turn; with two fingers, the right button or Shift, move"], ["wheel, pinch", "closer or farther"],
+  ["click, tap", "what a point is, or the next point to measure"], ["Shift-click", "measure to another point"],
+];
+
+function showKeys() {
+  const box = $("keys");
+  if (box.open) {
+    box.close();
+    return;
+  }
+  const shown = KEYS.filter(([names]) => names !== "R" || state?.results.length);
+  const kbd = (names) => names.split(" ").flatMap((name, k) => [...(k ? [" "] : []), element("kbd", { textContent: name })]);
+  const line = (head, words) => [element("dt", {}, ...head), element("dd", { textContent: words })];
+  box.replaceChildren(
+    element("h2", { textContent: "Keys" }), element("dl", {}, ...shown.flatMap(([names, words]) => line(kbd(names), words))),
+    element("h2", { textContent: "Mouse and fingers" }), element("dl", {}, ...GESTURES.flatMap(([name, words]) => line([name], words))),
+    button("Close", () => box.close()),
+  );
+  box.showModal();
 }
 
 let pressed = null;
@@ -861,26 +1081,34 @@ async function begin() {
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
   drives = !told.live && told.sensors.some((sensor) => sensor.moves);
-  chosen.rays = !drives; // they would hide the road
+  chosen.rays = Boolean(told.live); // they show how a run goes on, and hide the points of a result
+  if (told.offline) chosen.budget = BUDGETS.at(-1); // all points are here
   if (told.results.length) chosen.colour = "result";
   takeState(told);
+  if (told.by_sweep) chosen.show = "sweep";
+  if (!told.points && told.scene) chosen.scene = ["colour", "object"].find((name) => told.scene.includes(name));
   const words = readLink();
   picture.opacity = chosen.opacity;
   buildPanel();
   picture.setTheme(document.documentElement.dataset.theme);
   buildSteps();
   buildTime();
+  buildTools();
   picture.setTime(chosen.time);
   if (drives) look("sensor");
   if (!$("time").hidden) tellTime();
   setClip(chosen.clip);
   showRays();
-  picture.showObjects(chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null);
+  picture.showObjects(objectLimits(), hiddenOf("object"));
   readCamera(words);
   showPath();
+  showPicked();
+  if (chosen.clipBox) showClipBox(true);
+  setInterval(keepLink, 500);
   say("");
   mouse();
   addEventListener("keydown", keys);
+  addEventListener("keyup", releaseKey);
   addEventListener("hashchange", () => location.reload()); // another link was entered
   document.addEventListener("visibilitychange", () => { if (document.hidden) setPlaying(false); });
   let before = performance.now();

@@ -8,7 +8,7 @@ const THEMES = {
   light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
   dark: { back: 0x14171c, grid: 0x2a3038, surface: 0x3c434d, rays: 0x8f3c48 },
 };
-const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0;
+const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
 const FOV = 45; // degrees, from the upper to the lower edge
 const SIDES = { all: [0.55, -1, 0.62], inside: [0.3, -0.6, 1], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
 const PICKED_WITHIN = 6; // pixels
@@ -110,8 +110,8 @@ function bend({ mesh, poses, faces }, frame) {
 }
 
 export class Picture {
-  constructor(canvas, labels, axes, scale, changed) {
-    Object.assign(this, { canvas, labels, axes, scale, changed });
+  constructor(canvas, labels, handlesBox, axes, scale, changed) {
+    Object.assign(this, { canvas, labels, handlesBox, axes, scale, changed });
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.renderer.localClippingEnabled = true;
@@ -142,6 +142,8 @@ export class Picture {
     this.makePasses();
     this.layers = {}; // {name: Points}
     this.names = []; // [text, place, element]
+    this.onlyObjects = null;
+    this.hiddenObjects = new Set();
     this.sensors = [];
     this.actors = [];
     this.marks = [];
@@ -198,7 +200,8 @@ export class Picture {
     this.box = box.map((corner) => new THREE.Vector3(...corner));
     this.bounds = bounds.map((corner) => new THREE.Vector3(...corner));
     this.extent = this.box[0].distanceTo(this.box[1]) || 1;
-    this.middle = this.corners[0].clone().add(this.corners[7]).multiplyScalar(0.5); // of the scene
+    const ends = ["x", "y", "z"].map((axis) => this.corners.map((corner) => corner[axis]).reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]));
+    this.middle = new THREE.Vector3(...ends.map(([low, high]) => (low + high) / 2)); // of the first picture
     this.reach = this.bounds[0].distanceTo(this.bounds[1]) || 1;
     this.setClip([[null, null], [null, null], [null, null]]);
     this.addGrid();
@@ -303,16 +306,16 @@ export class Picture {
     this.surface.frustumCulled = false;
     this.surface.objects = told.arrays.objects;
     this.solid.add(this.surface);
-    this.showObjects(this.onlyObjects);
+    this.showObjects(this.onlyObjects, this.hiddenObjects);
   }
 
-  // limits: [lowest, highest] object that is shown, or null
-  showObjects(limits) {
-    this.onlyObjects = limits;
-    const shown = (object) => !limits || (object >= limits[0] && object <= limits[1]);
+  // limits: [lowest, highest] object that is shown, or null; hidden: those that are switched off
+  showObjects(limits, hidden) {
+    Object.assign(this, { onlyObjects: limits, hiddenObjects: hidden });
+    const shown = (object) => (!limits || (object >= limits[0] && object <= limits[1])) && !hidden.has(object);
     if (this.surface) {
       const { objects, geometry } = this.surface;
-      if (!limits) geometry.setIndex(null);
+      if (!limits && !hidden.size) geometry.setIndex(null);
       else {
         const index = [];
         objects.forEach((object, k) => { if (shown(object)) index.push(3 * k, 3 * k + 1, 3 * k + 2); });
@@ -406,7 +409,7 @@ export class Picture {
     this.rays = this.thinLines(ends, THEMES[this.theme].rays);
     this.rays.material.clippingPlanes = this.planes;
     this.scene.add(this.rays);
-    this.showObjects(this.onlyObjects);
+    this.showObjects(this.onlyObjects, this.hiddenObjects);
   }
 
   setPath(path, ground) {
@@ -447,12 +450,28 @@ export class Picture {
     }
     const moving = this.sensors.find((sensor) => sensor.moves) ?? this.sensors[0];
     this.carrier = moving ? new THREE.Vector3(...moving.at) : null;
-    if (this.follow && before && this.carrier) {
-      const way = this.carrier.clone().sub(before);
-      this.camera.position.add(way);
-      this.controls.target.add(way);
-    }
+    const heading = this.heading;
+    this.heading = this.headingOf(moving);
+    if (this.follow && before && this.carrier) this.moveWith(before, heading ?? this.heading);
     this.dirty = true;
+  }
+
+  // Moves and turns the camera as the carrier has moved from a place and turned from a heading.
+  moveWith(before, heading) {
+    const turn = Math.atan2(this.heading.y, this.heading.x) - Math.atan2(heading.y, heading.x);
+    for (const place of [this.camera.position, this.controls.target])
+      place.sub(before).applyAxisAngle(this.camera.up, turn).add(this.carrier);
+    this.controls.update();
+  }
+
+  // Horizontal direction in which a moving sensor moves now; along x if it does not move.
+  headingOf(moving) {
+    const ahead = new THREE.Vector3(1, 0, 0);
+    if (!moving?.moves) return ahead;
+    const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
+    const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
+    const way = b.sub(a).setZ(0);
+    return way.length() > 1e-6 ? way.normalize() : this.heading ?? ahead;
   }
 
   get labelled() {
@@ -505,15 +524,8 @@ export class Picture {
   lookFromSensor() {
     if (!this.carrier) return;
     const moving = this.sensors.find((sensor) => sensor.moves);
-    const ahead = new THREE.Vector3(1, 0, 0);
     const inwards = this.middle.clone().sub(this.carrier);
-    if (!moving && inwards.length() > 0.1 * this.extent) ahead.copy(inwards.normalize());
-    if (moving) {
-      const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
-      const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
-      const way = b.sub(a).setZ(0);
-      if (way.length() > 1e-6) ahead.copy(way.normalize());
-    }
+    const ahead = !moving && inwards.length() > 0.1 * this.extent ? inwards.normalize() : this.heading;
     const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
     if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
@@ -581,6 +593,7 @@ export class Picture {
     if (!this.dirty) return;
     this.dirty = false;
     this.updateCamera();
+    this.drawClipBox();
     const { uniforms } = this.pointMaterial;
     const height = this.target.height;
     uniforms.flat_.value = this.isParallel;
@@ -618,7 +631,8 @@ export class Picture {
     for (const [text, place] of this.labelled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
-      const x = ((at.x + 1) / 2) * width + 8, y = ((1 - at.y) / 2) * height - 24, wide = 7 * text.length + 14;
+      const wide = 7 * text.length + 14, y = ((1 - at.y) / 2) * height - 24;
+      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + 8, width - wide));
       if (taken.some(([a, b, c]) => x < a + c && a < x + wide && Math.abs(y - b) < 22)) continue;
       taken.push([x, y, wide]);
       shown.push([text, x, y]);
@@ -690,8 +704,9 @@ export class Picture {
     return first.reduce((a, b) => (b.away < a.away ? b : a));
   }
 
-  // places: of one or two points that are marked; text: of the line between them
-  mark(places, text = "") {
+  // places: of points that are marked, with lines between them; text: of what they measure; closed:
+  // whether a line leads back to the first
+  mark(places, text = "", closed = false) {
     for (const mark of this.marks) if (mark.made) this.scene.remove(mark.made);
     const material = new THREE.MeshBasicMaterial({ color: MARK, depthTest: false });
     this.marks = places.map((place) => {
@@ -700,15 +715,91 @@ export class Picture {
       ball.renderOrder = 2;
       return { ball, made: ball, place };
     });
-    if (places.length === 2) {
-      const line = this.thickLines(places.flat(), MARK, 3);
+    const ends = places.slice(1).flatMap((place, k) => [...places[k], ...place]);
+    if (closed && places.length > 2) ends.push(...places.at(-1), ...places[0]);
+    if (ends.length) {
+      const line = this.thickLines(ends, MARK, 3);
       line.material.depthTest = false;
       line.renderOrder = 1;
-      const place = places[0].map((value, axis) => (value + places[1][axis]) / 2);
-      this.marks.unshift({ made: line, place, text });
+      const middle = [0, 1, 2].map((axis) => places.reduce((sum, place) => sum + place[axis], 0) / places.length);
+      this.marks.unshift({ made: line, place: places.length === 3 && !closed ? places[1] : middle, text });
     }
     for (const mark of this.marks) this.scene.add(mark.made);
     this.dirty = true;
+  }
+
+  // -- the clip box ----------------------------------------------------------------------
+
+  // A box with a handle at each of its sides; moved(axis, end, value) when one is dragged.
+  showClipBox(on, moved) {
+    this.handles?.forEach(({ press }) => press.remove());
+    if (this.clipEdges) this.scene.remove(this.clipEdges);
+    this.handles = this.clipEdges = null;
+    this.dirty = true;
+    if (!on) return;
+    this.handles = [0, 1, 2].flatMap((axis) => [0, 1].map((end) => this.makeHandle(axis, end, moved)));
+    this.updateCamera();
+    this.drawClipBox();
+  }
+
+  // [lowest, highest] of the clip box along each axis: those of the scene where nothing is cut.
+  get clipEnds() {
+    return this.clip.map(([low, high], axis) => [low ?? this.bounds[0].getComponent(axis), high ?? this.bounds[1].getComponent(axis)]);
+  }
+
+  makeHandle(axis, end, moved) {
+    const press = element("button", { type: "button", title: `Drag the ${end ? "upper" : "lower"} limit of ${"xyz"[axis]}` });
+    press.setAttribute("aria-label", `clip box, ${"xyz"[axis]}, ${end ? "highest" : "lowest"}`);
+    const move = (by) => {
+      const ends = this.clipEnds, value = ends[axis][end] + by;
+      moved(axis, end, end ? Math.max(value, ends[axis][0]) : Math.min(value, ends[axis][1]));
+    };
+    press.onpointerdown = (event) => { press.setPointerCapture(event.pointerId); event.preventDefault(); press.focus(); };
+    press.onpointermove = (event) => {
+      if (!press.hasPointerCapture(event.pointerId)) return;
+      const [x, y] = this.pixelsPerMetre(axis), squared = x * x + y * y;
+      if (squared > 1e-6) move((event.movementX * x + event.movementY * y) / squared);
+    };
+    press.onkeydown = (event) => {
+      const sign = { ArrowUp: 1, ArrowDown: -1 }[event.key];
+      if (!sign) return;
+      event.preventDefault();
+      const [low, high] = [this.bounds[0], this.bounds[1]].map((corner) => corner.getComponent(axis));
+      move((sign * (high - low)) / (event.shiftKey ? 20 : 100));
+    };
+    this.handlesBox.append(press);
+    return { press, axis, end };
+  }
+
+  // Place of a handle: the middle of its side.
+  handlePlace(axis, end) {
+    const place = new THREE.Vector3(...this.clipEnds.map(([low, high]) => (low + high) / 2));
+    return place.setComponent(axis, this.clipEnds[axis][end]);
+  }
+
+  pixelsOf(place) {
+    const at = place.project(this.camera);
+    return [((at.x + 1) / 2) * this.canvas.clientWidth, ((1 - at.y) / 2) * this.canvas.clientHeight, at.z];
+  }
+
+  // How far the middle of the clip box moves in the picture, pixels, if it moves along an axis.
+  pixelsPerMetre(axis) {
+    const step = 1e-3 * this.extent, middle = new THREE.Vector3(...this.clipEnds.map(([low, high]) => (low + high) / 2));
+    const [a, b] = [middle.clone(), middle.clone().setComponent(axis, middle.getComponent(axis) + step)].map((place) => this.pixelsOf(place));
+    return [(b[0] - a[0]) / step, (b[1] - a[1]) / step];
+  }
+
+  drawClipBox() {
+    if (!this.handles) return;
+    if (this.clipEdges) this.scene.remove(this.clipEdges);
+    const [min, max] = [0, 1].map((end) => new THREE.Vector3(...this.clipEnds.map((ends) => ends[end])));
+    this.clipEdges = this.thinLines(edgesOf({ min, max }), CLIP);
+    this.scene.add(this.clipEdges);
+    for (const { press, axis, end } of this.handles) {
+      const [x, y, depth] = this.pixelsOf(this.handlePlace(axis, end));
+      press.hidden = Math.abs(depth) > 1;
+      press.style.transform = `translate(${Math.round(x)}px, ${Math.round(y)}px)`;
+    }
   }
 
   // The picture as a PNG file.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,10 +33,25 @@ from ..base.fingerprint import fingerprint
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
+from .sweep_files import (
+    Columns,
+    Read,
+    SweepFiles,
+    nuscenes_tables,
+    open_e57,
+    open_images,
+    open_kitti,
+    open_kitti_file,
+    open_nuscenes,
+    open_parquet,
+    open_webdataset,
+)
 
 KINDS = (
-    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a bag "
-    "of ROS 2 (.mcap or its folder), a .pcap of Velodyne, or a .pcap or .osf of Ouster"
+    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a "
+    ".e57, a .parquet or a folder of them, a bag of ROS 2 (.mcap or its folder), a .pcap of "
+    "Velodyne, a .pcap or .osf of Ouster, a .bin of KITTI, or a folder of KITTI, nuScenes, "
+    "WebDataset or range images"
 )
 # Names of the columns of rings and of intensities in other programs; the first column present is
 # read.
@@ -47,7 +62,6 @@ _WHITE_INTENSITY = 100.0
 _VELODYNE_BYTES = (1248, 554)  # first frame of a Velodyne's .pcap: points, or a position
 
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
-    ".e57": "write it as .las (pdal translate IN.e57 OUT.las)",
     **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
@@ -57,9 +71,14 @@ _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have ano
 
 Metres = tuple[float, float, float]  # of the units of x, y and z
 _METRES: Metres = (1.0, 1.0, 1.0)
-Columns = Mapping[str, AnyArray]
-# Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
-Read = tuple[AnyArray, Columns, Floats | None]
+
+
+class SeveralSensorsError(LidarError):
+    """The recording has several sensors or topics, and none is chosen."""
+
+    def __init__(self, message: str, names: Sequence[str]) -> None:
+        super().__init__(message)
+        self.names = names
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +132,7 @@ class Recording:
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
+    sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
 
     def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
         """Read a sweep, or part of a cloud, in the sensor frame or in the world frame.
@@ -151,6 +171,28 @@ class Recording:
                 f"it has no column {name!r} to compare as intensity."
                 + (did_you_mean(name, columns) or f" It has {', '.join(columns)}.")
             )
+
+
+def open_sensors(source: str | Path) -> dict[str, Recording]:
+    """Open all sensors, or topics, of a recording, {name: recording}; "" for a single one.
+
+    Of several sequences with coordinates of their own, the first.
+
+    LidarError as of `open_recording`.
+    """
+    try:
+        return {"": open_recording(source)}
+    except SeveralSensorsError as error:
+        recordings = {name: open_recording(source, sensor=name) for name in error.names}
+    sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
+    if len(sequences) == 1:
+        return recordings
+    note = f"The first of {len(sequences):,} sequences is shown, {sequences[0]}."
+    return {
+        name: replace(recording, notes=(note,))
+        for name, recording in recordings.items()
+        if recording.sequence == sequences[0]
+    }
 
 
 def _first_column(columns: Columns, names: Iterable[str]) -> AnyArray | None:
@@ -203,7 +245,7 @@ def _open_path(
         return recording
     suffix = path.suffix.lower()
     advice = f"{_CONVERSIONS[suffix]}, or " if suffix in _CONVERSIONS else ""
-    raise LidarError(f"{name} cannot be compared: {advice}give {KINDS}.")
+    raise LidarError(f"{name} is not read: {advice}give {KINDS}.")
 
 
 def _open_folder(
@@ -219,7 +261,52 @@ def _open_folder(
     files = [file for file in path.iterdir() if file.suffix.lower() == ".pcd"]
     if files:
         return _open_pcd(sorted(files, key=lambda file: natural(file.name)), name, intensity)
-    return None
+    if next(path.rglob("*.parquet"), None) is not None:
+        return _open_sweep_files(name, {"": partial(open_parquet, path, name)}, sensor, intensity)
+    with reading(name):
+        sensors = _sensors_of_folder(path)
+    openers = {key: partial(_itself, files) for key, files in sensors.items()}
+    return _open_sweep_files(name, openers, sensor, intensity) if sensors else None
+
+
+def _sensors_of_folder(path: Path) -> dict[str, SweepFiles]:
+    """Return the sweeps of each sensor of a folder with many files; empty for other folders."""
+    if tables := nuscenes_tables(path):
+        return open_nuscenes(path, tables)
+    if sensors := open_kitti(path):
+        return sensors
+    if tars := sorted(path.rglob("*.tar")):
+        return open_webdataset(tars)
+    return open_images(path)
+
+
+def _itself(files: SweepFiles) -> SweepFiles:
+    return files
+
+
+def _open_sweep_files(
+    name: str,
+    openers: Mapping[str, Callable[[], SweepFiles]],
+    sensor: str | None,
+    intensity: str | None,
+) -> Recording:
+    """Open the files of one of several sensors."""
+    opener = openers[_choose(name, "sensors", openers, sensor)]
+    with reading(name):
+        files = opener()
+    times_ns = files.times_ns
+    times = None if times_ns is None else times_ns.tolist
+    is_cloud = files.point_count is not None
+    return Recording(
+        name,
+        files.sweeps,
+        files.read,
+        intensity,
+        is_cloud,
+        files.point_count,
+        times=times,
+        sequence=files.sequence,
+    )
 
 
 def _open_file(
@@ -241,7 +328,17 @@ def _open_file(
         if frame_bytes in _VELODYNE_BYTES:
             return _open_velodyne(path, name, intensity)
         return _open_ouster(path, name, sensor, intensity)
-    return None
+    if suffix == ".tar":
+        with reading(name):
+            sensors = open_webdataset([path])
+        openers = {key: partial(_itself, files) for key, files in sensors.items()}
+        return _open_sweep_files(name, openers, sensor, intensity)
+    opener = {
+        ".e57": partial(open_e57, path, name),
+        ".parquet": partial(open_parquet, path, name),
+        ".bin": partial(open_kitti_file, path),
+    }.get(suffix)
+    return None if opener is None else _open_sweep_files(name, {"": opener}, sensor, intensity)
 
 
 def _open_cloud(
@@ -517,9 +614,9 @@ def _choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> s
     listed = f"{name} has no {kind}"
     if available:
         listed = f"{name} has the {kind} {', '.join(available)}"
+    if chosen is None and available:
+        advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)"
+        raise SeveralSensorsError(f"{listed}: {advice}.", available)
     if chosen is None:
-        advice = "record one"
-        if available:
-            advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)"
-        raise LidarError(f"{listed}: {advice}.")
+        raise LidarError(f"{listed}: record one.")
     raise LidarError(f"{listed}, not {chosen!r}." + did_you_mean(chosen, available))

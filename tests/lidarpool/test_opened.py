@@ -1,0 +1,258 @@
+"""The viewer opens whatever lidarpool reads or writes: exports, recordings, meshes, scenarios."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.drives import points_of, the_scene, the_sweeps, write_set
+
+from lidarpool import (
+    LidarError,
+    Mounted,
+    Noise,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+)
+from lidarpool.cli.result_commands import view as view_command
+from lidarpool.export.formats import Format
+from lidarpool.live import recorded
+from lidarpool.live.job_list import JobList
+from lidarpool.live.opened import is_data_set, open_view, open_views
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import box
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.viewer.view import IN_SENSOR_AXES
+
+FORMATS = (
+    "las", "laz", "parquet", "pcd", "images", "e57", "kitti", "nuscenes", "webdataset", "mcap",
+    "rosbag2",
+)  # fmt: skip
+IN_AXES = ("mcap", "rosbag2")  # whose points are in the axes of their sensor
+CLOUDS = ("las", "laz", "parquet")  # without sweeps
+COLUMNS = ["ray", "range", "intensity", "reflectivity", "class", "time", "normal_x", "normal_y"]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Return the folder of a survey of two sensors on a carrier in all formats, and its points."""
+    folder = tmp_path_factory.mktemp("exported")
+    scene = Scene.from_meshes([box("Floor", (30, 30, 0.1)), box("Wall", (1, 20, 6))])
+    sensor = Sensor.grid(layers=6)
+    sensors = [Mounted(sensor, name="roof"), Mounted(sensor, Pose((1, 0, 0)), name="nose")]
+    survey = Survey(
+        sensors=sensors,
+        trajectory=Track([0, 0.3], [[-9, -9, 3], [-5, -5, 3.0]]),
+        columns=[*COLUMNS, "normal_z"],
+        noise=Noise(range_m=0.01),
+    )
+    rig = Rig(scene, survey)
+    part = columns_of([*rig.cast(0, survey.scan_count)])
+    table = [column for column in survey.stored_columns if column.name not in "xyz"]
+
+    cloud = part.cloud((SCAN, *table), survey.precision_m, scene.origin)
+    sweeps = Sweeps.from_survey(survey, scene)
+    cloud = replace(cloud, sweeps=lambda: sweeps)
+    for name in FORMATS:
+        written = Format(name)
+        written.write(folder / written.row.file, cloud, sweeps)
+    return folder, cloud, sweeps
+
+
+def state_of(view):
+    header, _ = view.answer("state", {}, bool)
+    return header
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_each_format_is_opened_at_its_place_with_its_sweeps(exported, name):
+    folder, cloud, sweeps = exported
+    view = open_view(folder / Format(name).row.file)
+    state = state_of(view)
+    names = {column["name"] for column in state["columns"]}
+    sensors = 1 if name == "kitti" else 2
+    assert {"x", "y", "z"} <= names
+    if name == "kitti":
+        assert 0.4 < len(view.points) / len(cloud) < 0.6
+        assert "first of 2 sequences" in state["note"]
+    else:
+        assert len(view.points) == len(cloud)
+    assert name in ("kitti", "nuscenes", "e57", *IN_AXES) or {"intensity", "normal_z"} <= names
+    if name in CLOUDS:
+        assert view.sweeps is None and not state["note"]
+    else:
+        assert len(view.sweeps) == 3 * sensors and len(sweeps) == 6
+    if name in IN_AXES:
+        assert state["by_sweep"] and IN_SENSOR_AXES in state["note"]
+        return
+    if name == "kitti":  # whose poses start at the first of each sequence
+        return
+    found = np.stack([view.points.values(axis, slice(None)) for axis in "xyz"], axis=1)
+    expected = np.asarray(cloud)
+    tolerance_m = 2 if name == "pcd" else 2e-3  # the motion during a sweep is not compensated
+    for axis in range(3):  # the order of sweeps of one time differs
+        a, b = np.sort(found[:, axis]), np.sort(expected[:, axis])
+        np.testing.assert_allclose(a, b, atol=tolerance_m)
+
+
+@pytest.mark.parametrize("name", ["nuscenes", "webdataset", "mcap"])
+def test_a_recording_is_played_sweep_by_sweep(exported, name):
+    folder, cloud, _ = exported
+    view = open_view(folder / Format(name).row.file)
+    assert state_of(view)["duration"] == pytest.approx(0.3, abs=0.01)
+    assert len(view.sensors) == 2 and view.sweeps.begins_ns.max() == pytest.approx(2e8, rel=0.01)
+    counts = [
+        view.answer("points", {"colour": "z", "most": "100000", "scans": f"{k}-{k}"}, bool)[0][
+            "count"
+        ]
+        for k in range(6)
+    ]
+    assert sum(counts) == len(cloud) and min(counts) > 100
+    image = view.answer("range", {"sweep": "3"}, bool)[1]["image"]
+    assert image.shape[0] > 1 and image.any()
+
+
+def test_a_sweep_alone_and_what_is_too_much_for_memory(exported, monkeypatch):
+    folder, cloud, _ = exported
+    one = open_view(folder / "kitti" / "sequences" / "00" / "velodyne" / "000001.bin")
+    assert 0 < len(one.points) < len(cloud) / 5 and "object" in one.columns
+    monkeypatch.setattr(recorded, "MAX_POINTS", len(cloud) // 3)
+    assert len(open_view(folder / "cloud.las").points) == pytest.approx(len(cloud) / 3, abs=2)
+    note = state_of(open_view(folder / "pcd"))["note"]
+    assert "of 6 sweeps are shown" in note
+
+
+def test_files_of_other_programs(tmp_path):
+    text = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(
+        f"property float {name}\n" for name in ("x", "y", "z", "my.quality")
+    )
+    (tmp_path / "text.ply").write_text(text + "end_header\n0 0 0 1\n1 2 3 4\n")
+    view = open_view(tmp_path / "text.ply")
+    assert len(view.points) == 2 and "my_quality" in view.columns
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    las.x, las.y, las.z = np.arange(12.0).reshape(3, 4)
+    las.classification = np.array([2, 2, 6, 5], np.uint8)
+    las.write(tmp_path / "flown.las")
+    legend = open_view(tmp_path / "flown.las").answer(
+        "points", {"colour": "class", "most": "9"}, bool
+    )[0]["legend"]
+    assert [label[0] for label in legend["labels"]] == ["ground", "high vegetation", "building"]
+
+
+def test_a_mesh_and_a_scenario_are_previews_of_their_run(tmp_path):
+    (tmp_path / "wall.obj").write_text("v 5 -5 0\nv 5 5 0\nv 5 5 4\nv 5 -5 4\nf 1 2 3 4\n")
+    (tmp_path / "drive.yaml").write_text(
+        """scene: wall.obj
+sensors:
+  roof: {model: velodyne/vlp16, mount: {position: [0, 0, 1]}}
+  nose: velodyne/vlp16
+trajectory:
+  points:
+    - {time_s: 0, position: [0, 0, 1]}
+    - {time_s: 1, position: [2, 0, 1]}
+actors: [{name: Van, box: [1, 1, 1], at: [3, 1, 0.5]}]
+"""
+    )
+    view = open_view(tmp_path / "drive.yaml")
+    state = state_of(view)
+    assert state["preview"] and "before a run" in state["note"] and not state["exports"]
+    assert [sensor["name"] for sensor in state["sensors"]] == ["roof", "nose"]
+    assert [actor["name"] for actor in state["actors"]] == ["Van"]
+    scans = np.unique(view.points.values("scan", slice(None)))
+    first_sweeps = {0, int(view.sweeps.scans[np.flatnonzero(view.sweeps.sensor == 1)[0]])}
+    assert first_sweeps <= {*scans.tolist()} and len(view.points) > 100
+    assert len(view.sweeps) > 10, "all sweeps can be played"
+    mesh = open_view(tmp_path / "wall.obj")
+    assert state_of(mesh)["preview"] and len(mesh.pictured.scene.faces) == 2
+    (tmp_path / "campaign.yaml").write_text(
+        """base: drive.yaml
+count: 3
+vary: {sensors.roof.mount.position.2: {uniform: [1, 2]}}
+keep: kitti
+"""
+    )
+    assert "of 3 of the campaign" in state_of(open_view(tmp_path / "campaign.yaml"))["note"]
+
+
+def test_a_mesh_in_a_ply_is_no_cloud(tmp_path, exported):
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
+        f"property float {axis}\n" for axis in "xyz"
+    )
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "mesh.ply").write_text(header + faces + "0 0 0\n4 0 0\n0 4 0\n3 0 1 2\n")
+    assert open_view(tmp_path / "mesh.ply").preview
+    save_cloud(exported[1], tmp_path / "cloud.ply")
+    assert not open_view(tmp_path / "cloud.ply").preview
+
+
+def test_several_files_of_different_formats_are_one_view(exported):
+    folder, cloud, _ = exported
+    view = open_views([folder / "cloud.las", folder / "nuscenes"])
+    assert len(view.points) == 2 * len(cloud) and view.results == ["cloud.las", "nuscenes"]
+    with pytest.raises(LidarError, match=r"cloud.mcap has points in the axes of its sensors"):
+        open_views([folder / "cloud.las", folder / "cloud.mcap"])
+
+
+def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
+    folder, _, _ = exported
+    shutil.copytree(folder / "kitti" / "sequences" / "00", tmp_path / "cut")
+    (tmp_path / "cut" / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (tmp_path / "cut.bin").write_bytes(b"123")
+    (tmp_path / "cut.tar").write_bytes(b"123")
+    (tmp_path / "cut.parquet").write_bytes(b"123")
+    (tmp_path / "cut.e57").write_bytes(b"123")
+    (tmp_path / "notes.txt").write_text("none")
+    (tmp_path / "empty").mkdir()
+    for name, words in (
+        ("cut", "poses.txt has 1 rows for 3 files"),
+        ("cut.bin", "cut.bin"),
+        ("cut.tar", "cut.tar"),
+        ("cut.parquet", "cut.parquet"),
+        ("cut.e57", "cut.e57"),
+        ("notes.txt", "is not read: give the folder of a result"),
+        ("empty", "is not read: give the folder of a result"),
+        ("none.las", "does not exist"),
+    ):
+        with pytest.raises(LidarError, match=words) as raised:
+            open_view(tmp_path / name)
+        assert len(str(raised.value).splitlines()) == 1
+    monkeypatch.setattr("lidarsim.base.extras.find_spec", lambda name: None)
+    for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet"), ("pcd", "pcd")):
+        with pytest.raises(LidarError, match=rf"lidarpool\[{extra}\]"):
+            open_view(folder / name)
+
+
+@pytest.mark.parametrize("kind", ["folder", "kitti", "mcap", "webdataset"])
+def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind):
+    scene = the_scene()
+    write_set(tmp_path / "set", kind, scene, the_sweeps(scene))
+    assert is_data_set(tmp_path / "set") and not is_data_set(tmp_path)
+    jobs = JobList(tmp_path / "set")
+    told, _ = jobs.answer("jobs", {}, bool)
+    assert (told["count"], told["done"], told["failed"], told["over"]) == (6, 5, 1, True)
+    assert [job["name"] for job in told["ended"]] == ["00", "01", "02", "04", "05"]
+    assert [job["error"] for job in told["failures"]] == ["failed"]
+    assert told["ended"][1]["values"] == ["0.5"] and told["names"] == ["rain"]
+    for number in (0, 4):
+        state, _ = jobs.answer(f"job/{number}/state", {}, bool)
+        points = points_of(scene, number)
+        assert state["points"] == len(points) and not state["note"]
+        view = jobs.view_of(number)
+        for axis, name in enumerate("xyz"):  # sweeps of one time may be in another order
+            found, expected = view.points.values(name, slice(None)), np.asarray(points)[:, axis]
+            np.testing.assert_allclose(np.sort(found), np.sort(expected), atol=2e-3)
+        words = dict(jobs.answer(f"job/{number}/point", {"row": "0"}, bool)[0]["columns"])
+        assert kind == "mcap" or words["object"] in scene.all_names
+    for question in ("job/3/state", "job/9/state", "news"):
+        with pytest.raises(KeyError):
+            jobs.answer(question, {}, bool)
+    result = CliRunner().invoke(view_command, [str(tmp_path / "set"), "--export", "page.html"])
+    assert "is a data set of many jobs" in str(result.exception)

@@ -1,0 +1,67 @@
+"""Views of scenarios and meshes before a run: scene, sensors, trajectories and first sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarview.picture_file import PictureContent
+from lidarview.viewer.point_selection import OrderedPoints
+from lidarview.viewer.view import View
+
+from ..report.picture_content import planning_picture
+from ..scenario.build import Job, build
+from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_sections import is_campaign
+from ..scenario.scenario import Scenario
+
+_PREVIEW = "Preview before a run, with the points of the first sweep of each sensor."
+
+
+def scenario_view(path: Path) -> View:
+    """Return the preview of a scenario, of the first job of a campaign, or of a mesh file.
+
+    A mesh is scanned as `lidarpool run` scans it. LidarError if a file cannot be read, or fields of
+    the scenario contradict each other.
+    """
+    is_mesh = path.suffix.lower() not in (".yaml", ".yml")
+    note = _PREVIEW
+    if not is_mesh and is_campaign(path):
+        campaign = CampaignSpec.load(path)
+        job = campaign.job(0)
+        note = f"Job {job.name} of {campaign.count:,} of the campaign. {_PREVIEW}"
+    else:
+        job = build(Scenario.load(path)).job()
+    return preview_of(job, note, f"{path.resolve().name} - lidarpool")
+
+
+def preview_of(job: Job, note: str, title: str) -> View:
+    """Return the view of a job before its run."""
+    planning = planning_picture(job.planning)
+    content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
+    cloud = Cloud.joined([*first_sweeps(job)])
+    sweeps = job.sweeps
+    return View(OrderedPoints(cloud), content, sweeps, note, title, preview=True)
+
+
+def first_sweeps(job: Job) -> Iterator[Cloud]:
+    """Cast the first sweep of each sensor of a job in this process, in the order of their scans."""
+    sweeps = job.sweeps
+    survey = job.survey
+    if not len(sweeps):
+        raise LidarError("The survey has no sweeps: give poses, or a longer trajectory.")
+    rig = Rig(job.scene, survey)
+    table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
+    origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
+    for sensor in range(len(sweeps.sensors)):
+        first = int(np.flatnonzero(sweeps.sensor == sensor)[0])
+        start, stop = sweeps.scans[first : first + 2].tolist()
+        part = columns_of([*rig.cast(start, stop)])
+        yield part.cloud(table, survey.precision_m, origin)

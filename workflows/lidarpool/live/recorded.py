@@ -1,0 +1,221 @@
+"""Views of recordings and clouds of other programs, which are held in memory."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import TABLE, Column
+from lidarsim.sensor.trajectory import quaternions_of
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
+from lidarview.viewer.point_selection import OrderedPoints
+from lidarview.viewer.view import Downloads, View
+
+from ..recordings.recordings import Recording
+
+MAX_POINTS = 20_000_000  # of a recording, in memory
+_SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
+_RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
+_NAMES = {"classification": "class", "label": "class", "NormalX": "normal_x", "NormalY": "normal_y"}
+_NAMES |= {"NormalZ": "normal_z", "energy": "intensity"}
+# Classes of ASPRS LAS 1.4 by their numbers.
+ASPRS_CLASSES = (
+    "never classified", "unassigned", "ground", "low vegetation", "medium vegetation",
+    "high vegetation", "building", "low point", "", "water", "rail", "road surface", "",
+    "wire guard", "wire conductor", "transmission tower", "wire connector", "bridge deck",
+    "high noise",
+)  # fmt: skip
+
+
+@dataclass(eq=False)
+class Pieces:
+    """Points of sweeps, or of parts of a cloud, that are in memory."""
+
+    positions: list[Floats] = field(default_factory=list)
+    columns: list[Mapping[str, AnyArray]] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
+        """Add points at finite positions (n, 3); columns are those of a number for each point."""
+        valid = np.asarray(np.isfinite(positions).all(axis=1))
+        self.positions.append(positions[valid])
+        self.columns.append(
+            {
+                name: np.asarray(values)[valid]
+                for name, values in columns.items()
+                if np.shape(values) == (len(valid),) and np.asarray(values).dtype.kind in "biuf"
+            }
+        )
+        self.count += int(valid.sum())
+
+    def cloud(self, **columns: AnyArray) -> Cloud:
+        """Join the points with the columns that all pieces have, and further columns."""
+        if not self.positions:
+            return Cloud(np.zeros((0, 3)), columns)
+        shared = [name for name in self.columns[0] if all(name in piece for piece in self.columns)]
+        joined = {name: np.concatenate([piece[name] for piece in self.columns]) for name in shared}
+        joined = _with_known_names(joined) | columns
+        custom = tuple(_described(name, array) for name, array in joined.items())
+        return Cloud(np.concatenate(self.positions), joined, custom)
+
+
+def _with_known_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
+    """Return columns by the names of lidarpool, without coordinates and columns of zeros."""
+    named: dict[str, AnyArray] = {}
+    for name, values in columns.items():
+        if name == "rgb":  # of PCL: bytes in the bits of a float
+            bits = values.astype(np.float32).view(np.uint32) if values.dtype.kind == "f" else values
+            for colour, shift in (("red", 16), ("green", 8), ("blue", 0)):
+                named[colour] = ((bits >> shift) & 255).astype(np.uint8)
+            continue
+        known_name = "channel" if name in _RINGS else _NAMES.get(name, name)
+        known_name = re.sub(r"\W", "_", known_name)
+        known_name = known_name if known_name.isidentifier() else f"_{known_name}"
+        is_new = known_name not in columns or known_name == name
+        if known_name.lower() not in "xyz" and is_new and values.any():
+            # Bytes in the order of this machine; True and False as numbers.
+            kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
+            named[known_name] = values.astype(kind.newbyteorder("="))
+    if "return_number" in named and "number_of_returns" in named:
+        named["returns"] = named.pop("number_of_returns")
+    return named
+
+
+def _described(name: str, values: AnyArray) -> Column:
+    """Return the description of a column, of the table if it has values of that type."""
+    known = TABLE.get(name)
+    if known is not None and np.dtype(known.dtype) == values.dtype:
+        return known
+    is_label = known is not None and known.kind == "label" and values.dtype.kind in "iu"
+    return Column(name, values.dtype.name, "", "", kind="label" if is_label else "number")
+
+
+def recorded_view(
+    sensors: Mapping[str, Recording], title: str, downloads: Downloads | None
+) -> View:
+    """Return the view of the sensors of a recording, {name: recording}, with a player of sweeps.
+
+    LidarError if a recording is damaged, or has no points.
+    """
+    first = next(iter(sensors.values()))
+    notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
+    if first.is_cloud:
+        cloud, sweeps = _cloud_of(first), None
+    else:
+        cloud, sweeps, further_notes = _sweeps_of(sensors)
+        notes += further_notes
+    if not len(cloud):
+        raise LidarError(f"{first.name} has no points.")
+    names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
+    return View(
+        OrderedPoints(cloud), None, sweeps, " ".join(notes), title, downloads=downloads, names=names
+    )
+
+
+def _cloud_of(recording: Recording) -> Cloud:
+    """Read a cloud, of which one point in a few is taken if it is large."""
+    total = recording.point_count or 0
+    step = max(1, -(-total // MAX_POINTS))
+    pieces = Pieces()
+    for number in range(recording.count):
+        with reading(recording.name):
+            positions, columns, _ = recording.read(number)
+            thinned = {name: np.asarray(values)[::step] for name, values in columns.items()}
+            pieces.add(np.asarray(positions, np.float64)[::step] * recording.metres, thinned)
+    return pieces.cloud()
+
+
+@dataclass(frozen=True, eq=False)
+class _TimedSweep:
+    """A sweep of a recording, before it is read."""
+
+    begins_ns: float
+    sensor: int
+    number: int
+
+
+def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
+    """Return the sweeps of all sensors in the order of their times, and whether these are known."""
+    sweeps: list[_TimedSweep] = []
+    is_timed = True
+    for sensor, recording in enumerate(sensors):
+        times: Sequence[float] = [] if recording.times is None else [*recording.times()]
+        if len(times) < recording.count:
+            is_timed = False
+            times = [_SWEEP_NS * number for number in range(recording.count)]
+        sweeps += [
+            _TimedSweep(float(times[number]), sensor, number) for number in range(recording.count)
+        ]
+    start_ns = min((sweep.begins_ns for sweep in sweeps), default=0.0)
+    ordered = sorted(sweeps, key=lambda sweep: (sweep.begins_ns, sweep.sensor))
+    return [
+        _TimedSweep(sweep.begins_ns - start_ns, sweep.sensor, sweep.number) for sweep in ordered
+    ], is_timed
+
+
+def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
+    """Read sweeps until memory is full; return their points, the sweeps, and notes."""
+    recordings = [*sensors.values()]
+    ordered, is_timed = _order(recordings)
+    pieces = Pieces()
+    poses: list[Floats | None] = []
+    for sweep in ordered:
+        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number))
+        if pieces.count > MAX_POINTS:
+            break
+    notes = []
+    if len(poses) < len(ordered):
+        notes.append(f"The first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
+    if not is_timed and len(ordered) > 1:
+        notes.append("The recording has no times: ten sweeps a second are assumed.")
+    counts = [len(positions) for positions in pieces.positions]
+    cloud = pieces.cloud(scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
+    return cloud, recorded_sweeps(ordered[: len(poses)], poses, [*sensors]), notes
+
+
+def _add_sweep(pieces: Pieces, recording: Recording, number: int) -> Floats | None:
+    """Read a sweep into the world frame, if its pose is known; return the pose."""
+    with reading(recording.name):
+        positions, columns, pose = recording.read(number)
+        local = np.asarray(positions, np.float64) * recording.metres
+    is_return = local.any(axis=1)  # drivers write zeros for pulses without a return
+    local = local[is_return]
+    if pose is not None:
+        local = local @ pose[:3, :3].T + pose[:3, 3]
+    pieces.add(local, {name: np.asarray(values)[is_return] for name, values in columns.items()})
+    return pose
+
+
+def recorded_sweeps(
+    ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
+) -> Sweeps:
+    """Return sweeps of one scan each, without actors; `names` are those of the sensors."""
+    known = [np.eye(4) if pose is None else pose for pose in poses]
+    matrices = np.array(known, np.float64).reshape(-1, 4, 4)
+    count = len(ordered)
+    begins_ns = np.array([sweep.begins_ns for sweep in ordered])
+    still = SweepPoses(np.zeros((len(names), 3)), np.tile([0.0, 0, 0, 1], (len(names), 1)))
+    return Sweeps(
+        scans=np.arange(count + 1),
+        begins_ns=begins_ns,
+        ends_ns=begins_ns,
+        sensor=np.array([sweep.sensor for sweep in ordered], np.uint8),
+        pose=SweepPoses(matrices[:, :3, 3], quaternions_of(matrices[:, :3, :3])),
+        mounts=still,
+        sensors=tuple(names),
+        objects=(),
+        actors=(),
+        actor_poses=SweepPoses(np.zeros((0, 2 * count, 3)), np.zeros((0, 2 * count, 4))),
+        actor_bounds=np.zeros((0, 2, 3)),
+        actor_there=np.zeros((0, count), np.bool_),
+        coordinates="sensor" if any(pose is None for pose in poses) else "world",
+        precision_m=0.001,
+    )

@@ -1,0 +1,1 @@
+"""Clouds and recordings of lidarpool and of other programs, read sweep by sweep."""
