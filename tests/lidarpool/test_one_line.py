@@ -14,6 +14,7 @@ from lidarpool import (
     Cloud,
     Column,
     Fault,
+    Follower,
     Gnss,
     Imu,
     Job,
@@ -54,6 +55,7 @@ THINGS = [
     CampaignRun(tuple(range(1000)), 3, 1000, 1000, 1.2, 0, 1.3, sensors={"a": "x" * 99}),
     Cloud(np.zeros((1, 3)), {name: [0] for name in TABLE}),
     Column("own", "float32", "m", "a long description " * 20),
+    Follower([MESH], SENSOR),
     Job(SCENE, SURVEY, PLANNING, values={str(n): n for n in range(100)}),
     Mounted(SENSOR, Pose((1, 0, 2)), "roof", noise=Noise(range_m=0.01)),
     Navigation(imu=Imu(gyroscope_noise_density=1e-4), gnss=Gnss(horizontal_m=0.02)),
@@ -90,8 +92,10 @@ def test_it_is_one_line(thing):
 
 
 def test_every_public_class_is_among_them():
-    # A result and a comparison are printed as tables; robot, scan and sweep have their tests.
+    # A result and a comparison are printed as tables; robot, scan and sweep have their tests. A
+    # scanner of MuJoCo needs MuJoCo.
     elsewhere = {"Result", "Comparison", "Fit", "Robot", "ScanSpec", "Sweep", "LidarError"}
+    elsewhere.add("MujocoScanner")
     public = {n for n in lidarpool.__all__ if isinstance(getattr(lidarpool, n), type)}
     parts = {"Imu", "Gnss"}  # of Navigation
     assert (

@@ -146,7 +146,6 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("name", "advice"),
     [
-        ("a.e57", "pdal translate"),
         ("a.bag", "rosbags-convert"),
         ("a.xyz", "as .ply or .las"),
         ("a.glb", "run a survey of it first"),

@@ -48,9 +48,8 @@ from .sweep_files import (
 )
 
 KINDS = (
-    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, a "
-    ".e57, a .parquet or a folder of them, a bag of ROS 2 (.mcap or its folder), a .pcap of "
-    "Velodyne, a .pcap or .osf of Ouster, a .bin of KITTI, or a folder of KITTI, nuScenes, "
+    "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .bin of KITTI, "
+    ".pcap of Velodyne or Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, "
     "WebDataset or range images"
 )
 # Names of the columns of rings and of intensities in other programs; the first column present is

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.elementary import sin_cos
+from ..base.vectors import applied, inverse, matmul
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from ..sensor.trajectory import matrices
@@ -458,7 +459,9 @@ class OusterEncoder(PacketEncoder):
             return np.eye(4)
         imu = instruments.imu
         on_carrier = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
-        pose = np.linalg.inv(self.source.mount) @ on_carrier
+        mount = self.source.mount
+        to_sensor = inverse(mount[:3, :3])
+        pose = matmul(affine(to_sensor, -applied(to_sensor, mount[:3, 3])), on_carrier)
         pose[:3, 3] *= 1000
         return pose
 
