@@ -28,6 +28,7 @@ _SECTIONS = {
     "scene: copies: scatter": "Scatter",
     "scene: ground": "Ground",
     "sensor": "SensorSection",
+    "sensor: packets": "PacketSection",
     "poses": "Pose",
     "trajectory": "TrajectorySection",
     "trajectory: points": "TimedPose",
