@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import atexit
+import os
 import sys
 import time
 from html import escape
@@ -60,11 +61,21 @@ class Step(NamedTuple):
     end_s: float  # seconds since the start of the process
 
 
+def _age_s() -> float:
+    """Return the seconds since the start of this process."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # a system other than Linux
+        return time.time() - psutil.Process().create_time()
+    # psutil adds to the time of the boot, which was a second off where clocks had been set since.
+    stat = Path("/proc/self/stat").read_text("ascii", errors="replace")
+    start_ticks = int(stat.rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - start_ticks / os.sysconf("SC_CLK_TCK")
+
+
 class Timeline:
     """Steps of this process in the order in which they ended."""
 
     def __init__(self) -> None:
-        self._started = psutil.Process().create_time()  # seconds since 1970, in steps of 10 ms
+        self._started = time.time() - _age_s()  # seconds since 1970, in steps of 10 ms
         self.steps: list[Step] = []
 
     def mark(self, name: str) -> None:
