@@ -18,8 +18,9 @@ def value():
     return {"grid": grid, "transposed": grid.T, "name": "hall", "none": np.zeros((0, 3), np.int32)}
 
 
-def same(one, two):
-    return one.keys() == two.keys() and all(np.array_equal(one[name], two[name]) for name in one)
+def same(first, second):
+    names = first.keys()
+    return names == second.keys() and all(np.array_equal(first[n], second[n]) for n in names)
 
 
 def test_a_copy_of_a_pickled_value_can_be_written_to():

@@ -48,7 +48,7 @@ class Pickled(NamedTuple):
 
 
 class SharedHandle(NamedTuple):
-    """What a process needs to load the value of a `SharedValue`."""
+    """Location of a `SharedValue`, by which another process loads the value."""
 
     path: str
     name: str  # of the memory, which no other has
@@ -83,9 +83,9 @@ class SharedValue:
         for content in (pickled.head, *pickled.buffers):
             start = -(-self._file.tell() // _ALIGNMENT) * _ALIGNMENT
             self._file.seek(start)
-            rest = memoryview(content)
-            while rest:  # the system writes 2 GiB at a time
-                rest = rest[self._file.write(rest) :]
+            remaining = memoryview(content)
+            while remaining:  # the system writes 2 GiB at a time
+                remaining = remaining[self._file.write(remaining) :]
             spans.append((start, start + len(content)))
         path = f"/proc/{os.getpid()}/fd/{self._file.fileno()}"
         self.handle = SharedHandle(path, name, tuple(spans))
