@@ -177,7 +177,7 @@ def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, pl
         variable.set({**variable.get(timeout=LONG_S), "closed": True})
         closed.append(names[0])
 
-    survey = Survey(SENSOR, [(0, 0, 0)], steps=400)
+    survey = Survey(SENSOR, [(0, 0, 0)], steps=4000)  # the pipe of scans fills often enough
     with pytest.raises(LidarError, match=f"another client has closed.*-{kind}'"):
         simulate(room(), survey, client=client, on_progress=close, on_frame=close)
     assert closed
