@@ -63,22 +63,29 @@ def name_of(triangles: int) -> str:
 
 
 def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
-    """Time a scan: the cast alone, packing of hits, and copies of hits to the host."""
+    """Time a scan: rays, the cast alone, packing of hits, and copies of hits to the host."""
     engine: Any = caster.engine
-    parts = list(engine._chunks(scan))
-    hit_parts = [engine._cast("cast_pattern", n, rays) for _, n, rays in parts]
-    hits = sum(int((triangle >= 0).sum()) for _, triangle, _ in hit_parts)
+    parts = list(scan.chunks(engine.chunk))
+    tables = [engine._make_rays(scan, start, stop) for start, stop in parts]
+    limits = (scan.t_min, scan.t_max)
 
-    def cast() -> None:
-        for _, n, rays in parts:
-            engine._cast("cast_pattern", n, rays)
+    def rays() -> None:
+        for start, stop in parts:
+            engine._make_rays(scan, start, stop)
+
+    def cast() -> list[Any]:
+        return [engine._cast(table, table[1].shape[1], limits) for table in tables]
+
+    hit_parts = cast()
+    hits = sum(int((triangle >= 0).sum()) for _, triangle, _ in hit_parts)
 
     def pack() -> None:
         groups = Groups(scan.groups, 1)
-        for (start, _, _), hit in zip(parts, hit_parts, strict=True):
+        for (start, _), hit in zip(parts, hit_parts, strict=True):
             engine._pack(hit, start, groups, 1.0, engine._no_counters, engine._no_other_hits)
 
     times = {
+        "rays": milliseconds(session, rays),
         "cast": milliseconds(session, cast),
         "pack": milliseconds(session, pack),
         "to_device": wall_milliseconds(session, lambda: caster.visit(scan, len)),
@@ -121,7 +128,7 @@ def kernels(session: Session) -> Rows:
         )
         yield f"{name}, brute force", brute_force(session, caster, shuffled)
     engine: Any = caster.engine
-    for kernel in ("cast_pattern", "pack", "make_rays"):
+    for kernel in ("cast_table", "pack", "make_rays"):
         function = engine._module.get_function(kernel)
         yield kernel, {"registers": function.num_regs, "local_bytes": function.local_size_bytes}
 

@@ -68,8 +68,8 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
     """Cast a job's rays; return the counters per ray, and the share of hits."""
-    directions = np.ascontiguousarray(job.directions @ job.rotation.T)
-    n = len(directions)
+    directions = np.ascontiguousarray((job.directions @ job.rotation.T).T)
+    n = directions.shape[1]
     distance = np.empty(n)
     triangle = np.empty(n, np.int32)
     instance_layout = lay_out_instances(plain(mesh), layout.roots)
@@ -84,8 +84,9 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
             layout.faces,
             *cuda_backend.NO_MASKS,
         )
-        rays = (np.array(origin), ctypes.c_int(0), directions)  # one origin for all
-        limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
+        shared_origin = (np.array(origin), ctypes.c_longlong(1))
+        rays = (*shared_origin, directions, ctypes.c_longlong(n))
+        limits = (ctypes.c_double(0.0), ctypes.c_double(np.inf))
         _run(
             library,
             "cast_table",

@@ -23,6 +23,7 @@ from raybeam.cuda_backend import CudaBackend
 
 HOST_FILES = Path(__file__).parent / "raybeam" / "host"
 STACK = 256
+VOTING = ("pack",)  # kernels in which the threads of a warp wait for each other
 
 
 class Array(np.ndarray):
@@ -214,7 +215,7 @@ def compiled(compiler, folder, code, options):
     source = folder / f"{number}.cpp"
     library = folder / f"{number}.so"
     names = re.findall(r"^KERNEL (\w+)\(", code, re.M)
-    runs = "".join(f"RUN({name})\n" for name in names)
+    runs = "".join(f"RUN({name}, {str(name in VOTING).lower()})\n" for name in names)
     source.write_text(f'#include "launch.h"\n{code}\n{runs}')
     command = [
         compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-ffp-contract=off",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, ClassVar, cast
 from weakref import WeakKeyDictionary
@@ -126,8 +126,7 @@ class CudaBackend(Backend):
         n = len(rays)
         with self._device:
             table = self._ray_table(rays)
-            limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
-            hits = self._cast("cast_table", n, (*table, np.int64(n), *limits))
+            hits = self._cast(table, n, (rays.t_min, rays.t_max))
             groups = Groups(np.zeros(1, np.int64), 1)
             packed = self._pack(hits, 0, groups, 1.0, self._no_counters, self._no_other_hits)
             u, v = self._weights(hits, table, packed[0])
@@ -135,14 +134,14 @@ class CudaBackend(Backend):
             columns = (ray, distance, triangle, u, v, instance)
             return ClosestHits(*(array.get() for array in columns))
 
-    def _ray_table(self, rays: Rays) -> tuple[Any, np.int32, Any]:
-        """Copy rays to the device; return origins, step between origins, and directions."""
-        origins, directions = map(np.ascontiguousarray, (rays.origins, rays.directions))
-        step = np.int32(0 if len(rays.origins) == 1 else 3)
-        return self._cupy.asarray(origins), step, self._cupy.asarray(directions)
+    def _ray_table(self, rays: Rays) -> tuple[Any, Any]:
+        """Copy rays to the device; return origins, (3, n) or (3, 1) if shared, and directions."""
+        tables = (np.ascontiguousarray(table.T) for table in (rays.origins, rays.directions))
+        origins, directions = map(self._cupy.asarray, tables)
+        return origins, directions
 
     def _weights(
-        self, hits: tuple[Any, Any, Any], table: tuple[Any, np.int32, Any], ray: Any
+        self, hits: tuple[Any, Any, Any], table: tuple[Any, Any], ray: Any
     ) -> tuple[Any, Any]:
         """Return the weights of the second and third corner of the hits of rays (k,)."""
         count = len(ray)
@@ -151,7 +150,7 @@ class CudaBackend(Backend):
         frame, _, instances = self._instance_tables
         scene = (self._meshes[2], frame, instances)
         _, row, instance = hits
-        arguments = (*scene, *table, ray, row, instance, np.int64(count))
+        arguments = (*scene, *_table_arguments(table), ray, row, instance, np.int64(count))
         self._run("weigh_table", count, *arguments, u, v)
         return u, v
 
@@ -186,11 +185,12 @@ class CudaBackend(Backend):
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
-            for start, n, rays in self._chunks(scan):
-                hits = self._cast("cast_pattern", n, rays)
-                replacing = self._replace(hits, start, n, other_hits)
+            for start, stop in scan.chunks(self.chunk):
+                table = self._make_rays(scan, start, stop)
+                hits = self._cast(table, stop - start, (scan.t_min, scan.t_max))
+                replacing = self._replace(hits, start, stop - start, other_hits)
                 packed = self._pack(hits, start, groups, scene.frame.scale, counting, replacing)
-                use(DeviceHits(*packed, cp, partial(self._rays, start, rays)))
+                use(DeviceHits(*packed, cp, partial(_listed_rays, start, table)))
             return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
     def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
@@ -240,38 +240,35 @@ class CudaBackend(Backend):
         self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *hits[:2])
         return metres, triangle, np.int32(len(self._scene.mesh))
 
-    def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
-        """Return origins and directions, (3, k), of rays of a chunk, on the device."""
-        cp = self._cupy
-        n = len(ray)
-        origins = cp.empty((3, n))
-        directions = cp.empty((3, n))
-        numbers = ray, np.int64(start), np.int64(n)
-        self._run("make_rays", n, *rays[:-3], *numbers, origins, directions)
-        return origins, directions
+    def _make_rays(self, scan: Scan, start: int, stop: int) -> tuple[Any, Any]:
+        """Return origins, metres, and directions of rays `start` to `stop` of a scan.
 
-    def _chunks(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
-        """Yield first ray, number of rays, and arguments of cast_pattern, chunk by chunk."""
-        scale = self._scene.frame.scale
-        limits = [np.float64(t * scale) for t in (scan.t_min, scan.t_max)]
-        tables = self._resident(scan.pattern)
+        Both are float64 (3, n) on the device, with the bits of `pattern_rays`. Rays that are read
+        from memory cost the cast fewer registers and operations in double than rays that are
+        computed again for each triangle.
+        """
+        cp = self._cupy
+        n = stop - start
+        directions, pattern_origins = self._resident(scan.pattern)
         rows = len(scan.pattern)
-        for start, stop in scan.chunks(self.chunk):
-            window = (np.int64(rows), np.int64((scan.first + start) % rows))
-            arguments = (
-                *self._pose_tables(scan.poses, start, stop),
-                tables[0],
-                tables[-1],
-                *window,
-                *self._pattern_flags(scan, start),
-                *self._motion(scan.poses, start, stop),
-                np.int64(stop - start),
-                *limits,
-            )
-            yield start, stop - start, arguments
+        table = cp.empty((3, n)), cp.empty((3, n))
+        self._run(
+            "make_rays",
+            n,
+            *self._pose_tables(scan.poses, start, stop),
+            directions,
+            pattern_origins,
+            np.int64(rows),
+            np.int64((scan.first + start) % rows),
+            *self._pattern_flags(scan, start),
+            *self._motion(scan.poses, start, stop),
+            np.int64(n),
+            *table,
+        )
+        return table
 
     def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
-        """Return arguments of cast_pattern: positions and rotations of rays `start` to `stop`."""
+        """Return arguments of make_rays: positions and rotations of rays `start` to `stop`."""
         span = _pose_span(poses, start, stop)
         matrices = np.zeros(1) if poses.rotations is None else poses.rotations[span]
         # `asarray` keeps the order of memory, and poses are stored by component.
@@ -281,7 +278,7 @@ class CudaBackend(Backend):
         ]
 
     def _pattern_flags(self, scan: Scan, start: int) -> list[np.int32]:
-        """Return arguments of cast_pattern: rays of the first pose, of each pose, and flags.
+        """Return arguments of make_rays: rays of the first pose, of each pose, and flags.
 
         The flags say whether there are rotations, and whether there are origins.
         """
@@ -293,7 +290,7 @@ class CudaBackend(Backend):
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
     def _motion(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
-        """Return arguments of cast_pattern: delays, rates of poses, and whether there is motion."""
+        """Return arguments of make_rays: delays, rates of poses, and whether there is motion."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:
@@ -303,22 +300,32 @@ class CudaBackend(Backend):
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Return directions, and origins if any, of a pattern on the device: (3, n) each."""
+        """Return directions and origins of a pattern on the device: (3, n) each.
+
+        Without origins, the directions take their place, which are not read then.
+        """
         tables = self._patterns.get(pattern)
         if tables is None:
             arrays = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
-            tables = self._patterns[pattern] = tuple(
-                to_device(self._cupy, array.T) for array in arrays if array is not None
-            )
+            tables = [to_device(self._cupy, array.T) for array in arrays if array is not None]
+            tables = self._patterns[pattern] = (tables[0], tables[-1])
         return tables
 
-    def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """Return local distance, table row and instance of closest hits, on the device."""
+    def _cast(
+        self, table: tuple[Any, Any], n: int, limits: tuple[float, float]
+    ) -> tuple[Any, Any, Any]:
+        """Return local distance, table row and instance of closest hits, on the device.
+
+        `table` are origins and directions of n rays, `limits` those of the distance, metres.
+        """
         t = self._cupy.empty(n)
         row = self._cupy.empty(n, np.int32)
         instance = self._cupy.empty(n if self._scene.nested else 1, np.int32)
-        self._run(kernel, n, *self._meshes, *self._instance_tables, *rays, t, row, instance)
+        local_limits = [np.float64(t * self._scene.frame.scale) for t in limits]
+        scene = (*self._meshes, *self._instance_tables)
+        arguments = (*_table_arguments(table), *local_limits, t, row, instance)
+        self._run("cast_table", n, *scene, *arguments)
         return t, row, instance
 
     def _pack(
@@ -375,6 +382,18 @@ class CudaBackend(Backend):
         if threads:
             grid = (-(-threads // _BLOCK),)
             self._module.get_function(kernel)(grid, (_BLOCK,), arguments)
+
+
+def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:
+    """Return arguments of kernels: origins, directions, and the number of each."""
+    origins, directions = table
+    return origins, np.int64(origins.shape[1]), directions, np.int64(directions.shape[1])
+
+
+def _listed_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
+    """Return origins and directions, (3, k), of rays of a table, of which the first is `start`."""
+    origins, directions = (column[:, ray - start] for column in table)
+    return origins, directions
 
 
 def _pose_span(poses: Poses, start: int, stop: int) -> slice:

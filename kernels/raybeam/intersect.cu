@@ -6,8 +6,8 @@
 // instances, 0 for a plain scene: a mesh without a transform; MASKED, 1 if parts of triangles are
 // transparent, else 0. A scene without instances or masks does not pay for these.
 //
-// Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics but for
-// counts, so it does not matter which threads run together. Offsets into tables are 64 bits wide; an
+// Threads are independent but for counts: no shared memory, no barriers, and votes of a warp and
+// atomics only in `count_row`, so it does not matter which threads run together. Offsets into tables are 64 bits wide; an
 // int is enough for the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit,
 // and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
 // Tables of float4 are separate allocations, which the device aligns to 256 bytes.
@@ -42,8 +42,9 @@
 
 typedef long long Count;
 
-// Five blocks of 128 threads to a multiprocessor, four with instances, one less for bodies: with
-// more, nvcc spills registers for sm_90 or sm_120.
+// Five blocks of 128 threads to a multiprocessor, four with instances, one less for bodies, two less
+// for bodies with instances and masks: with more, nvcc 13.0 or 13.5 spills registers for sm_90, sm_100
+// or sm_120.
 #define BLOCKS (NESTED ? 4 : 5)
 #define KERNEL extern "C" __global__ void __launch_bounds__(128, BLOCKS)
 
@@ -94,20 +95,24 @@ __device__ __forceinline__ void place_origin(const Scene& scene, const double* o
     ray.oz = (origin[2] - f[2]) * f[3];
 }
 
-// Origins and directions from memory; a shared origin if stride is 0, else 3.
+// Rays from memory: origins in metres, (3, origin_count), shared by all rays if origin_count is 1, and
+// directions, (3, count).
 struct TableRays {
     const double* origins;
-    int stride;
+    Count origin_count;
     const double* directions;
+    Count count;
 
-    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    __device__ __forceinline__ Ray load(const Scene& scene, int i) const
     {
+        const int at = origin_count == 1 ? 0 : i;
+        const double origin[3] = {
+            origins[at], origins[origin_count + at], origins[2 * origin_count + at]};
         Ray ray;
-        place_origin(scene, origins + i * stride, ray);
-        const double* d = directions + 3 * i;
-        ray.dx = d[0];
-        ray.dy = d[1];
-        ray.dz = d[2];
+        place_origin(scene, origin, ray);
+        ray.dx = directions[i];
+        ray.dy = directions[count + i];
+        ray.dz = directions[2 * count + i];
         return ray;
     }
 };
@@ -148,13 +153,13 @@ struct PatternRays {
     }
 
     // Compute the origin of a ray, metres, and its direction.
-    __device__ __forceinline__ void make(Count i, double* at, double* to) const
+    __device__ __forceinline__ void make(int i, double* at, double* to) const
     {
         Count row = first + i;
         // A chunk's rays fit an int, see above; so does the rest after a turn, if there are more.
         if (row >= rows) row -= rows;
         if (row >= rows) row = (unsigned)row % (unsigned)rows;
-        const int ray = (int)i;
+        const int ray = i;
         const unsigned pose = ray < left ? 0u : 1u + (unsigned)(ray - left) / (unsigned)each;
         const double* r = rotations + 9 * (Count)pose;
         const double x = directions[row], y = directions[rows + row];
@@ -184,26 +189,15 @@ struct PatternRays {
         if (moving)
             for (int axis = 0; axis < 3; ++axis) at[axis] = at[axis] + delay * rate[axis];
     }
-
-    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
-    {
-        double at[3], to[3];
-        make(i, at, to);
-        Ray out;
-        place_origin(scene, at, out);
-        out.dx = to[0];
-        out.dy = to[1];
-        out.dz = to[2];
-        return out;
-    }
 };
 
-// Rays in the axes of a moving body at the ray's time: `pose` is the position of the body, and the
-// rotation from the body's axes, by rows.
+// Rays in the axes of a moving body at the ray's time: row `row` of `poses` is the position of the
+// body, and the rotation from the body's axes, by rows. A row takes fewer registers than a pointer.
 struct BodyRays {
     const double* rays;  // 6 rows of `count`: origins in metres, and directions
     Count count;
-    const double* pose;
+    const double* poses;  // 12 a row
+    int row;
 
     __device__ __forceinline__ static void take(
         const double* r, double x, double y, double z, double& a, double& b, double& c)
@@ -214,8 +208,9 @@ struct BodyRays {
     }
 
     // Compute a ray; return the length of its direction, as `cast_crossing` of crossing.py.
-    __device__ __forceinline__ double make(const Scene& scene, Count i, Ray& ray) const
+    __device__ __forceinline__ double make(const Scene& scene, int i, Ray& ray) const
     {
+        const double* pose = poses + 12 * (Count)row;
         double at[3];
         const double x = rays[i] - pose[0], y = rays[count + i] - pose[1];
         const double z = rays[2 * count + i] - pose[2];
@@ -240,7 +235,7 @@ struct BodyRays {
         return sqrt(squared);
     }
 
-    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    __device__ __forceinline__ Ray load(const Scene& scene, int i) const
     {
         Ray out;
         make(scene, i, out);
@@ -553,7 +548,7 @@ struct Closest {
     // Test the waiting triangles of an instance in double.
     template <class Rays>
     __device__ __forceinline__ void settle(
-        const Scene& scene, const Rays& rays, Count i, int inside, double t_min, Walk& w)
+        const Scene& scene, const Rays& rays, int i, int inside, double t_min, Walk& w)
     {
 #pragma unroll 1  // one copy of the test
         for (int turn = 0; turn < 2; ++turn) {
@@ -588,7 +583,7 @@ struct Closest {
 // at a time.
 template <class Rays>
 __device__ __forceinline__ void visit(
-    const Scene& scene, const Rays& rays, Count i, int inside, double t_min, Waiting* stack,
+    const Scene& scene, const Rays& rays, int i, int inside, double t_min, Waiting* stack,
     int bottom, Closest& best)
 {
     const double* record = scene.instances + RECORD * (Count)inside;
@@ -622,7 +617,7 @@ __device__ __forceinline__ void visit(
 // The ray is prepared again: keeping it while an instance is visited takes twice the registers.
 template <class Rays>
 __device__ __forceinline__ int next_instance(
-    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max,
+    const Scene& scene, const Rays& rays, int i, double t_min, double t_max,
     Waiting* stack, int& top)
 {
     Walk w;
@@ -634,7 +629,7 @@ __device__ __forceinline__ int next_instance(
 
 template <class Rays>
 __device__ __forceinline__ void walk(
-    const Scene& scene, const Rays& rays, Count i, double t_min, Closest& best)
+    const Scene& scene, const Rays& rays, int i, double t_min, Closest& best)
 {
     Waiting stack[STACK];
     if (!NESTED) {
@@ -659,44 +654,15 @@ KERNEL cast_table(
     const Count* __restrict__ opacity,
     const double* __restrict__ frame, const float4* __restrict__ top,
     const double* __restrict__ instances,
-    const double* __restrict__ origins, int origin_stride,
+    const double* __restrict__ origins, Count origin_count,
     const double* __restrict__ directions, Count count, double t_min, double t_max,
     double* __restrict__ distance, int* __restrict__ place, int* __restrict__ instance)
 {
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, uvs,
                          masks, opacity,   frame,   top,   instances};
-    const TableRays rays = {origins, origin_stride, directions};
-    Closest best(t_max);
-    walk(scene, rays, i, t_min, best);
-    place[i] = best.place;
-    if (best.place >= 0) distance[i] = best.t;
-    if (NESTED && best.place >= 0) instance[i] = best.instance;
-}
-
-// Closest hits of a pattern's rays from one pose after another; otherwise as cast_table.
-KERNEL cast_pattern(
-    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
-    const double* __restrict__ corners, const int* __restrict__ faces,
-    const float* __restrict__ uvs, const unsigned char* __restrict__ masks,
-    const Count* __restrict__ opacity,
-    const double* __restrict__ frame, const float4* __restrict__ top,
-    const double* __restrict__ instances,
-    const double* __restrict__ positions, const double* __restrict__ rotations,
-    const double* __restrict__ directions, const double* __restrict__ origins,
-    Count rows, Count first, int left, int each, int turned, int shifted,
-    const double* __restrict__ delays, const double* __restrict__ rates, int moving,
-    Count count, double t_min, double t_max,
-    double* __restrict__ distance, int* __restrict__ place, int* __restrict__ instance)
-{
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count) return;
-    const Scene scene = {nodes, triangles, corners, faces, uvs,
-                         masks, opacity,   frame,   top,   instances};
-    const PatternRays rays = {positions, rotations, directions, origins, rows,
-                              first,     left,      each,       turned,  shifted,
-                              delays,    rates,     moving};
+    const TableRays rays = {origins, origin_count, directions, count};
     Closest best(t_max);
     walk(scene, rays, i, t_min, best);
     place[i] = best.place;
@@ -705,7 +671,7 @@ KERNEL cast_pattern(
 }
 
 #undef BLOCKS
-#define BLOCKS (NESTED ? 3 : 4)
+#define BLOCKS (NESTED ? (MASKED ? 2 : 3) : 4)
 
 // Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of crossing.py. Ray i
 // meets the bodies at time when[i], if below `times`: the pose of body k at time t, 12 doubles, is
@@ -725,7 +691,7 @@ KERNEL cast_bodies(
     double* __restrict__ nearest_metres, Count* __restrict__ nearest_body,
     int* __restrict__ nearest_instance, int* __restrict__ nearest_triangle)
 {
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
     if (i >= count || when[i] < 0 || when[i] >= times) return;
     const Scene scene = {nodes, triangles, corners, faces, uvs,
                          masks, opacity,   frame,   top,   instances};
@@ -737,9 +703,10 @@ KERNEL cast_bodies(
             const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];
             clip(low[axis], low[3 + axis], o, d, enters, leaves);
         }
-        const double* pose = poses + 12 * ((Count)when[i] * body_count + k);
-        if (!(enters <= leaves) || pose[0] != pose[0]) continue;
-        const BodyRays own = {rays, count, pose};
+        const int row = when[i] * body_count + k;
+        const double absent = poses[12 * (Count)row];
+        if (!(enters <= leaves) || absent != absent) continue;
+        const BodyRays own = {rays, count, poses, row};
         Ray ray;
         const double reach = nearest_metres[i] * frame[3] * (1.0 + SLACK);
         Closest best(fmin(t_max, reach * own.make(scene, i, ray)));
@@ -762,15 +729,15 @@ KERNEL cast_bodies(
 KERNEL weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ instances,
-    const double* __restrict__ origins, int origin_stride,
-    const double* __restrict__ directions,
+    const double* __restrict__ origins, Count origin_count,
+    const double* __restrict__ directions, Count ray_count,
     const unsigned int* __restrict__ ray, const int* __restrict__ place,
     const int* __restrict__ instance, Count count, double* __restrict__ u, double* __restrict__ v)
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (k >= count) return;
     const Scene scene = {0, 0, corners, 0, 0, 0, 0, frame, 0, instances};
-    const TableRays rays = {origins, origin_stride, directions};
+    const TableRays rays = {origins, origin_count, directions, ray_count};
     Ray at = rays.load(scene, ray[k]);
     enter_mesh(scene, NESTED ? instance[ray[k]] : 0, at);
     Exact hit;
@@ -793,6 +760,17 @@ KERNEL replace(
     if (place[i] < 0 || metres[k] < distance[i] / scale) place[i] = -2 - (int)k;
 }
 
+// Add 1 to a row of a tally for each thread that counts; all threads of a warp call. Neighbouring rays
+// often hit the same triangle: the threads of a warp that count the same row add once.
+__device__ __forceinline__ void count_row(unsigned long long* tally, Count row, bool counts)
+{
+    const unsigned counting = __ballot_sync(~0u, counts);
+    if (!counts) return;
+    const unsigned same = __match_any_sync(counting, (unsigned long long)row);
+    if (threadIdx.x % 32 == (unsigned)__ffs((int)same) - 1)
+        atomicAdd(tally + row, (unsigned long long)__popc(same));
+}
+
 // Close up the hits that are kept, in ray order: number of the ray, from `start` on, distance in
 // metres, the caller's triangle, instance. `other_…` are those of `replace`.
 //
@@ -813,11 +791,15 @@ KERNEL pack(
     int* __restrict__ which)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count || place[i] == -1) return;
-    const int row = place[i], other = -2 - row;
-    const int face = row < 0 ? other_triangle[other] : faces[row];
-    const int in = row < 0 ? other_instance : NESTED ? instance[i] : 0;
-    if (counting) atomicAdd(tally + counters[2 * in] + counters[2 * in + 1] * face, 1ULL);
+    const bool hit = i < count && place[i] != -1;
+    int face = 0, in = 0;
+    if (hit) {
+        const int row = place[i];
+        face = row < 0 ? other_triangle[-2 - row] : faces[row];
+        in = row < 0 ? other_instance : NESTED ? instance[i] : 0;
+    }
+    if (counting) count_row(tally, counters[2 * in] + counters[2 * in + 1] * face, hit);
+    if (!hit) return;
     int k = ends[i] - 1;
     if (every > 1) {
         int group = 0;
@@ -833,30 +815,29 @@ KERNEL pack(
         k = groups[2 * group_count + group] + k / every;
     }
     ray[k] = (unsigned int)(start + i);
-    metres[k] = row < 0 ? other_metres[other] : distance[i] / scale;
+    metres[k] = place[i] < 0 ? other_metres[-2 - place[i]] : distance[i] / scale;
     triangle[k] = face;
     which[k] = in;
 }
 
-// Origins in metres and directions of the listed rays, counted from `start`: (3, count) each,
-// with the bits of `pattern_rays`.
+// Rays of a pattern, from one pose after another, as a table: origins in metres and directions,
+// (3, count) each, with the bits of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,
     Count rows, Count first, int left, int each, int turned, int shifted,
     const double* __restrict__ delays, const double* __restrict__ rates, int moving,
-    const unsigned int* __restrict__ ray, Count start, Count count,
-    double* __restrict__ from, double* __restrict__ towards)
+    Count count, double* __restrict__ from, double* __restrict__ towards)
 {
-    const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (k >= count) return;
+    const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
+    if (i >= count) return;
     const PatternRays rays = {positions, rotations, directions, origins, rows,
                               first,     left,      each,       turned,  shifted,
                               delays,    rates,     moving};
     double at[3], to[3];
-    rays.make((Count)ray[k] - start, at, to);
+    rays.make(i, at, to);
     for (int axis = 0; axis < 3; ++axis) {
-        from[axis * count + k] = at[axis];
-        towards[axis * count + k] = to[axis];
+        from[axis * count + i] = at[axis];
+        towards[axis * count + i] = to[axis];
     }
 }

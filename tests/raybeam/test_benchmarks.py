@@ -49,7 +49,7 @@ def test_all_that_the_device_is_measured_at(played_cuda, tmp_path, capsys, monke
     assert found["leaks"]["edges and corners"] == {"rays": 5000, "escaped": 0}
     assert 0 < found["large"]["many rays"]["last ray"] < 6144
     assert set(found["columns"]["a batch, ms"]) == {
-        "cast_pattern", "pack", "make_rays", "columns", "copy", "all",
+        "cast_table", "pack", "make_rays", "columns", "copy", "all",
     }  # fmt: skip
     assert found["columns"]["plain"]["bytes_a_point"] == 30
     assert found["durable"]["disk"]["mpoints_s"] > 0 < found["sharing"]["two to one"]["ratio"]

@@ -9,8 +9,7 @@ extern "C" const long long* what_was_seen() { return seen; }
 
 #include SOURCE
 
-RUN(cast_table)
-RUN(cast_pattern)
-RUN(cast_bodies)
-RUN(weigh_table)
-RUN(pack)
+RUN(cast_table, false)
+RUN(cast_bodies, false)
+RUN(weigh_table, false)
+RUN(pack, true)
