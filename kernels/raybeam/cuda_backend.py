@@ -392,7 +392,7 @@ def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int
 
 def _listed_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
     """Return origins and directions, (3, k), of rays of a table, of which the first is `start`."""
-    origins, directions = (column[:, ray - start] for column in table)
+    origins, directions = (column.take(ray - start, axis=1) for column in table)
     return origins, directions
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import importlib.resources
-import pickle
 import shutil
 import subprocess
 import tracemalloc
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,8 +29,6 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.columns.parts import pack
-from lidarpool.run.pipeline import rigs as stage
 from lidarsim.scene.actors import box
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.shapes import seed_objects
@@ -44,7 +40,7 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.device import OPTIONS, DevicePoints
 from lidarsim.simulator.memory import cast_bytes
 from lidarsim.simulator.rig import Rig
-from raybeam import registry
+from raybeam import available_backends, registry
 
 COLUMNS = (
     "ray", "time", "range", "intensity", "reflectance", "class", "triangle", "sensor", "returns",
@@ -77,11 +73,17 @@ MODELS["on the move, beams of several rays"] = Survey(
 )
 
 
-@pytest.fixture
-def backend(source_backend, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
-    monkeypatch.setattr(source_backend, "chunk", 997)
-    return source_backend.name
+@pytest.fixture(params=["source", pytest.param("cuda", marks=pytest.mark.gpu)])
+def backend(request, monkeypatch):
+    """Name of a backend that makes columns on a device: one that the CPU plays, or a real one."""
+    if request.param == "source":
+        played = request.getfixturevalue("source_backend")
+        monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, played))
+    elif reason := available_backends()["cuda"]:
+        pytest.skip(f"cuda: {reason}")
+    backends = {backend.name: backend for backend in registry.BACKENDS}
+    monkeypatch.setattr(backends[request.param], "chunk", 997)
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -225,23 +227,6 @@ def test_columns_of_actors(scene, name, scenes, backend):
     same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))
 
 
-def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
-    survey = MADE["on the move"]
-    spans = [(0, 9), (9, 28)]
-    monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(finish=lambda scans: None))
-    tasks = []
-    for name in (backend, "numpy"):
-        rig = Rig(scenes["both"], survey, name)
-        monkeypatch.setattr(stage, "rig_of", lambda *_, rig=rig: rig)
-        done = stage.intersect([stage.CastWork(0, "a run", spans)], (), None, None)
-        tasks.append(pickle.loads(pickle.dumps(done, protocol=5)))
-    for mine, other in zip(*tasks, strict=True):
-        samples = mine.part.samples
-        exact = other.part.samples
-        assert pack(mine.part) == pack(replace(other.part, samples=samples))
-        assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
-
-
 def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
     sensor = MADE["few columns"].sensor
     clouds = [
@@ -257,6 +242,8 @@ def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
 def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):
+    if backend == "cuda":
+        pytest.skip("CuPy's own pool takes page-locked memory")
     taken = []
 
     def rounded(size):  # as CuPy's pool does

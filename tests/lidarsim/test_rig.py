@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tests.shapes import Cart, cast_between, tally_of
 
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
-from lidarpool.base.shared_memory import Pickled
 from lidarpool.columns.parts import pack
-from lidarpool.run.pipeline import rigs
-from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator import static_bodies
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
-from poolpart.task_context import WorkerLeft
 from raybeam import RayCaster
 
 ELEVATIONS = np.radians([-20, -5, 0, 12])
@@ -155,12 +149,6 @@ def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 
-def test_a_worker_that_leaves_is_not_a_failure_of_its_scans():
-    """The driver casts those elsewhere, and would end the run at any other error."""
-    with pytest.raises(WorkerLeft), naming_scans(3, 5):
-        raise WorkerLeft("the worker has left")
-
-
 def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch):
     built = []
 
@@ -180,24 +168,3 @@ def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch
     for one, two in ((other, fresh), (rig, Rig(scene, surveys[0], "numpy"))):
         assert pack(columns_of(list(one.cast(0, 14)))) == pack(columns_of(list(two.cast(0, 14))))
     assert other.scene.actors == (car,) and rig.scene.actors == ()
-
-
-def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):
-    monkeypatch.setattr(
-        rigs, "get_worker", lambda: SimpleNamespace(state=SimpleNamespace(nthreads=1))
-    )
-    monkeypatch.setattr(rigs, "own_device", lambda: None)
-    scene = Pickled.from_value(Scene.from_meshes([box("Room", (8, 6, 3))]))
-    packed = pickle.dumps(survey(poses=TURNED))
-
-    def made(run):
-        plan = Pickled.from_value((f"{run}.scene-1", (), packed, "numpy"))
-        return rigs.rig_of(f"{run}.0-2", plan, scene)
-
-    assert made("a") is rigs.rig_of("a.0-2")
-    rigs.drop_all("a")
-    assert made("a").survey.steps == 14  # of a task that is under way yet
-    with pytest.raises(rigs.RigMissing):
-        rigs.rig_of("a.0-2")
-    assert made("b") is rigs.rig_of("b.0-2")
-    rigs.drop_all("b")

@@ -21,7 +21,7 @@ FLAGS = {kind: (*flags(64, *kind), AS_CUPY) for kind in product((False, True), r
 
 @pytest.fixture(scope="module")
 def nvcc():
-    """The newest nvcc: that of the package nvidia-cuda-nvcc, which is not in PATH, or the system's."""
+    """The newest nvcc: of the package nvidia-cuda-nvcc, which is not in PATH, or the system's."""
     packages = Path(sysconfig.get_path("purelib"), "nvidia").glob("cu*/bin/nvcc")
     places = [*map(str, sorted(packages, reverse=True)), "nvcc", "/usr/local/cuda/bin/nvcc"]
     compiler = next(filter(None, map(shutil.which, places)), None)
