@@ -31,17 +31,19 @@ os.environ |= {
     "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
 }
 
-# Tests that need no Dask: machines with a GPU often have few packages and no network. Those of
-# raybeam need NumPy alone.
-_WITHOUT_DASK = ("raybeam", *(["lidarsim/test_device.py"] if find_spec("pydantic") else []))
+# Folders and files of tests that need no Dask: machines with a GPU often have few packages and no
+# network. Those of raybeam need NumPy alone.
+_OF_LIDARSIM = ("lidarsim", "lidarsim/test_device.py", "lidarsim/test_gpu_benchmarks.py")
+_WITHOUT_DASK = ("raybeam", *(_OF_LIDARSIM if find_spec("pydantic") else ()))
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
     """Leave out tests that need Dask where it is not installed."""
-    if find_spec("distributed") is not None or collection_path.suffix != ".py":
+    if find_spec("distributed") is not None:
         return None
     place = collection_path.relative_to(Path(__file__).parent).as_posix()
-    return None if place.startswith(_WITHOUT_DASK) or "/" not in place else True
+    left_in = place in (".", *_WITHOUT_DASK) or place.startswith("raybeam/")
+    return None if left_in else True
 
 
 # Dask's own clusters look this long after each death whether the worker is there, and give it up

@@ -13,6 +13,7 @@ times of the rays. A shape that deforms has frames: vertices at known times (def
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints
+from .backend import BackendUnavailable
 from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, TimedBodies
 from .deforming import Deforming
@@ -103,7 +105,14 @@ def hits_on(
     limits
         float64 (n,): distance before which a hit of each ray counts, metres; None for the limit of
         the scan.
+
+    Raises
+    ------
+    BackendUnavailable
+        If numba is not installed.
     """
+    if importlib.util.find_spec("numba") is None:
+        raise BackendUnavailable("Bodies that move need numba: pip install numba.")
     from . import moving_loops as loops  # numba takes half a second to import
 
     end = float(np.nextafter(scan.t_max, np.inf))  # t_max counts

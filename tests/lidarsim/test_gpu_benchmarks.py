@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -96,3 +98,17 @@ def test_a_section_that_dies_is_named(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setattr(gpu.sys, "executable", str(script))
     assert gpu.apart("moving", ["--quick"], 30) == {"error": "its process ended with -9"}
+
+
+def test_what_a_device_is_tested_with_needs_no_dask():
+    """Machines with a GPU often have few packages and no network."""
+    script = (
+        "import sys, pytest; sys.modules.update(dict.fromkeys(['dask', 'distributed', 'open3d']));"
+        "sys.exit(pytest.main(['--collect-only', '-q', '-m', 'gpu', 'tests']))"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    for name in ("raybeam/test_cast", "lidarsim/test_device", "lidarsim/test_gpu_benchmarks"):
+        assert f"tests/{name}.py" in done.stdout
+    assert "tests/lidarpool" not in done.stdout

@@ -1,5 +1,6 @@
 """Bodies that move: hits are those of each ray on each body, where that is at the ray's time."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from raybeam import (
 )
 from raybeam import moving as module
 from raybeam.pattern_rays import checked_rays
+
+pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
 
 RAYS = 3_000
 PERIOD = 0.1

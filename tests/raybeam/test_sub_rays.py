@@ -114,6 +114,7 @@ def test_offsets_add_to_the_angles_of_each_beam():
 
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])
 def test_sub_rays_hit_what_moves(shapes, kind):
+    pytest.importorskip("numba")
     """Bodies that stand are hit where the same shape is."""
     rng = np.random.default_rng(8)
     shape = RayCaster(*(mesh := shapes["vase"]()), backend="numpy")
