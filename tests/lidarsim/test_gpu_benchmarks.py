@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks import gpu, gpu_points, gpu_rays, instances
-from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
+from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
 from raybeam import available_backends
 
