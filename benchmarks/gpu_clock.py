@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import shutil
 import statistics
@@ -18,6 +19,7 @@ import numpy as np
 # times that something is measured
 _LEAST = 3
 _MOST = 50
+_BATCH_MS = 50  # of the device: short launches are repeated, until its clock has settled
 _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
 
 
@@ -56,20 +58,26 @@ class Session:
 
 
 def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, float]:
-    """Return median, least and greatest time of a launch on the device, by events."""
-    events = session.cupy.cuda.Event
-    launch()
+    """Return median, least and greatest time of a launch on the device, by events.
 
-    def once() -> float:
+    A time is the mean of a batch of launches that takes at least 50 ms, or `seconds` of the sizes.
+    """
+    events = session.cupy.cuda.Event
+
+    def batch(count: int) -> float:
         start = events()
         stop = events()
         start.record()
-        launch()
+        for _ in range(count):
+            launch()
         stop.record()
         stop.synchronize()
-        return float(session.cupy.cuda.get_elapsed_time(start, stop))
+        return float(session.cupy.cuda.get_elapsed_time(start, stop)) / count
 
-    return _repeated(session, once)
+    launch()
+    batch_ms = min(_BATCH_MS, 1e3 * session.sizes.seconds)
+    count = math.ceil(batch_ms / batch(1))
+    return {**_repeated(session, lambda: batch(count)), "launches": count}
 
 
 def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str, float]:
@@ -88,6 +96,7 @@ def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str,
 
 
 def _repeated(session: Session, once: Callable[[], float]) -> dict[str, float]:
+    """Return median, least and greatest of times that `once` returns, milliseconds."""
     end = time.monotonic() + session.sizes.seconds
     times = [once()]
     while len(times) < _LEAST or (len(times) < _MOST and time.monotonic() < end):

@@ -45,7 +45,7 @@ class CudaBackend(Backend):
 
     name: ClassVar[str] = "cuda"
     on_device: ClassVar[bool] = True
-    # Rays: some 300 MB on the device, and while columns are copied again as much. Grid, sums of
+    # Rays: some 500 MB on the device, and 300 MB more while columns are copied. Grid, sums of
     # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
     # 64 bits.
     chunk: ClassVar[int] = 1 << 21
