@@ -75,12 +75,24 @@ class Backend(ABC):
         """Return the versions that the bits of results depend on, besides NumPy's; "" for none."""
         return ""
 
+    @classmethod
+    def limit_memory(cls, device: int | None, share: float) -> None:  # noqa: B027 - none to limit
+        """Have this process take at most a share of a device's memory; without a device, nothing.
+
+        A share of 1 or more sets no limit.
+        """
+
     def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:
         self._scene = scene
 
     def update_scene(self, scene: Scene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
         self._scene = scene
+
+    @property
+    def device_lost(self) -> bool:
+        """Whether the device answers no call of this process any more, after an error of it."""
+        return False
 
     @abstractmethod
     def closest(self, rays: Rays) -> ClosestHits:

@@ -141,6 +141,11 @@ class RayCaster:
         return self._engine.on_device
 
     @property
+    def device_lost(self) -> bool:
+        """Whether a CUDA device answers no call of this process any more, after an error of it."""
+        return self._engine.device_lost
+
+    @property
     def face_count(self) -> int:
         """Number of triangles of all meshes, triangles without an area included."""
         return self._scene.face_count

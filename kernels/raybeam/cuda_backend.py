@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import importlib.util
+import os
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, ClassVar, cast
@@ -74,6 +75,20 @@ class CudaBackend(Backend):
             return "CuPy finds no CUDA headers: pip install 'cupy-cuda13x[ctk]', or 12x"
         return ""
 
+    @classmethod
+    def limit_memory(cls, device: int | None, share: float) -> None:
+        """Have this process take at most a share of a device's memory.
+
+        CuPy keeps the memory that it has freed: without a limit, the first process on a device
+        leaves none to the others. A share of 1 or more sets no limit, and a limit of the user
+        (CUPY_GPU_MEMORY_LIMIT) stays.
+        """
+        if share >= 1 or "CUPY_GPU_MEMORY_LIMIT" in os.environ:
+            return
+        cupy = cls.load_cupy()
+        with _device(cupy, device):
+            cupy.get_default_memory_pool().set_limit(fraction=share)
+
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
         super().__init__(scene, threads, device)
         self._cupy = cupy = self.load_cupy()
@@ -113,6 +128,19 @@ class CudaBackend(Backend):
             )
             tables = (layout.frame, layout.top, layout.instances)
             self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
+
+    @property
+    def device_lost(self) -> bool:
+        """Whether the device answers no call of this process any more.
+
+        After an illegal address or an uncorrectable error of memory, all calls of CUDA fail until
+        the process ends; after a lack of memory, they do not.
+        """
+        try:
+            self._device.synchronize()
+        except self._cupy.cuda.runtime.CUDARuntimeError:
+            return True
+        return False
 
     @staticmethod
     def load_cupy() -> Any:

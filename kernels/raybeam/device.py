@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from numpy.typing import DTypeLike
 from .arrays import AnyArray, Floats, Ints32, UInts32
 from .hits import Part
 
+PINNED_BYTES = 1 << 30  # page-locked, of all outboxes of a process
 _MAX_PENDING = 2  # copies: a copy runs while the arrays of the next are computed
 
 
@@ -87,6 +90,29 @@ def to_device(cupy: Any, array: AnyArray) -> Any:
     return copy
 
 
+class _Pinned:
+    """Count of page-locked bytes in use by this process; threads may share it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # a finalizer may run while its thread holds the lock
+        self._bytes = 0
+
+    def take(self, size: int) -> bool:
+        """Count bytes and return True, unless there would be too many."""
+        with self._lock:
+            fits = self._bytes + size <= PINNED_BYTES
+            self._bytes += size * fits
+            return fits
+
+    def give_back(self, size: int) -> None:
+        """Count bytes that are no longer in use."""
+        with self._lock:
+            self._bytes -= size
+
+
+_pinned = _Pinned()
+
+
 class Outbox:
     """Queue of copies of arrays to the host, in a separate stream, while the device goes on.
 
@@ -105,11 +131,21 @@ class Outbox:
     def room(self, count: int, kind: DTypeLike) -> AnyArray:
         """Return an array (count,) in page-locked memory, to which the device can write directly.
 
-        The memory goes back to CuPy's pool when the last view of it has gone.
+        The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
+        `PINNED_BYTES`, further arrays are in ordinary memory, to which copies take longer: memory
+        that is page-locked is lost to all other processes of the machine.
         """
-        size = count * np.dtype(kind).itemsize
-        memory = self._cupy.cuda.alloc_pinned_memory(max(size, 1))
-        return np.frombuffer(memory, kind, count)
+        size = max(count * np.dtype(kind).itemsize, 1)
+        if not _pinned.take(size):
+            return np.empty(count, kind)
+        try:
+            memory = self._cupy.cuda.alloc_pinned_memory(size)
+        except BaseException:
+            _pinned.give_back(size)
+            raise
+        array = np.frombuffer(memory, kind, count)
+        weakref.finalize(array, _pinned.give_back, size)  # views of the array keep the array
+        return array
 
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
         """Start to copy arrays that the current stream computes: pairs of source and target.

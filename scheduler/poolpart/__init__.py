@@ -1,6 +1,6 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from .devices import own_device
+from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .mapping import Results
 from .partition import Partition
@@ -25,6 +25,7 @@ __all__ = [
     "n_workers",
     "named",
     "own_device",
+    "own_device_share",
     "per_gpu",
     "per_host",
     "rest",

@@ -60,6 +60,21 @@ def own_device() -> int | None:
     return _own[address]
 
 
+@telling_departure()
+def own_device_share() -> float:
+    """Share of its device's memory that this task's worker may take: 1 if no other uses the device.
+
+    The workers of a partition and host that see as many devices share these evenly; they count as
+    soon as they have joined. Errors are those of `own_device`.
+    """
+    if own_device() is None:
+        return 1.0
+    address = get_worker().address
+    gpus = probe.visible_gpus()
+    sharers: int = on_scheduler(own_client(), count_sharers, address=address, gpus=gpus)
+    return 1 / sharers
+
+
 # -- on the scheduler ------------------------------------------------------------------
 
 
@@ -71,6 +86,22 @@ def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
     if _HELD not in worker.extra:
         worker.extra[_HELD] = _least_used(dask_scheduler, worker, gpus)
     return gpus.index(worker.extra[_HELD])
+
+
+def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int:
+    """Return the number of workers that use a worker's device, or are about to; at least 1."""
+    worker = dask_scheduler.workers.get(address)
+    if worker is None:
+        return 1
+    partitions = _partitions(worker)
+    peers = [
+        peer
+        for peer in dask_scheduler.workers.values()
+        if peer.host == worker.host and not partitions.isdisjoint(_partitions(peer))
+    ]
+    held = worker.extra.get(_HELD)
+    users = sum(peer.extra.get(_HELD) == held for peer in dask_scheduler.workers.values())
+    return max(1, users, -(-len(peers) // len(gpus)))
 
 
 def _least_used(scheduler: Any, worker: Any, gpus: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.clusters import QUIET, cluster_of
 
-from poolpart import Pool, devices, own_device, probe
+from poolpart import Pool, devices, own_device, own_device_share, probe
 
 # Each worker sees two devices.
 PRELOAD = """
@@ -23,7 +23,9 @@ probe.visible_gpus = lambda: ("x", "y")
 def scheduler_of(**partitions):
     """What the choice needs of a scheduler; the workers' partitions by address."""
     workers = {
-        address: SimpleNamespace(address=address, extra={}, resources=dict.fromkeys(names, 1))
+        address: SimpleNamespace(
+            address=address, host="here", extra={}, resources=dict.fromkeys(names, 1)
+        )
         for address, names in partitions.items()
     }
     return SimpleNamespace(workers=workers)
@@ -71,10 +73,34 @@ def test_shared_evenly_whatever_the_order_of_the_lists_and_whoever_is_restarted(
     assert max(counts) - min(counts) <= 1
 
 
+@pytest.mark.parametrize(
+    ("partitions", "visible", "sharers"),
+    [
+        ({"a": "P"}, "xy", 1),
+        ({"a": "P", "b": "P"}, "xy", 1),
+        ({"a": "P", "b": "P", "c": "P"}, "xy", 2),  # before the others have asked
+        ({"a": "P", "b": "P", "c": "Q"}, "x", 2),
+    ],
+)
+def test_workers_of_a_partition_and_host_share_the_memory(partitions, visible, sharers):
+    scheduler = scheduler_of(**partitions)
+    assign(scheduler, a=visible)
+    counted = devices.count_sharers("a", visible, dask_scheduler=scheduler)
+    assert counted == sharers
+    assert devices.count_sharers("gone", visible, dask_scheduler=scheduler) == 1
+
+
+def test_workers_of_several_partitions_on_a_device_share_its_memory():
+    scheduler = scheduler_of(a="P", b="Q")
+    assign(scheduler, a="x", b="x")
+    assert devices.count_sharers("a", "x", dask_scheduler=scheduler) == 2
+
+
 def test_without_a_driver_nobody_is_asked(start, monkeypatch):
     monkeypatch.setattr(probe, "visible_gpus", lambda: ())
     client = start({"a": {}})
     assert client.submit(own_device).result() is None
+    assert client.submit(own_device_share).result() == 1
     assert client.cluster.scheduler.workers.popitem()[1].extra == {}
     with pytest.raises(ValueError, match="worker"):
         own_device()

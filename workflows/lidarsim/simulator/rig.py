@@ -186,6 +186,11 @@ class Rig:
         """Name of the ray-casting backend in use."""
         return self.scene_caster.backend
 
+    @property
+    def device_lost(self) -> bool:
+        """Whether a CUDA device answers no call of this process any more, after an error of it."""
+        return self.scene_caster.caster.device_lost
+
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings `first` to `stop` of sensor `number`, in the carrier's frame.
 

@@ -26,13 +26,14 @@ from poolpart.workers import worker_identities
 from ...base.shared_memory import Pickled, SharedHandle, SharedValue
 from ...base.software import difference, software_query
 from .batches import Outcome
-from .failures import JobError, error_of, memory_clause, raise_if_failed, was_killed
+from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .messages import BatchRange
 from .names import INTERSECT
 from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
 
 LOOK_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
+LOST_DEVICES = 3  # processes that may lose their GPU in a run, and the last ends it
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # for workers to drop their rigs
@@ -108,6 +109,7 @@ class CastingWorkers:
         self._requested_slots = -1  # as the scheduler knows
         self._adapts = True  # False once the partition is known not to adapt to requests
         self.notes: list[str] = []  # notes for the user
+        self._lost_devices: set[str] = set()  # processes whose GPU answers no more
 
     @property
     def slots(self) -> dict[str, int]:
@@ -256,6 +258,9 @@ class CastingWorkers:
                 if isinstance(error, MemoryUnseen):
                     payload.blind.add(worker)
             return Outcome.NO_RIG
+        if isinstance(error, DeviceLost):
+            self._count_lost_device(error, worker)
+            return Outcome.DIED
         if was_killed(future):
             return Outcome.DIED
         if status == "error" and len(jobs) > 1:
@@ -263,6 +268,25 @@ class CastingWorkers:
         activity = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
         raise_if_failed(future, activity, JobError)  # the message names the scans
         return Outcome.PENDING
+
+    def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
+        """Note that a worker has lost its GPU; LidarError if that happens again and again."""
+        if error.process in self._lost_devices:
+            return
+        self._lost_devices.add(error.process)
+        self._checked.pop(worker, None)  # until its process ends; the next has another address
+        self._refused[worker] = "its GPU answers no call any more"
+        self.notes.append(f"The GPU of {worker} answered no call any more ({error}).")
+        if not error.restarts:
+            raise LidarError(
+                f"The GPU of {worker} answers no call any more, and no nanny restarts the worker: "
+                f"start it anew and continue with --resume ({error})."
+            )
+        if len(self._lost_devices) >= LOST_DEVICES:
+            raise LidarError(
+                f"GPUs of workers have failed {LOST_DEVICES} times, the last of {worker}: look at "
+                f"nvidia-smi and dmesg there, then continue with --resume ({error})."
+            )
 
     def forget(self, key: str) -> None:
         """Cancel a casting task, or drop its result."""

@@ -24,6 +24,19 @@ class ScanError(RuntimeError):
     """Error while scans are described, cast or packed; the message names the scans."""
 
 
+class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened
+    """Error of a GPU after which it answers no call of the worker's process any more."""
+
+    def __init__(self, reason: str, process: str, restarts: bool) -> None:
+        super().__init__(reason, process, restarts)
+        self.reason = reason
+        self.process = process  # identifies the process
+        self.restarts = restarts  # whether a nanny starts another process
+
+    def __str__(self) -> str:
+        return self.reason
+
+
 @contextmanager
 def naming_scans(first: int, stop: int) -> Iterator[None]:
     """Prefix the message of any error with the current scans.

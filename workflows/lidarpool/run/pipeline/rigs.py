@@ -9,11 +9,14 @@ tree again.
 
 from __future__ import annotations
 
+import logging
+import os
 import pickle
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,17 +31,21 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.device import DevicePoints
 from lidarsim.simulator.points import BatchPoints
 from lidarsim.simulator.rig import Rig
-from poolpart import own_device
+from poolpart import own_device, own_device_share
+from raybeam.registry import choose
 
 from ...base.shared_memory import Pickled, SharedHandle
 from ...base.tracing import trace
-from .failures import naming_scans
+from .failures import DeviceLost, ScanError, naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
 from .placement import Recorder, TaskRecord
 
+logger = logging.getLogger(__name__)
+
 Packed = Pickled | SharedHandle  # a plan or a scene, as it comes from the driver
 
+LEAVE_S = 2.0  # from the error of a GPU to the end of its process: the driver knows it by then
 UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
 
 
@@ -106,7 +113,10 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
         elif scene is not None:
             static_scene: Scene = _unpickled(scene)
             threads = get_worker().state.nthreads
-            rig = Rig(static_scene.with_actors(actors), survey, backend, threads, own_device())
+            device = own_device()
+            if device is not None:
+                choose(backend).limit_memory(device, own_device_share())
+            rig = Rig(static_scene.with_actors(actors), survey, backend, threads, device)
         else:
             raise RigMissing(f"This worker has no scene {name!r}.")
     except RigMissing:
@@ -193,7 +203,7 @@ def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
     trace("intersect.start", **fields, scans=scans)
-    with naming_scans(first, stop):
+    with leaving_with_device(rig), naming_scans(first, stop):
         batches = list(rig.cast(first, stop))
         trace("intersect.cast", **fields, scans=scans)
         part = replace(
@@ -204,6 +214,26 @@ def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     batch = CastBatch(work.job, part, recorder.finish(stop - first))
     trace("intersect.end", **fields, scans=scans)
     return batch
+
+
+@contextmanager
+def leaving_with_device(rig: Rig) -> Iterator[None]:
+    """Raise DeviceLost for an error after which the rig's GPU does not answer, and end the process.
+
+    A nanny starts another process, whose calls the GPU answers. Without a nanny the process stays,
+    since it may be that of the user.
+    """
+    try:
+        yield
+    except ScanError as error:
+        if not rig.device_lost:
+            raise
+        worker = get_worker()
+        restarts = worker.nanny is not None
+        logger.error("The GPU answers no call of this process any more: %s", error)
+        if restarts:  # when the error has been sent
+            threading.Timer(LEAVE_S, os._exit, [1]).start()
+        raise DeviceLost(str(error), f"{worker.address} {os.getpid()}", restarts) from None
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
