@@ -75,8 +75,8 @@ class Backend(ABC):
         """Return the versions that the bits of results depend on, besides NumPy's; "" for none."""
         return ""
 
-    @classmethod
-    def limit_memory(cls, device: int | None, share: float) -> None:  # noqa: B027 - none to limit
+    @classmethod  # noqa: B027 - other backends have nothing to limit
+    def limit_memory(cls, device: int | None, share: float) -> None:
         """Have this process take at most a share of a device's memory; without a device, nothing.
 
         A share of 1 or more sets no limit.

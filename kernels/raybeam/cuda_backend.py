@@ -214,11 +214,11 @@ class CudaBackend(Backend):
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
             for start, stop in scan.chunks(self.chunk):
-                table = self._make_rays(scan, start, stop)
-                hits = self._cast(table, stop - start, (scan.t_min, scan.t_max))
+                rays = self._make_rays(scan, start, stop)
+                hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
                 replacing = self._replace(hits, start, stop - start, other_hits)
                 packed = self._pack(hits, start, groups, scene.frame.scale, counting, replacing)
-                use(DeviceHits(*packed, cp, partial(_listed_rays, start, table)))
+                use(DeviceHits(*packed, cp, partial(_listed_rays, start, rays)))
             return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
     def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
@@ -336,8 +336,8 @@ class CudaBackend(Backend):
         if tables is None:
             arrays = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
-            tables = [to_device(self._cupy, array.T) for array in arrays if array is not None]
-            tables = self._patterns[pattern] = (tables[0], tables[-1])
+            copies = [to_device(self._cupy, array.T) for array in arrays if array is not None]
+            tables = self._patterns[pattern] = (copies[0], copies[-1])
         return tables
 
     def _cast(
