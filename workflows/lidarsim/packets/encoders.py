@@ -155,6 +155,7 @@ class PacketEncoder(ABC):
 
 # {format of packets: module and class of its encoder}
 ENCODERS = {
+    "hesai": "lidarsim.packets.hesai:HesaiEncoder",
     "ouster": "lidarsim.packets.ouster:OusterEncoder",
     "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
 }

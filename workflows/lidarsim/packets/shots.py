@@ -138,6 +138,18 @@ def settings_of(sensor: Sensor) -> PacketSettings:
     return sensor.packets
 
 
+def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
+    """Return the last and the strongest returns of the mode dual: two arrays (n, c).
+
+    `values` (r, n, c) are in the order of `Shots`, `returned` (r, n, c) whether a return is sent.
+    Where the last return is the strongest, the second array has the second strongest; an only
+    return is in both.
+    """
+    if len(values) == 1:
+        return [values[0], values[0]]
+    return [np.where(returned[1], values[1], values[0]), values[0]]
+
+
 class CarryOver:
     """Firings that fill no packet yet: a revolution is not a whole number of packets."""
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Ints
+from ..base.arrays import AnyArray, Ints
 from .encoders import Datagrams, PacketEncoder, PacketSource
-from .shots import CarryOver, Shots
+from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
 
 DATA_PORT = 2368
@@ -110,8 +110,8 @@ class VelodyneEncoder(PacketEncoder):
         reflectivities = shots.columns["reflectivity"] * fits
         shape = len(blocks), -1, 1, _BLOCK_LASERS
         for name, values in (("distance", distances), ("reflectivity", reflectivities)):
-            planes = [plane.reshape(shape) for plane in self._planes_of(values, fits)]
-            interleaved = np.concatenate(planes, axis=2)
+            planes = last_and_strongest(values, fits) if self._planes == 2 else [values[0]]
+            interleaved = np.concatenate([plane.reshape(shape) for plane in planes], axis=2)
             blocks["returns"][name][:, :used] = interleaved.reshape(len(blocks), used, -1)
         banks = max(1, channels // _BLOCK_LASERS)
         blocks["flag"] = _UNUSED
@@ -121,11 +121,3 @@ class VelodyneEncoder(PacketEncoder):
         firing = np.arange(used) // self._planes * _BLOCK_LASERS // channels
         blocks["azimuth"][:, :used] = by_firing[:, firing]
         blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers take the last block's
-
-    def _planes_of(self, values: AnyArray, returned: Bools) -> list[AnyArray]:
-        """Return values (r, n, c) in the order of blocks: (n, c) for each block of a firing."""
-        if self._planes == 1:
-            return [values[0]]
-        if len(values) == 1:
-            return [values[0], values[0]]
-        return [np.where(returned[1], values[1], values[0]), values[0]]
