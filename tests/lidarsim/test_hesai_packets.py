@@ -145,7 +145,7 @@ def crc_of(data):
     return crc
 
 
-def check_packet(data, manual, mode, number):
+def check_packet(data, manual, mode, number, rate_hz):
     """Assert the fields of a packet that hold no returns."""
     assert len(data) == manual.size
     header = bytearray(manual.header)
@@ -155,7 +155,9 @@ def check_packet(data, manual, mode, number):
     assert data[manual.mode_at] == MODES[mode]
     assert struct.unpack_from("<I", data, manual.sequence_at)[0] == number
     assert 0x42 in data[manual.mode_at :]  # factory
-    assert struct.pack("<H", 600) in data[manual.size - 60 :]  # revolutions a minute
+    assert (
+        struct.pack("<H", round(60 * rate_hz)) in data[manual.size - 60 :]
+    )  # revolutions a minute
     if manual.channels == 128:
         state = data[788:805]
         assert state[1] >> 5 == 1 and not any(state[2:5])
@@ -164,7 +166,9 @@ def check_packet(data, manual, mode, number):
         assert data[816] == 2 and data[814:816] == b"\0\0"  # all lasers fire in each block
 
 
-def plain_rows(payloads, model: str, mode: str, first_number: int = 1) -> list[Row]:
+def plain_rows(
+    payloads, model: str, mode: str, first_number: int = 1, rate_hz: float = RATE_HZ
+) -> list[Row]:
     """Return the returns of data packets, read field by field."""
     manual = MODELS[model]
     times_us = laser_us(model)
@@ -174,7 +178,7 @@ def plain_rows(payloads, model: str, mode: str, first_number: int = 1) -> list[R
     rows = []
     for number, payload in enumerate(payloads):
         data = payload.tobytes()
-        check_packet(data, manual, mode, first_number + number)
+        check_packet(data, manual, mode, first_number + number, rate_hz)
         reference_us = stamp_us(data, manual) + manual.reference_us
         for firing in range(firings):
             starts = [
@@ -203,7 +207,7 @@ def plain_rows(payloads, model: str, mode: str, first_number: int = 1) -> list[R
                             units * UNIT_M,
                             reflectivity,
                             azimuth / 100 + azimuths_deg[laser]
-                            + 360 * RATE_HZ * times_us[laser] / 1e6,
+                            + 360 * rate_hz * times_us[laser] / 1e6,
                             reference_us + periods * manual.firing_us + times_us[laser],
                         )
                     )  # fmt: skip
@@ -354,3 +358,193 @@ FIELDS = [
 def test_a_fault_of_a_packet_is_detected(model, mode, field):
     with pytest.raises(AssertionError):
         check(mutated(payloads_of(model, mode), model, field), model, mode)
+
+
+def synthetic_shots(model, count=60):
+    """Return shots whose returns follow from their numbers, without casting."""
+    manual = MODELS[model]
+    firings = np.arange(count)
+    number = np.arange(2 * count * manual.channels).reshape(2, count, manual.channels)
+    range_m = (100 + number * 7919 % 14_000) * UNIT_M
+    range_m[0, 2::5] = np.nan  # firings without a return
+    range_m[1, (firings % 3 > 0) | (firings % 5 == 2)] = np.nan
+    starts_ns = np.rint(firings * manual.firing_us * 1000).astype(np.int64)
+    return load_sensor(f"hesai/{model}"), Shots(
+        firings=firings,
+        starts_ns=starts_ns,
+        stamps_ns=starts_ns,
+        azimuths=np.radians(90 - 350 - 360 * RATE_HZ * starts_ns / 1e9),
+        dropped=np.zeros(count, bool),
+        range_m=range_m.astype(np.float32),
+        columns={"reflectivity": (number % 251).astype(np.uint8)},
+    )
+
+
+# What HesaiLidar_SDK_2.0 (November 2025) reads of the synthetic shots, in the mode dual, of
+# PandarQT in the mode last: packets, points with a range, sums of reflectivity, of lasers, and of
+# ranges in units; and the start of the SHA-256 of the packets that it read.
+RECORDED = {
+    "xt32": (15, 3072, 380982, 47616, 21760656, "a45ed8f173568d08"),
+    "pandar40p": (12, 3840, 470986, 74880, 27245520, "882f1598e2a7ab32"),
+    "pandar64": (20, 6144, 753920, 193536, 43681392, "c20b8f4fdd641a7b"),
+    "pandarqt": (15, 3072, 374955, 96768, 21818176, "a520f7a2a819dc1d"),
+    "pandar128": (60, 12288, 1539920, 780288, 87177104, "6d83500786a7d5e4"),
+    "ot128": (60, 12288, 1539920, 780288, 87177104, "4a77bf6a7de17381"),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_packets_are_those_that_the_sdk_has_read(model):
+    sensor, shots = synthetic_shots(model)
+    mode = "last" if model == "pandarqt" else "dual"
+    encoder = encoder_of(PacketSource(sensor, mode))
+    payloads = data_of(encoder.encode(shots[:13]) + encoder.encode(shots[13:]))
+    rows = np.array(plain_rows(payloads, model, mode))
+    rows = np.concatenate([rows, rows[rows[:, 2] == BOTH]])  # the SDK keeps both
+    sums = rows[:, 4].sum(), rows[:, 1].sum(), np.rint(rows[:, 3] / UNIT_M).sum()
+    digest = hashlib.sha256(payloads.tobytes()).hexdigest()[:16]
+    assert (len(payloads), len(rows), *map(int, sums), digest) == RECORDED[model]
+
+
+def moving_survey(rate_hz=10, **options):
+    """Return a survey of a sensor that drives and turns for two revolutions and a half."""
+    times = np.linspace(0, 0.3, 16)
+    yaw = 0.8 * times
+    positions = np.stack([5 * times - 1, 0.2 * times, 0.1 * np.sin(9 * times)], axis=1)
+    turns = np.stack([0 * yaw, 0.03 * np.sin(7 * times), np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    options = {"steps": 90, "columns": COLUMNS, "keep_every": 1, "precision_m": 1e-6} | options
+    sensor = load_sensor("hesai/xt32", rate_hz=rate_hz)
+    return Survey(
+        sensors=[Mounted(sensor, Pose((0.5, 0.0, 0.0), 20.0), "lidar")],
+        trajectory=Track(times, positions, turns, smooth=True), coordinates="sensor", **options,
+    )  # fmt: skip
+
+
+def fields_of(payloads, position, kind="<u4"):
+    size = int(kind[-1])
+    return payloads[:, position : position + size].copy().view(kind)[:, 0].astype(int)
+
+
+def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
+    """At 7 Hz, a revolution of 2,857.1 firings is not a whole number of packets of 8."""
+    survey = moving_survey(rate_hz=7, steps=40)
+    cloud, sweeps = points_of(survey, room())
+    payloads = data_of(encoded(cloud, sweeps))
+    assert len(payloads) == survey.carried[0].sensor.firings(39)[1] // 8
+    rows = np.array(plain_rows(payloads[350:365], "xt32", "strongest", 351, rate_hz=7))
+    assert len(rows) == 15 * 8 * 32  # in a closed room
+    firing = cloud["time"] // 50_000
+    expected = cloud[(firing >= 350 * 8) & (firing < 365 * 8)]
+    expected = expected[np.lexsort((31 - expected["channel"], expected["time"] // 50_000))]
+    assert rows[:, 3] == pytest.approx(expected["range"], abs=UNIT_M / 2 + 1e-5)
+    assert rows[:, 6] == pytest.approx(expected["time"] / 1000, abs=0.505)
+    turned = rows[:, 5] - (90 - expected["azimuth"]) + 180
+    assert turned % 360 - 180 == pytest.approx(0, abs=0.0051)
+
+
+def test_dropped_packets_are_gaps_in_the_sequence():
+    fault = Fault("dropped_packets", from_s=0.05, share=0.3, packet=8)
+    survey = moving_survey(faults=[fault])
+    cloud, sweeps = points_of(survey, room())
+    payloads = data_of(encoded(cloud, sweeps))
+    numbers = fields_of(payloads, 1076)
+    in_cloud = np.unique(cloud["time"] // (8 * 50_000))
+    assert (numbers - 1).tolist() == in_cloud[in_cloud < 625].tolist()
+    assert 0.2 < (625 - len(numbers)) / 500 < 0.4 and numbers[:125].tolist() == [*range(1, 126)]
+
+
+def test_a_jump_of_the_clock_is_in_the_stamps():
+    survey = moving_survey(faults=[Fault("time_jump", from_s=0.1, by_s=0.02)])
+    cloud, sweeps = points_of(survey, room())
+    groups = encoded(cloud, sweeps)
+    stamps = [stamp_us(payload.tobytes(), MODELS["xt32"]) for payload in data_of(groups)]
+    assert sorted(set(np.diff(stamps).tolist())) == [400, 20_400]
+    due_ns = np.concatenate([group.due_ns for group in groups])
+    assert set(np.diff(due_ns)) == {400_000}
+
+
+def test_ranges_that_a_packet_cannot_hold_are_no_returns():
+    sensor, shots = synthetic_shots("xt32", 8)
+    range_m = np.full_like(shots.range_m, np.nan)
+    range_m[0] = 65_535 * UNIT_M
+    range_m[0, 4] = 65_535.6 * UNIT_M
+    range_m[0, 5] = 0.0019
+    encoder = encoder_of(PacketSource(sensor, "strongest"))
+    shots = replace(shots, range_m=range_m, columns={"reflectivity": np.uint8(7) + 0 * range_m})
+    rows = plain_rows(data_of(encoder.encode(shots)), "xt32", "strongest")
+    assert {row.firing for row in rows} == {*range(8)} - {4, 5}
+    assert {row.range_m for row in rows} == {65_535 * UNIT_M}
+
+
+@pytest.mark.parametrize("model", ["xt32", "pandar40p", "ot128"])
+def test_dates_are_those_of_the_survey(model):
+    """The leap day, and the second in which the packet's last block is stamped."""
+    sensor, shots = synthetic_shots(model, 40)
+    start = datetime(2028, 2, 29, 23, 59, 59, 999_100, tzinfo=UTC)
+    start_ns = round(start.timestamp() * 1e6) * 1000
+    encoder = encoder_of(PacketSource(sensor, "last", start_ns=start_ns, dated=True))
+    payloads = data_of(encoder.encode(shots))
+    manual = MODELS[model]
+    stamps = [stamp_us(payload.tobytes(), manual) for payload in payloads]
+    periods = manual.blocks * np.arange(1, len(payloads) + 1) - 1
+    since_start = periods * manual.firing_us - manual.first_us - manual.reference_us
+    assert stamps == pytest.approx((start_ns - START_NS) / 1000 + since_start, abs=0.501)
+    dates = {tuple(payload[manual.date_at : manual.date_at + 6].tolist()) for payload in payloads}
+    year = 2028 - manual.epoch
+    assert dates == {(year, 2, 29, 23, 59, 59), (year, 3, 1, 0, 0, 0)}
+
+
+def with_identifiers(sensor, **identifiers):
+    packets = replace(sensor.packets, identifiers={**sensor.packets.identifiers, **identifiers})
+    return replace(sensor, packets=packets)
+
+
+def test_a_ptp_clock_counts_seconds():
+    sensor, shots = synthetic_shots("xt32")
+    sensor = with_identifiers(sensor, clock="ptp")
+    payloads = data_of(encoder_of(PacketSource(sensor, "last")).encode(shots))
+    seconds = START_NS // 10**9
+    assert payloads[:, 1065:1071].tolist() == [[0, 0, *seconds.to_bytes(4, "big")]] * len(payloads)
+
+
+def test_files_beside_the_packets_hold_angles_and_firing_times():
+    files = {model: encoder_of(PacketSource(load_sensor(f"hesai/{model}"), "last")).files()
+             for model in MODELS}  # fmt: skip
+    for model, contents in files.items():
+        head, *rows = contents[".angles.csv"].decode().splitlines()
+        assert head == "Channel,Elevation,Azimuth"
+        numbers = np.array([row.split(",") for row in rows], float)
+        expected = np.column_stack([np.arange(len(rows)) + 1, *lasers_deg(model)])
+        assert numbers == pytest.approx(expected, abs=1e-6)
+    rows = files["pandar40p"][".firetimes.csv"].decode().splitlines()
+    assert rows[0] == "Channel,fire time(us)"
+    assert [rows[1], rows[8], rows[40]] == ["1,-42.22", "8,-54.67", "40,-3.62"]
+    rows = files["ot128"][".firetimes.csv"].decode().splitlines()
+    assert rows[:3] == [
+        "Operational State,0,0,0,0,2,2", "Azimuth State,0,1,2,3,0,1", "1" + 6 * ",46.645"
+    ]  # fmt: skip
+    rows = files["pandar128"][".firetimes.csv"].decode().splitlines()
+    assert rows[1] == "operation mode,0,0,0,0,0,0,0,0,2,2,2,2,3,3,3,3"
+    assert rows[2] == "angle state,0,0,1,1,2,2,3,3,0,0,1,1,0,0,1,1"
+    assert rows[3] == "1" + 16 * ",4436" and rows[4] == "2" + 16 * ",28554"
+
+
+@pytest.mark.parametrize(
+    ("sensor", "mode", "message"),
+    [
+        (load_sensor("hesai/xt32"), "two_strongest", "returns strongest, last, dual, first, not"),
+        (load_sensor("hesai/pandar64"), "first", "have the returns strongest, last, dual, not fir"),
+        (load_sensor("hesai/pandarqt"), "dual", "have the returns last, first, not dual: set ret"),
+        (with_identifiers(load_sensor("hesai/xt32"), model="PandarXT"), "last",
+         "are of the models PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128, OT128, not"),
+        (with_identifiers(load_sensor("hesai/xt32"), model="Pandar64"), "last", "hold 64 lasers"),
+        (with_identifiers(load_sensor("hesai/pandarqt"), model="Pandar64"), "last",
+         "hold firings every 55.56 µs, not 166.67"),
+        (with_identifiers(load_sensor("hesai/xt32"), clock="tai"), "last", "clock gps or ptp, not"),
+        (with_identifiers(load_sensor("hesai/pandar64"), clock="ptp"), "last", "the clock gps, no"),
+    ],
+)  # fmt: skip
+def test_packets_that_cannot_be_made_are_refused(sensor, mode, message):
+    with pytest.raises(LidarError, match=message):
+        encoder_of(PacketSource(sensor, mode))
