@@ -5,7 +5,7 @@ Sources: see hesai_layouts.py.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from ..sensor.beams import Mirror, Spin
 from .encoders import Datagrams, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
 from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, Layout
+from .hesai_ptc import PtcDevice, PtcService
+from .service import Destination
 from .shots import CarryOver, Shots, last_and_strongest
 
 DATA_PORT = 2368
@@ -80,6 +82,29 @@ class HesaiEncoder(PacketEncoder):
             ".firetimes.csv": self._lasers.firetimes_file().encode(),
         }
 
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> PtcService:
+        """Return what answers the commands by which readers get calibration and identity."""
+        files = self.files()
+        device = PtcDevice(
+            name=self.source.name,
+            model_code=self._layout.model_code,
+            lasers=self._layout.channels,
+            rate_rpm=self._rate_rpm,
+            mode=self.source.mode,
+            port=self._port,
+            ptp=self._ptp,
+            calibration=files[".angles.csv"],
+            firetimes=files[".firetimes.csv"],
+        )
+        return PtcService(device, address, destination, send_to)
+
+    @property
+    def _rate_rpm(self) -> int:
+        """Revolutions a minute."""
+        return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
+
     def _layout_of_model(self) -> Layout:
         """Return the layout of the model; LidarError for an unknown model."""
         model = self.text("model")
@@ -120,7 +145,7 @@ class HesaiEncoder(PacketEncoder):
         if layout.header:
             packets["header"] = layout.header_bytes(self._planes == 2)
         self._fill_blocks(packets["blocks"], shots)
-        packets["motor_rpm"] = round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
+        packets["motor_rpm"] = self._rate_rpm
         packets["mode"] = layout.modes[self.source.mode]
         packets["factory"] = _FACTORY
         packets["sequence"] = self._next_number + np.arange(len(packets))
