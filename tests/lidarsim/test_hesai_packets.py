@@ -55,7 +55,6 @@ class Manual:
     stamp_at: int
     date_at: int
     sequence_at: int
-    modes: str = "strongest last dual first"
     epoch: int = 1900
     block_head: int = 2  # bytes before the returns of a block
     return_bytes: int = 3
@@ -78,16 +77,16 @@ MODELS = {
     ),
     "pandar40p": Manual(
         1266, b"", 10, 40, 500 / 9, -54.67, -28.58, mode_at=1254, stamp_at=1250, date_at=1256,
-        sequence_at=1262, modes="strongest last dual", epoch=2000, block_head=4, dual_at=(),
+        sequence_at=1262, epoch=2000, block_head=4, dual_at=(),
     ),
     "pandar64": Manual(
         1198, bytes.fromhex("eeff400600040000"), 6, 64, 500 / 9, -54.668, -42.58, mode_at=1186,
-        stamp_at=1182, date_at=1188, sequence_at=1194, modes="strongest last dual", epoch=2000,
+        stamp_at=1182, date_at=1188, sequence_at=1194, epoch=2000,
         dual_at=(),
     ),
     "pandarqt": Manual(
         1072, bytes.fromhex("eeff03010000400400040101"), 4, 64, 500 / 3, 2.31, 25.71,
-        mode_at=1060, stamp_at=1056, date_at=1062, sequence_at=1068, modes="last first",
+        mode_at=1060, stamp_at=1056, date_at=1062, sequence_at=1068,
         return_bytes=4, first_block=True,
     ),
     "pandar128": Manual(
@@ -99,7 +98,12 @@ MODELS = {
         **NUMBERED_128,
     ),
 }  # fmt: skip
-CASES = [(model, mode) for model, manual in MODELS.items() for mode in manual.modes.split()]
+CASES = [
+    *[(model, "dual") for model in MODELS if model != "pandarqt"],
+    *[("xt32", mode) for mode in ("strongest", "first")],
+    *[(model, "last") for model in ("xt32", "pandar40p", "pandar64", "pandarqt", "ot128")],
+    *[("pandarqt", "first"), ("pandar128", "first")],
+]
 
 
 def laser_us(model):
@@ -228,7 +232,7 @@ def scanned(model: str, mode: str):
     """Return a survey of some degrees, its points and its sweeps."""
     survey = Survey(
         sensor=load_sensor(f"hesai/{model}"), poses=[Pose((0.0, 0.0, 0.0), -40.0)],
-        steps=1 if MODELS[model].channels == 128 else 3,
+        steps={32: 3, 40: 2}.get(MODELS[model].channels, 1) if model != "pandarqt" else 3,
         columns=COLUMNS, keep_every=1, precision_m=1e-6, noise=Noise(range_m=0.02),
         returns=Returns(mode, subrays=7, divergence_mrad=20.0),
     )  # fmt: skip
@@ -528,6 +532,17 @@ def test_files_beside_the_packets_hold_angles_and_firing_times():
     assert rows[1] == "operation mode,0,0,0,0,0,0,0,0,2,2,2,2,3,3,3,3"
     assert rows[2] == "angle state,0,0,1,1,2,2,3,3,0,0,1,1,0,0,1,1"
     assert rows[3] == "1" + 16 * ",4436" and rows[4] == "2" + 16 * ",28554"
+
+
+def test_the_file_of_angles_is_a_calibration(tmp_path):
+    sensor = load_sensor("hesai/pandar64")
+    angles = encoder_of(PacketSource(sensor, "last")).files()[".angles.csv"]
+    (tmp_path / "lidar.angles.csv").write_bytes(angles)
+    calibrated = load_sensor("hesai/pandar64", calibration=tmp_path / "lidar.angles.csv")
+    for name in ("elevation", "azimuth", "time_ns"):
+        values = getattr(calibrated.beams, name)
+        assert values == pytest.approx(getattr(sensor.beams, name), abs=1e-9)
+    assert encoder_of(PacketSource(calibrated, "last")).files()[".angles.csv"] == angles
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ Sources: HesaiLidar_SDK_2.0, folder correction, and the parsers that load the fi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,26 +49,27 @@ class LaserTable(NamedTuple):
 
     def firetimes_file(self) -> str:
         """Return the file of firing times; in all states and distances they are the same."""
-        states = self.layout.lists_states
+        states = self.layout.listed_states
+        times_us = [_decimal(time) for time in self.time_us]
         if not states:
-            lines = [f"{laser},{_decimal(time)}" for laser, time in enumerate(self.time_us, 1)]
-            return "\n".join(["Channel,fire time(us)", *lines, ""])
+            return _table([["Channel", "fire time(us)"]], times_us, 1)
         azimuth_states = [states[:n].count(state) for n, state in enumerate(states)]
-        if len(states) == 8:  # of Pandar128: nanoseconds, far and near
-            columns = [state for state in states for _ in range(2)]
-            heads = [
-                [_NEAR_M, *["distance>=A1", "distance<A1"] * len(states)],
-                ["operation mode", *columns],
-                ["angle state", *[state for state in azimuth_states for _ in range(2)]],
-            ]
-            times = [f"{round(time * 1000)}" for time in self.time_us]
-        else:
-            columns = list(states)
+        if not self.layout.lists_distances:
             heads = [["Operational State", *states], ["Azimuth State", *azimuth_states]]
-            times = [_decimal(time) for time in self.time_us]
-        rows = [[laser, *[time] * len(columns)] for laser, time in enumerate(times, 1)]
-        lines = [",".join(map(str, row)) for row in (*heads, *rows)]
-        return "\n".join([*lines, ""])
+            return _table(heads, times_us, len(states))
+        heads = [
+            [_NEAR_M, *["distance>=A1", "distance<A1"] * len(states)],
+            ["operation mode", *np.repeat(states, 2)],
+            ["angle state", *np.repeat(azimuth_states, 2)],
+        ]
+        times_ns = [f"{round(time * 1000)}" for time in self.time_us]
+        return _table(heads, times_ns, 2 * len(states))
+
+
+def _table(heads: list[list[Any]], times: list[str], columns: int) -> str:
+    """Return a table in which each laser has the same time in some columns."""
+    rows = [[laser, *[time] * columns] for laser, time in enumerate(times, 1)]
+    return "\n".join([*(",".join(map(str, row)) for row in [*heads, *rows]), ""])
 
 
 def _decimal(number: float) -> str:

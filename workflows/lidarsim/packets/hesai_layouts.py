@@ -52,7 +52,8 @@ class Layout:
     stamps_first_block: bool = False  # else the stamp is of the last block
     has_checksums: bool = False  # of body, state and tail
     has_epoch_seconds: bool = True  # whether the date may be seconds since 1970, of a PTP clock
-    lists_states: tuple[int, ...] = ()  # operational state of each column of firing times
+    listed_states: tuple[int, ...] = ()  # operational state of each column of firing times
+    lists_distances: bool = False  # whether each state has columns for far and for near targets
 
     def header_bytes(self, dual: bool) -> Ints:
         """Return the bytes of the header."""
@@ -237,7 +238,8 @@ LAYOUTS = {
         header=_numbered((1, 4), 0, 128, 2, _FLAGS_128),
         dual_header=_DUAL_NUMBERED,
         has_checksums=True,
-        lists_states=(0, 0, 0, 0, 2, 2, 3, 3),
+        listed_states=(0, 0, 0, 0, 2, 2, 3, 3),
+        lists_distances=True,
     ),
     "OT128": Layout(
         channels=128,
@@ -252,6 +254,6 @@ LAYOUTS = {
         header=_numbered((1, 4), _OT128_STATUS, 128, 2, _FLAGS_128),
         dual_header=_DUAL_NUMBERED,
         has_checksums=True,
-        lists_states=(0, 0, 0, 0, 2, 2),
+        listed_states=(0, 0, 0, 0, 2, 2),
     ),
 }
