@@ -123,8 +123,15 @@ def test_peers_that_send_other_bytes_do_not_stop_the_service(asked):
             close(connection)
 
 
-def test_an_address_in_use_is_refused():
+def test_an_address_in_use_is_refused_and_a_default_port_replaced():
     with serving() as (encoder, port):
         service = encoder.service(f"127.0.0.1:{port}", Destination("127.0.0.1", {}), print)
-        with pytest.raises(LidarError, match=f"commands cannot be had at 127.0.0.1:{port}"):
+        with pytest.raises(LidarError, match=f"cannot listen at 127.0.0.1:{port} .*--api"):
             service.__enter__()
+        with contextlib.ExitStack() as stack:
+            services = [
+                stack.enter_context(encoder.service("127.0.0.1", Destination("127.0.0.1"), print))
+                for _ in range(2)
+            ]
+            ports = {service.description.rpartition(":")[2] for service in services}
+            assert len(ports) == 2

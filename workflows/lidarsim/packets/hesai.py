@@ -6,6 +6,7 @@ Sources: see hesai_layouts.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -42,6 +43,7 @@ class HesaiEncoder(PacketEncoder):
 
     identifiers = ("model",)
     optional_identifiers = ("clock",)
+    default_ports: ClassVar[Mapping[str, int]] = {"data": DATA_PORT}
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)

@@ -7,6 +7,7 @@ tier4/nebula, hesai hardware interface.
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import socket
 import threading
@@ -16,7 +17,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from ipaddress import AddressValueError, IPv4Address
-from struct import Struct, error, pack
+from struct import Struct, pack
+from struct import error as StructError
 from typing import Self
 from zlib import crc32
 
@@ -24,7 +26,6 @@ from ..base.errors import LidarError
 from .service import Destination, Service
 
 PTC_PORT = 9347
-_LOOPBACK = "127.0.0.1"
 _MARK = b"\x47\x74"  # first bytes of requests and answers
 _HEADER = Struct(">2sBBI")  # mark, command, code of the answer, bytes that follow
 _MAX_REQUEST_BYTES = 1024
@@ -119,8 +120,7 @@ class PtcService(Service):
     device
         What the answers state.
     address
-        HOST:PORT to listen at, HOST alone for port 9347, or "" for port 9347 of the loopback
-        interface.
+        HOST:PORT to listen at; HOST alone for port 9347, or for a free port if port 9347 is taken.
     destination, send_to
         As of `Service`.
     """
@@ -133,10 +133,10 @@ class PtcService(Service):
         send_to: Callable[[Destination], None],
     ) -> None:
         super().__init__(destination, send_to)
-        host, _, port = address.partition(":")
+        self._host, _, port = address.partition(":")
         self._device = device
-        self._host = host or _LOOPBACK
-        self._port = int(port or PTC_PORT)
+        self._ports = [int(port)] if port else [PTC_PORT, 0]  # to try, of which 0 is a free port
+        self._port = self._ports[0]
         self._started_s = time.monotonic()
         self._connections: dict[asyncio.Task[None], None] = {}  # the longest silent is first
         self._loop: asyncio.AbstractEventLoop
@@ -146,20 +146,10 @@ class PtcService(Service):
     @property
     def description(self) -> str:
         """The address of the commands."""
-        return f"commands (PTC) at {self._host}:{self._port}"
+        return f"Hesai's commands (PTC) at {self._host}:{self._port}"
 
     def __enter__(self) -> Self:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((self._host, self._port))
-            listener.listen(_MAX_CONNECTIONS)
-        except OSError as problem:
-            listener.close()
-            raise LidarError(
-                f"Hesai's commands cannot be had at {self._host}:{self._port} "
-                f"({os.strerror(problem.errno or 0)}): give another address."
-            ) from problem
+        listener = self._listening_socket()
         self._port = listener.getsockname()[1]
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(
@@ -175,6 +165,26 @@ class PtcService(Service):
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+
+    def _listening_socket(self) -> socket.socket:
+        """Return a socket at the address; LidarError if the address cannot be used."""
+        for port in self._ports:
+            listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((self._host, port))
+                listener.listen(_MAX_CONNECTIONS)
+            except OSError as problem:
+                listener.close()
+                if problem.errno == errno.EADDRINUSE and port != self._ports[-1]:
+                    continue
+                raise LidarError(
+                    f"Hesai's commands (PTC) cannot listen at {self._host}:{port} "
+                    f"({os.strerror(problem.errno or 0)}): give another address, such as --api "
+                    "127.0.0.1:9348."
+                ) from problem
+            return listener
+        raise AssertionError("the last port returns or raises")
 
     async def _close(self) -> None:
         """Close the address and all connections."""
@@ -243,7 +253,7 @@ class PtcService(Service):
         try:
             packed, port, _ = _DESTINATION.unpack(parameter)
             host = IPv4Address(packed)
-        except (error, AddressValueError):
+        except (StructError, AddressValueError):
             raise _RefusedError(_INVALID_PARAMETER) from None
         if not port or host.is_multicast or host.is_unspecified:
             raise _RefusedError(_INVALID_PARAMETER)
