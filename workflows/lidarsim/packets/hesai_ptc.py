@@ -16,9 +16,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from ipaddress import AddressValueError, IPv4Address
+from ipaddress import IPv4Address
 from struct import Struct, pack
-from struct import error as StructError
 from typing import Self
 from zlib import crc32
 
@@ -250,11 +249,10 @@ class PtcService(Service):
 
     def _set_destination(self, parameter: bytes) -> bytes:
         """Send datagrams to another address from now on."""
-        try:
-            packed, port, _ = _DESTINATION.unpack(parameter)
-            host = IPv4Address(packed)
-        except (StructError, AddressValueError):
-            raise _RefusedError(_INVALID_PARAMETER) from None
+        if len(parameter) != _DESTINATION.size:
+            raise _RefusedError(_INVALID_PARAMETER)
+        packed, port, _ = _DESTINATION.unpack(parameter)
+        host = IPv4Address(packed)
         if not port or host.is_multicast or host.is_unspecified:
             raise _RefusedError(_INVALID_PARAMETER)
         self.destination = Destination(str(host), {self._device.port: port})
