@@ -96,6 +96,7 @@ class HesaiEncoder(PacketEncoder):
             rate_rpm=self._rate_rpm,
             mode=self.source.mode,
             port=self._port,
+            dated=self.source.dated,
             ptp=self._ptp,
             calibration=files[".angles.csv"],
             firetimes=files[".firetimes.csv"],

@@ -44,6 +44,7 @@ _INVALID_PARAMETER = 1
 _UNSUPPORTED = 5
 
 _INVENTORY = Struct(">18s16s6s16s16s16s16shBBB")
+_INVENTORY_BYTES = {42: 162}  # {model code of OT128: size}; others have 120
 _CONFIG = Struct(">4s4s4s4sHHHBHHHBBBBBBBHBBB6x")
 _STATUS = Struct(">IH8iBBiiB5x")
 _DESTINATION = Struct(">4sHH")
@@ -65,6 +66,7 @@ class PtcDevice:
     rate_rpm: int
     mode: str  # of returns
     port: int  # of the data
+    dated: bool  # whether a receiver sets the clock
     ptp: bool  # whether the clock is a PTP clock
     calibration: bytes  # file of angles
     firetimes: bytes  # file of firing times
@@ -75,7 +77,7 @@ class PtcDevice:
         mac = b"\x02" + number.to_bytes(5, "big")  # locally administered
         fields = (f"SIM{number:010d}".encode(), b"", mac, b"", b"", b"", b"", 0)
         packed = _INVENTORY.pack(*fields, self.model_code, 0, self.lasers)
-        return packed.ljust(162 if self.model_code == 42 else 120, b"\0")
+        return packed.ljust(_INVENTORY_BYTES.get(self.model_code, 120), b"\0")
 
     def config(self, own_host: str, destination: Destination) -> bytes:
         """Return the settings of network, rotation, clock and returns."""
@@ -100,7 +102,10 @@ class PtcDevice:
 
     def status(self, uptime_s: float) -> bytes:
         """Return the time of operation and the rate; temperatures are 0."""
-        return _STATUS.pack(int(uptime_s), self.rate_rpm, *[0] * 8, 1, 1, 1, 0, 2 * self.ptp)
+        ptp_state = 2 if self.ptp else 0  # locked, or free run
+        return _STATUS.pack(
+            int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
+        )
 
 
 class _RefusedError(Exception):
