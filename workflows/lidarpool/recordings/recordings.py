@@ -59,6 +59,7 @@ _INTENSITY_COLUMNS = ("intensity", "reflectivity", "i")
 # Intensity that Velodyne and Ouster report of a white surface at any range.
 _WHITE_INTENSITY = 100.0
 _VELODYNE_BYTES = (1248, 554)  # first frame of a Velodyne's .pcap: points, or a position
+_HESAI_STARTS = (b"\xee\xff", b"\xff\xee")  # first bytes of a Hesai's datagrams
 
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
@@ -322,11 +323,7 @@ def _open_file(
     if suffix == ".mcap":
         return _open_bag(path, name, sensor, intensity)
     if suffix in (".osf", ".pcap"):
-        with reading(name), open_input(path) as file:
-            frame_bytes = int.from_bytes(file.read(36)[32:], "little")
-        if frame_bytes in _VELODYNE_BYTES:
-            return _open_velodyne(path, name, intensity)
-        return _open_ouster(path, name, sensor, intensity)
+        return _open_packets(path, name, sensor, intensity)
     if suffix == ".tar":
         with reading(name):
             sensors = open_webdataset([path])
@@ -338,6 +335,20 @@ def _open_file(
         ".bin": partial(open_kitti_file, path),
     }.get(suffix)
     return None if opener is None else _open_sweep_files(name, {"": opener}, sensor, intensity)
+
+
+def _open_packets(path: Path, name: str, sensor: str | None, intensity: str | None) -> Recording:
+    """Open packets of a Velodyne or an Ouster; LidarError for those of a Hesai."""
+    with reading(name), open_input(path) as file:
+        head = file.read(84)
+    if int.from_bytes(head[32:36], "little") in _VELODYNE_BYTES:
+        return _open_velodyne(path, name, intensity)
+    if head[82:] in _HESAI_STARTS:
+        raise LidarError(
+            f"{name} has packets of a Hesai, which are not read: write points of them as .pcd with "
+            "Hesai's SDK."
+        )
+    return _open_ouster(path, name, sensor, intensity)
 
 
 def _open_cloud(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import ClassVar
@@ -18,6 +18,7 @@ from ..sensor import Sensor
 from ..sensor.packet_settings import Identifier, PacketSettings
 from ..sweeps.instruments import Instruments
 from ..sweeps.sweeps import Sweeps
+from .service import Destination, Service
 from .shots import Shots, settings_of
 
 # Plug-ins are subclasses of `PacketEncoder`; the name of a plug-in is the `format` of data files.
@@ -97,6 +98,9 @@ class PacketEncoder(ABC):
     optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
     address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
     destination: ClassVar[str] = "255.255.255.255"
+    default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
+    # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
+    told_apart: ClassVar[bool] = False
 
     def __init__(self, source: PacketSource) -> None:
         self.source = source
@@ -119,6 +123,21 @@ class PacketEncoder(ABC):
     def files(self) -> Mapping[str, bytes]:
         """Return files that readers need beside the packets, {suffix: content}."""
         return {}
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service | None:
+        """Return what answers the maker's software for a live sensor, or None for no service.
+
+        `address` is where it listens: HOST for the maker's port, or HOST:PORT. The other parameters
+        are those of `Service`.
+        """
+        return None
+
+    @property
+    def ports(self) -> Mapping[str, int]:
+        """Ports of all kinds of packets, that of the returns first: {kind: port}."""
+        return {**self.default_ports, **self.source.settings.ports}
 
     @property
     def firing_interval_ns(self) -> int:
@@ -155,6 +174,7 @@ class PacketEncoder(ABC):
 
 # {format of packets: module and class of its encoder}
 ENCODERS = {
+    "hesai": "lidarsim.packets.hesai:HesaiEncoder",
     "ouster": "lidarsim.packets.ouster:OusterEncoder",
     "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
 }

@@ -6,11 +6,15 @@ timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Ints
+from ..base.arrays import AnyArray, Ints
 from .encoders import Datagrams, PacketEncoder, PacketSource
-from .shots import CarryOver, Shots
+from .service import Destination, Service
+from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
 
 DATA_PORT = 2368
@@ -43,6 +47,7 @@ class VelodyneEncoder(PacketEncoder):
     """
 
     identifiers = ("product", "unit_m")
+    default_ports: ClassVar[Mapping[str, int]] = {"data": DATA_PORT, "position": POSITION_PORT}
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -78,6 +83,23 @@ class VelodyneEncoder(PacketEncoder):
         """Return no packets, because the sensor sends no packet before its blocks are full."""
         return []
 
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service:
+        """Return the sensor's web interface, see `PacketEncoder.service`."""
+        from .velodyne_api import VelodyneApi, VelodyneState
+
+        source = self.source
+        state = VelodyneState(
+            model=source.sensor.model,
+            serial=source.name or "lidarpool",
+            returns=source.mode.title(),
+            rpm=round(60 * source.sensor.head.rate_hz),  # type: ignore[attr-defined]
+            pps_state="Locked" if source.dated else "Absent",
+        )
+        ports = self.port("data", DATA_PORT), self.port("position", POSITION_PORT)
+        return VelodyneApi(address, destination, send_to, state, ports)
+
     def _data(self, shots: Shots) -> Datagrams:
         """Return the data packets of shots that fill packets."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
@@ -110,8 +132,8 @@ class VelodyneEncoder(PacketEncoder):
         reflectivities = shots.columns["reflectivity"] * fits
         shape = len(blocks), -1, 1, _BLOCK_LASERS
         for name, values in (("distance", distances), ("reflectivity", reflectivities)):
-            planes = [plane.reshape(shape) for plane in self._planes_of(values, fits)]
-            interleaved = np.concatenate(planes, axis=2)
+            planes = last_and_strongest(values, fits) if self._planes == 2 else [values[0]]
+            interleaved = np.concatenate([plane.reshape(shape) for plane in planes], axis=2)
             blocks["returns"][name][:, :used] = interleaved.reshape(len(blocks), used, -1)
         banks = max(1, channels // _BLOCK_LASERS)
         blocks["flag"] = _UNUSED
@@ -121,11 +143,3 @@ class VelodyneEncoder(PacketEncoder):
         firing = np.arange(used) // self._planes * _BLOCK_LASERS // channels
         blocks["azimuth"][:, :used] = by_firing[:, firing]
         blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers take the last block's
-
-    def _planes_of(self, values: AnyArray, returned: Bools) -> list[AnyArray]:
-        """Return values (r, n, c) in the order of blocks: (n, c) for each block of a firing."""
-        if self._planes == 1:
-            return [values[0]]
-        if len(values) == 1:
-            return [values[0], values[0]]
-        return [np.where(returned[1], values[1], values[0]), values[0]]

@@ -1,0 +1,219 @@
+"""Packets of Hesai: PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128 and OT128.
+
+Sources: see hesai_layouts.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Bytes, Ints, Records
+from ..base.errors import LidarError
+from ..base.words import did_you_mean
+from ..sensor.beams import Mirror, Spin
+from .encoders import Datagrams, PacketEncoder, PacketSource
+from .hesai_calibration import LaserTable
+from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, Layout
+from .hesai_ptc import PtcDevice, PtcService
+from .service import Destination
+from .shots import CarryOver, Shots, last_and_strongest
+
+DATA_PORT = 2368
+_AZIMUTHS = 36_000  # in a revolution
+_MAX_UNITS = 65_535
+_FACTORY = 0x42
+_SECOND_NS = 1_000_000_000
+_CLOCKS = ("gps", "ptp")
+_NORMAL_STATE = 1 << 5  # functional safety: normal, without a fault
+_COUNTED_US = 5000  # functional safety counts modulo 8 in steps of this time
+_PERIOD_TOLERANCE_US = 0.02
+
+
+class HesaiEncoder(PacketEncoder):
+    """Data packets of a model, with sequence numbers, and checksums where the model has them.
+
+    Azimuths are those of the head at the reference time of each block, clockwise from the sensor's
+    y axis. In the mode dual, each block of last returns is followed by a block of strongest
+    returns, or of second strongest where the last return is the strongest; an only return is in
+    both. The identifier `clock` is gps, the default, for dates, or ptp for seconds since 1970.
+    """
+
+    identifiers = ("model",)
+    optional_identifiers = ("clock",)
+    default_ports: ClassVar[Mapping[str, int]] = {"data": DATA_PORT}
+
+    def __init__(self, source: PacketSource) -> None:
+        super().__init__(source)
+        self._layout = self._layout_of_model()
+        self._check_sensor()
+        layout = self._layout
+        if source.mode not in layout.modes:
+            modes = ", ".join(layout.modes)
+            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+        self._lasers = LaserTable.of_sensor(source.sensor, layout)
+        self._planes = 2 if source.mode == "dual" else 1
+        self._firings = layout.blocks // self._planes
+        self._port = self.port("data", DATA_PORT)
+        self._ptp = self._is_ptp()
+        self._carry = CarryOver(self._firings)
+        self._next_number = 1
+
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the data packets that the shots of a sweep fill."""
+        filled = self._carry.whole_packets(shots)
+        if not len(filled):
+            return []
+        packets = self._packets(filled)
+        payloads = packets.view(np.uint8).reshape(len(packets), packets.itemsize)
+        last_ns = filled.starts_ns[self._firings - 1 :: self._firings]
+        datagrams = Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
+        dropped = np.all(filled.dropped.reshape(-1, self._firings), axis=1)
+        return [datagrams.without(np.asarray(dropped))]
+
+    def finish(self) -> list[Datagrams]:
+        """Return no packets, because the sensor sends no packet before its blocks are full."""
+        return []
+
+    def files(self) -> Mapping[str, bytes]:
+        """Return the angles and the firing times of the lasers as the maker's files."""
+        return {
+            ".angles.csv": self._lasers.angles_file().encode(),
+            ".firetimes.csv": self._lasers.firetimes_file().encode(),
+        }
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> PtcService:
+        """Return what answers the commands by which readers get calibration and identity."""
+        files = self.files()
+        device = PtcDevice(
+            name=self.source.name,
+            model_code=self._layout.model_code,
+            lasers=self._layout.channels,
+            rate_rpm=self._rate_rpm,
+            mode=self.source.mode,
+            port=self._port,
+            dated=self.source.dated,
+            ptp=self._ptp,
+            calibration=files[".angles.csv"],
+            firetimes=files[".firetimes.csv"],
+        )
+        return PtcService(device, address, destination, send_to)
+
+    @property
+    def _rate_rpm(self) -> int:
+        """Revolutions a minute."""
+        return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
+
+    def _layout_of_model(self) -> Layout:
+        """Return the layout of the model; LidarError for an unknown model."""
+        model = self.text("model")
+        if model not in LAYOUTS:
+            names = ", ".join(LAYOUTS)
+            error = self.unusable(f"are of the models {names}, not {model}")
+            raise LidarError(f"{error}{did_you_mean(model, LAYOUTS)}")
+        return LAYOUTS[model]
+
+    def _check_sensor(self) -> None:
+        """Raise LidarError unless the sensor fires as the model does."""
+        sensor = self.source.sensor
+        layout = self._layout
+        head = sensor.head
+        if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
+            raise self.unusable("need a head that spins clockwise")
+        if sensor.channels != layout.channels:
+            raise self.unusable(f"hold {layout.channels} lasers, not {sensor.channels}")
+        firing_us = self.firing_interval_ns / 1000
+        if abs(firing_us - layout.firing_us) > _PERIOD_TOLERANCE_US:
+            raise self.unusable(
+                f"hold firings every {layout.firing_us:.2f} µs, not {firing_us:.2f}: readers "
+                "assume this time"
+            )
+
+    def _is_ptp(self) -> bool:
+        """Return whether times are those of a PTP clock; LidarError for an unknown clock."""
+        clock = self.source.settings.identifiers.get("clock", "gps")
+        clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
+        if clock not in clocks:
+            raise self.unusable(f"have the clock {' or '.join(clocks)}, not {clock}")
+        return clock == "ptp"
+
+    def _packets(self, shots: Shots) -> Records:
+        """Return the data packets of shots that fill packets, as records (n,)."""
+        layout = self._layout
+        packets = np.zeros(len(shots) // self._firings, layout.packet)
+        if layout.header:
+            packets["header"] = layout.header_bytes(self._planes == 2)
+        self._fill_blocks(packets["blocks"], shots)
+        packets["motor_rpm"] = self._rate_rpm
+        packets["mode"] = layout.modes[self.source.mode]
+        packets["factory"] = _FACTORY
+        packets["sequence"] = self._next_number + np.arange(len(packets))
+        self._next_number += len(packets)
+        stamped = 0 if layout.stamps_first_block else self._firings - 1
+        stamps_us = self._stamps_us(shots.stamps_ns[stamped :: self._firings])
+        seconds = stamps_us // 1_000_000
+        packets["stamp_us"] = stamps_us % 1_000_000
+        packets["date"] = _epoch_seconds(seconds) if self._ptp else layout.dates(seconds)
+        if layout.has_checksums:
+            packets["operational_state"] = STANDARD_STATE
+            packets["safety"]["state"] = _NORMAL_STATE | (stamps_us // _COUNTED_US % 8)
+            _fill_checksums(packets)
+        return packets
+
+    def _stamps_us(self, firings_ns: Ints) -> Ints:
+        """Return stamps since 1970 of packets whose stamped blocks fire at `firings_ns` (n,)."""
+        offset_us = self._layout.first_laser_us + self._layout.reference_us
+        stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
+        return (stamps_ns + 500) // 1000
+
+    def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
+        """Write azimuths and returns of shots into blocks (n, b)."""
+        layout = self._layout
+        units = np.rint(shots.range_m * (1000 / UNIT_MM))
+        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        distances = np.where(fits, units, 0).astype("<u2")
+        reflectivities = shots.columns["reflectivity"] * fits
+        shape = len(blocks), self._firings, 1, layout.channels
+        for name, values in (("distance", distances), ("reflectivity", reflectivities)):
+            planes = last_and_strongest(values, fits) if self._planes == 2 else [values[0]]
+            interleaved = np.concatenate([plane.reshape(shape) for plane in planes], axis=2)
+            blocks["returns"][name] = interleaved.reshape(len(blocks), layout.blocks, -1)
+        if "reserved" in (blocks["returns"].dtype.names or ()):
+            blocks["returns"]["reserved"] = layout.return_byte
+        if layout.block_start is not None:
+            blocks["start"] = layout.block_start
+        head = self.source.sensor.head
+        turned = head.radians_per_ns * layout.first_laser_us * 1000  # type: ignore[attr-defined]
+        azimuths_deg = 90 - np.degrees(shots.azimuths - turned)
+        azimuths = np.rint(azimuths_deg * 100).astype(np.int64) % _AZIMUTHS
+        by_firing = azimuths.reshape(len(blocks), self._firings)
+        blocks["azimuth"] = np.repeat(by_firing, self._planes, axis=1)
+
+
+def _epoch_seconds(seconds: Ints) -> Bytes:
+    """Return seconds since 1970 as dates of PTP clocks: (n, 6), a 0 and the big-endian number."""
+    return seconds.astype(">u8").view(np.uint8).reshape(-1, 8)[:, 2:] * (np.arange(6) > 0)
+
+
+def _fill_checksums(packets: Records) -> None:
+    """Write the checksums of the blocks, of the functional safety and of the tail."""
+    from . import hesai_loops  # not before: numba takes half a second to import
+
+    fields = packets.dtype.fields
+    assert fields is not None
+    safety_start = fields["safety"][1]
+    parts = (  # record with the field, field, and the bytes that the checksum covers
+        (packets, "checksum", slice(fields["blocks"][1], fields["checksum"][1])),
+        (packets["safety"], "checksum", slice(safety_start + 1, safety_start + 5)),
+        (packets, "tail_checksum", slice(fields["status"][1], fields["tail_checksum"][1])),
+    )
+    payloads = packets.view(np.uint8).reshape(len(packets), packets.itemsize)
+    table = hesai_loops.remainders()
+    for records, field, covered in parts:
+        sums = np.zeros(len(packets), np.uint32)
+        hesai_loops.checksums(payloads[:, covered], table, sums)
+        records[field] = sums

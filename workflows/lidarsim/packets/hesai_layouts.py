@@ -1,0 +1,259 @@
+"""Layouts of Hesai's packets: fields, return modes and times of each model.
+
+Sources: user manuals of PandarXT-32, PandarXT-16, Pandar40P, Pandar64, PandarQT, Pandar128 and
+Pandar128E3X; HesaiLidar_SDK_2.0, UdpProtocol and UdpParser; tier4/nebula, hesai decoders, with its
+recordings of PandarXT-32, Pandar40P, Pandar64 and PandarQT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.arrays import Ints
+
+_STRONGEST_OR_LAST = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
+_FIRST = {"first": 0x33}
+_SOP = (0xEE, 0xFF)  # start of a packet
+UNIT_MM = 4
+_SEQUENCE_FLAG = 1  # flags of a header: what follows the blocks
+_IMU_FLAG = 2
+_SAFETY_FLAG = 4
+_OT128_STATUS = 128  # version of the status by which readers tell OT128 from Pandar128
+
+_RETURN = [("distance", "<u2"), ("reflectivity", "u1")]
+_RETURN_WITH_BYTE = [*_RETURN, ("reserved", "u1")]
+_SEQUENCE = ("sequence", "<u4")
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Packets of a model.
+
+    The reference of a block is the time at which its azimuth is that of the head.
+    """
+
+    channels: int
+    blocks: int
+    firing_us: float
+    packet: np.dtype[np.void]
+    modes: Mapping[str, int]  # {mode of returns: number in the packet}
+    first_laser_us: float  # from the reference of a block to the laser that fires first
+    reference_us: float  # from the stamp of a packet to the reference of the stamped block
+    epoch: int  # year 0 of dates
+    model_code: int  # of the device information, see hesai_ptc.py
+    header: tuple[int, ...] = ()  # bytes, of which `dual_header` replaces some
+    dual_header: Mapping[int, int] | None = None  # {position: byte in the mode dual}
+    block_start: int | None = None  # first bytes of each block
+    return_byte: int = 0  # fourth byte of a return
+    stamps_first_block: bool = False  # else the stamp is of the last block
+    has_checksums: bool = False  # of body, state and tail
+    has_epoch_seconds: bool = True  # whether the date may be seconds since 1970, of a PTP clock
+    listed_states: tuple[int, ...] = ()  # operational state of each column of firing times
+    lists_distances: bool = False  # whether each state has columns for far and for near targets
+
+    def header_bytes(self, dual: bool) -> Ints:
+        """Return the bytes of the header."""
+        header = np.array(self.header, np.int64)
+        for position, byte in (self.dual_header or {}).items() if dual else ():
+            header[position] = byte
+        return header
+
+    def dates(self, seconds: Ints) -> NDArray[np.uint8]:
+        """Return the dates of seconds since 1970, UTC: (n, 6), year to second."""
+        times = seconds.astype("datetime64[s]")
+        months = times.astype("datetime64[M]")
+        days = times.astype("datetime64[D]")
+        second_of_day = (times - days).astype(np.int64)
+        columns = (
+            times.astype("datetime64[Y]").astype(np.int64) + 1970 - self.epoch,
+            months.astype(np.int64) % 12 + 1,
+            (days - months).astype(np.int64) + 1,
+            second_of_day // 3600,
+            second_of_day // 60 % 60,
+            second_of_day % 60,
+        )
+        return np.stack(columns, axis=1).astype(np.uint8)
+
+
+def _numbered(
+    version: tuple[int, int], status: int, lasers: int, blocks: int, flags: int
+) -> tuple[int, ...]:
+    """Return the header of a numbered protocol, 12 bytes, in a mode of a single return."""
+    return (*_SOP, *version, status, 0, lasers, blocks, 0, UNIT_MM, 1, flags)
+
+
+# {position in the header of numbered protocols: byte}: the last return is first; two returns.
+_DUAL_NUMBERED = {8: 1, 10: 2}
+
+
+def _blocks(
+    count: int, lasers: int, returned: list[tuple[str, str]], starts: bool = False
+) -> tuple[str, np.dtype[np.void], tuple[int]]:
+    """Return the field of the blocks of a packet."""
+    start = [("start", "<u2")] if starts else []
+    block = np.dtype([*start, ("azimuth", "<u2"), ("returns", np.dtype(returned), (lasers,))])
+    return "blocks", block, (count,)
+
+
+_PANDAR_TAIL = [
+    ("status", "u1", (5,)),
+    ("shutdown", "u1"),
+    ("error", "<u2"),
+    ("motor_rpm", "<u2"),
+    ("stamp_us", "<u4"),
+    ("mode", "u1"),
+    ("factory", "u1"),
+    ("date", "u1", (6,)),
+    _SEQUENCE,
+]
+_QT_TAIL = [
+    ("status", "u1", (10,)),
+    ("motor_rpm", "<u2"),
+    ("stamp_us", "<u4"),
+    ("mode", "u1"),
+    ("factory", "u1"),
+    ("date", "u1", (6,)),
+    _SEQUENCE,
+]
+_DATED_TAIL = [
+    ("mode", "u1"),
+    ("motor_rpm", "<u2"),
+    ("date", "u1", (6,)),
+    ("stamp_us", "<u4"),
+    ("factory", "u1"),
+    _SEQUENCE,
+]
+_IMU = [
+    ("imu_temperature", "<i2"),
+    ("imu_acceleration_unit", "<u2"),
+    ("imu_rate_unit", "<u2"),
+    ("imu_stamp", "<u4"),
+    ("imu_acceleration", "<i2", (3,)),
+    ("imu_rate", "<i2", (3,)),
+]
+_SAFETY = np.dtype(
+    [
+        ("version", "u1"),
+        ("state", "u1"),
+        ("fault_info", "u1"),
+        ("fault_code", "<u2"),
+        ("reserved", "u1", (8,)),
+        ("checksum", "<u4"),
+    ]
+)
+_PACKET_128 = np.dtype(
+    [
+        ("header", "u1", (12,)),
+        _blocks(2, 128, _RETURN),
+        ("checksum", "<u4"),
+        ("safety", _SAFETY),
+        ("status", "u1", (9,)),
+        ("azimuth_states", "<u2"),
+        ("operational_state", "u1"),
+        *_DATED_TAIL,
+        *_IMU,
+        ("tail_checksum", "<u4"),
+    ]
+)
+STANDARD_STATE = 2  # operational state in which all lasers fire in each block
+_FLAGS_128 = _SEQUENCE_FLAG | _IMU_FLAG | _SAFETY_FLAG
+
+LAYOUTS = {
+    "PandarXT-32": Layout(
+        channels=32,
+        blocks=8,
+        firing_us=50.0,
+        packet=np.dtype(
+            [
+                ("header", "u1", (12,)),
+                _blocks(8, 32, _RETURN_WITH_BYTE),
+                ("status", "u1", (9,)),
+                ("shutdown", "u1"),
+                *_DATED_TAIL,
+            ]
+        ),
+        modes=_STRONGEST_OR_LAST | _FIRST,
+        first_laser_us=6.0,
+        reference_us=0.0,
+        epoch=1900,
+        model_code=25,
+        header=_numbered((6, 1), 0, 32, 8, _SEQUENCE_FLAG),
+        dual_header=_DUAL_NUMBERED,
+        return_byte=0xFF,
+    ),
+    "Pandar40P": Layout(
+        channels=40,
+        blocks=10,
+        firing_us=500 / 9,
+        packet=np.dtype([_blocks(10, 40, _RETURN, starts=True), *_PANDAR_TAIL]),
+        modes=_STRONGEST_OR_LAST,
+        first_laser_us=-54.67,
+        reference_us=-28.58,
+        epoch=2000,
+        model_code=0,
+        block_start=0xEEFF,
+        has_epoch_seconds=False,
+    ),
+    "Pandar64": Layout(
+        channels=64,
+        blocks=6,
+        firing_us=500 / 9,
+        packet=np.dtype([("header", "u1", (8,)), _blocks(6, 64, _RETURN), *_PANDAR_TAIL]),
+        modes=_STRONGEST_OR_LAST,
+        first_laser_us=-54.668,
+        reference_us=-42.58,
+        epoch=2000,
+        model_code=2,
+        header=(*_SOP, 64, 6, 0, UNIT_MM, 0, 0),
+        has_epoch_seconds=False,
+    ),
+    "PandarQT": Layout(
+        channels=64,
+        blocks=4,
+        firing_us=500 / 3,
+        packet=np.dtype([("header", "u1", (12,)), _blocks(4, 64, _RETURN_WITH_BYTE), *_QT_TAIL]),
+        # Of two returns, it sends the last and the first.
+        modes={"last": 0x38} | _FIRST,
+        first_laser_us=2.31,
+        reference_us=25.71,
+        epoch=1900,
+        model_code=15,
+        header=_numbered((3, 1), 0, 64, 4, _SEQUENCE_FLAG),
+        stamps_first_block=True,
+    ),
+    "Pandar128": Layout(
+        channels=128,
+        blocks=2,
+        firing_us=500 / 9,
+        packet=_PACKET_128,
+        modes=_STRONGEST_OR_LAST | _FIRST,
+        first_laser_us=0.776,
+        reference_us=3.148,
+        epoch=1900,
+        model_code=3,
+        header=_numbered((1, 4), 0, 128, 2, _FLAGS_128),
+        dual_header=_DUAL_NUMBERED,
+        has_checksums=True,
+        listed_states=(0, 0, 0, 0, 2, 2, 3, 3),
+        lists_distances=True,
+    ),
+    "OT128": Layout(
+        channels=128,
+        blocks=2,
+        firing_us=500 / 9,
+        packet=_PACKET_128,
+        modes=_STRONGEST_OR_LAST | _FIRST,
+        first_laser_us=0.0,
+        reference_us=0.0,
+        epoch=1900,
+        model_code=42,
+        header=_numbered((1, 4), _OT128_STATUS, 128, 2, _FLAGS_128),
+        dual_header=_DUAL_NUMBERED,
+        has_checksums=True,
+        listed_states=(0, 0, 0, 0, 2, 2),
+    ),
+}

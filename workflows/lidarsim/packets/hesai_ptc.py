@@ -1,0 +1,272 @@
+"""Commands of a live Hesai over TCP (PTC): calibration, identity, settings, destination.
+
+Sources: TCP API of the user manuals of PandarQT and PandarXT-16; HesaiLidar_SDK_2.0, PtcClient;
+tier4/nebula, hesai hardware interface.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from ipaddress import IPv4Address
+from struct import Struct, pack
+from typing import Self
+from zlib import crc32
+
+from ..base.errors import LidarError
+from .service import Destination, Service
+
+PTC_PORT = 9347
+_MARK = b"\x47\x74"  # first bytes of requests and answers
+_HEADER = Struct(">2sBBI")  # mark, command, code of the answer, bytes that follow
+_MAX_REQUEST_BYTES = 1024
+_MAX_CONNECTIONS = 16  # one more closes the connection that was silent longest
+_WITHIN_S = 5.0  # from the start of a request to its end, and for its answer
+
+_GET_CALIBRATION = 0x05
+_GET_INVENTORY = 0x07
+_GET_CONFIG = 0x08
+_GET_STATUS = 0x09
+_SET_SPIN_RATE = 0x17
+_SET_RETURN_MODE = 0x1E
+_SET_DESTINATION = 0x20
+_GET_FIRETIMES = 0xA9
+_OK = 0
+_INVALID_PARAMETER = 1
+_UNSUPPORTED = 5
+
+_INVENTORY = Struct(">18s16s6s16s16s16s16shBBB")
+_INVENTORY_BYTES = {42: 162}  # {model code of OT128: size}; others have 120
+_CONFIG = Struct(">4s4s4s4sHHHBHHHBBBBBBBHBBB6x")
+_STATUS = Struct(">IH8iBBiiB5x")
+_DESTINATION = Struct(">4sHH")
+# {mode of returns: number of the command}
+_RETURN_MODES = {"last": 0, "strongest": 1, "dual": 2, "first": 3}
+_GPS_PORT = 10_110  # of packets with the receiver's sentences, which are not sent
+
+# What ends a connection: the peer, bytes that are no command, or this side.
+_ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio.CancelledError)
+
+
+@dataclass(frozen=True)
+class PtcDevice:
+    """Facts of a sensor that its commands report."""
+
+    name: str  # of the sensor in its survey
+    model_code: int
+    lasers: int
+    rate_rpm: int
+    mode: str  # of returns
+    port: int  # of the data
+    dated: bool  # whether a receiver sets the clock
+    ptp: bool  # whether the clock is a PTP clock
+    calibration: bytes  # file of angles
+    firetimes: bytes  # file of firing times
+
+    def inventory(self) -> bytes:
+        """Return serial number, versions and model."""
+        number = crc32(self.name.encode())
+        mac = b"\x02" + number.to_bytes(5, "big")  # locally administered
+        fields = (f"SIM{number:010d}".encode(), b"", mac, b"", b"", b"", b"", 0)
+        packed = _INVENTORY.pack(*fields, self.model_code, 0, self.lasers)
+        return packed.ljust(_INVENTORY_BYTES.get(self.model_code, 120), b"\0")
+
+    def config(self, own_host: str, destination: Destination) -> bytes:
+        """Return the settings of network, rotation, clock and returns."""
+        return _CONFIG.pack(
+            IPv4Address(own_host).packed,
+            b"\xff\xff\xff\0",
+            bytes(4),
+            IPv4Address(destination.host).packed,
+            destination.ports.get(self.port, self.port),
+            _GPS_PORT,
+            self.rate_rpm,
+            *(0, 0),  # no phase lock
+            *(0, 3600),  # field of view, 0.1 degrees
+            self.ptp,
+            1,  # with sequence numbers
+            0,  # fires by time
+            _RETURN_MODES[self.mode],
+            *(0, 0),  # in operation
+            *(0, 0),  # no VLAN
+            *(0, 0, 0),  # format of dates, noise filter, linear reflectivity
+        )
+
+    def status(self, uptime_s: float) -> bytes:
+        """Return the time of operation and the rate; temperatures are 0."""
+        ptp_state = 2 if self.ptp else 0  # locked, or free run
+        return _STATUS.pack(
+            int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
+        )
+
+
+class _RefusedError(Exception):
+    """A command that is answered by a code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+class PtcService(Service):
+    """Answers commands on a thread of its own; a connection may send any number of commands.
+
+    Parameters
+    ----------
+    device
+        What the answers state.
+    address
+        HOST:PORT to listen at; HOST alone for port 9347, or for a free port if port 9347 is taken.
+    destination, send_to
+        As of `Service`.
+    """
+
+    def __init__(
+        self,
+        device: PtcDevice,
+        address: str,
+        destination: Destination,
+        send_to: Callable[[Destination], None],
+    ) -> None:
+        super().__init__(destination, send_to)
+        self._host, _, port = address.partition(":")
+        self._device = device
+        self._ports = [int(port)] if port else [PTC_PORT, 0]  # to try, of which 0 is a free port
+        self._port = self._ports[0]
+        self._started_s = time.monotonic()
+        self._connections: dict[asyncio.Task[None], None] = {}  # the longest silent is first
+        self._loop: asyncio.AbstractEventLoop
+        self._thread: threading.Thread
+        self._server: asyncio.Server
+
+    @property
+    def description(self) -> str:
+        """The address of the commands."""
+        return f"Hesai's commands (PTC) at {self._host}:{self._port}"
+
+    def __enter__(self) -> Self:
+        listener = self._listening_socket()
+        self._port = listener.getsockname()[1]
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._loop.run_forever, name="Hesai PTC", daemon=True
+        )
+        self._thread.start()
+        starting = asyncio.start_server(self._serve, sock=listener)
+        self._server = asyncio.run_coroutine_threadsafe(starting, self._loop).result()
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _listening_socket(self) -> socket.socket:
+        """Return a socket at the address; LidarError if the address cannot be used."""
+        for port in self._ports:
+            listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((self._host, port))
+                listener.listen(_MAX_CONNECTIONS)
+            except OSError as problem:
+                listener.close()
+                if problem.errno == errno.EADDRINUSE and port != self._ports[-1]:
+                    continue
+                raise LidarError(
+                    f"Hesai's commands (PTC) cannot listen at {self._host}:{port} "
+                    f"({os.strerror(problem.errno or 0)}): give another address, such as --api "
+                    "127.0.0.1:9348."
+                ) from problem
+            return listener
+        raise AssertionError("the last port returns or raises")
+
+    async def _close(self) -> None:
+        """Close the address and all connections."""
+        self._server.close()
+        tasks = list(self._connections)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the commands of a connection until it ends, or sends bytes that are none."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._connections[task] = None
+        if len(self._connections) > _MAX_CONNECTIONS:
+            silent = next(iter(self._connections))
+            del self._connections[silent]
+            silent.cancel()
+        try:
+            with suppress(*_ENDS):
+                while True:
+                    start = await reader.readexactly(1)
+                    self._connections[task] = self._connections.pop(task, None)
+                    async with asyncio.timeout(_WITHIN_S):
+                        writer.write(await self._answered(start, reader, writer))
+                        await writer.drain()
+        finally:
+            self._connections.pop(task, None)
+            writer.close()
+
+    async def _answered(
+        self, start: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> bytes:
+        """Read the rest of a request, and return the answer; ValueError for other bytes."""
+        header = start + await reader.readexactly(_HEADER.size - 1)
+        mark, command, _, size = _HEADER.unpack(header)
+        if mark != _MARK or size > _MAX_REQUEST_BYTES:
+            raise ValueError
+        parameter = await reader.readexactly(size)
+        own_host: str = writer.get_extra_info("sockname")[0]
+        try:
+            content = self._content(command, parameter, own_host)
+        except _RefusedError as refusal:
+            return _HEADER.pack(_MARK, command, refusal.code, 0)
+        return _HEADER.pack(_MARK, command, _OK, len(content)) + content
+
+    def _content(self, command: int, parameter: bytes, own_host: str) -> bytes:
+        """Return the content of the answer to a command; _RefusedError for what cannot be done."""
+        device = self._device
+        answers: dict[int, Callable[[], bytes]] = {
+            _GET_CALIBRATION: lambda: device.calibration,
+            _GET_FIRETIMES: lambda: device.firetimes,
+            _GET_INVENTORY: device.inventory,
+            _GET_CONFIG: lambda: device.config(own_host, self.destination),
+            _GET_STATUS: lambda: device.status(time.monotonic() - self._started_s),
+            _SET_SPIN_RATE: partial(_unchanged, parameter, pack(">H", device.rate_rpm)),
+            _SET_RETURN_MODE: partial(_unchanged, parameter, bytes([_RETURN_MODES[device.mode]])),
+            _SET_DESTINATION: lambda: self._set_destination(parameter),
+        }
+        if command not in answers:
+            raise _RefusedError(_UNSUPPORTED)
+        return answers[command]()
+
+    def _set_destination(self, parameter: bytes) -> bytes:
+        """Send datagrams to another address from now on."""
+        if len(parameter) != _DESTINATION.size:
+            raise _RefusedError(_INVALID_PARAMETER)
+        packed, port, _ = _DESTINATION.unpack(parameter)
+        host = IPv4Address(packed)
+        if not port or host.is_multicast or host.is_unspecified:
+            raise _RefusedError(_INVALID_PARAMETER)
+        self.destination = Destination(str(host), {self._device.port: port})
+        self.send_to(self.destination)
+        return b""
+
+
+def _unchanged(parameter: bytes, current: bytes) -> bytes:
+    """Accept the current value of a setting, which cannot be changed; _RefusedError for others."""
+    if parameter != current:
+        raise _RefusedError(_INVALID_PARAMETER)
+    return b""
