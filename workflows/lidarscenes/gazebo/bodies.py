@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -14,6 +15,7 @@ from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import printable
+from lidarsim.scene.files.scene_graph import MAX_NODES
 
 from .frames import Frames, RelativePose, placed_by, pose_of
 from .notes import Notes
@@ -65,14 +67,16 @@ class Body:
         Links of the model itself.
     children
         Models in it.
-    elements
-        The model's element, and those of models that are merged into it, with their files.
     """
 
     frames: Frames
     links: list[Link] = field(default_factory=list)
     children: list[Instance] = field(default_factory=list)
-    elements: list[tuple[Element, Source]] = field(default_factory=list)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of links and models in the model, with those of all models in it."""
+        return len(self.links) + sum(1 + child.body.size for child in self.children)
 
 
 class _Included(NamedTuple):
@@ -96,9 +100,10 @@ class BodyReader:
 
     def world(self, element: Element, source: Source) -> Body:
         """Return the body of a <world>, or of a root with models."""
-        frames = Frames(WORLD_FRAME)
-        body = Body(frames, elements=[(element, source)])
+        body = Body(Frames(WORLD_FRAME))
         self._fill(body, element, source)
+        if body.size > MAX_NODES:
+            raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
         return body
 
     def _fill(self, body: Body, element: Element, source: Source) -> None:
@@ -175,7 +180,6 @@ class BodyReader:
         matrix = matmul(frames.matrix(pose.frame or frames.root), matrix)
         frames.adopt(nested.frames, matrix)
         body.links += nested.links
-        body.elements += nested.elements
         body.children += [
             child._replace(matrix=matmul(matrix, child.matrix)) for child in nested.children
         ]
@@ -189,8 +193,10 @@ class BodyReader:
             raise LidarError(f"more than {_MAX_NESTED} models are within each other.")
         if key not in self._bodies:
             self._open_elements.append(key)
-            body = Body(Frames(_MODEL_FRAME), elements=[(element, source)])
+            body = Body(Frames(_MODEL_FRAME))
             self._fill(body, element, source)
+            if body.size > MAX_NODES:
+                raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
             self._bodies[key] = body
             self._open_elements.pop()
         return self._bodies[key]

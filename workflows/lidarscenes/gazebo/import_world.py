@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import yaml
 
 from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, explained, prefixed
+from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import matmul
 from lidarsim.scene.files.scene_graph import MeshFileError
@@ -50,17 +50,16 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         If the world cannot be read, or has no lidar.
     """
     if len(assets) > 1:
-        raise LidarError(f"{world} is of Gazebo: give one folder, --assets DIR.")
+        raise LidarError("it is of Gazebo: give one folder, --assets DIR.")
     loaded = _loaded(world, assets)
-    with prefixed(world):
-        lidars = [*lidars_of(loaded)]
+    lidars = [*lidars_of(loaded)]
     if not lidars:
         raise LidarError(
-            f"{world} has no lidar (gpu_lidar, gpu_ray, lidar, ray): lidarpool init --mesh "
+            f"it has no lidar (gpu_lidar, gpu_ray, lidar, ray): lidarpool init --mesh "
             f"{world.name} makes a scenario for a sensor of yours."
         )
     if len(lidars) > MAX_SENSORS:
-        raise LidarError(f"{world} has {len(lidars)} lidars; at most {MAX_SENSORS} are allowed.")
+        raise LidarError(f"it has {len(lidars)} lidars; at most {MAX_SENSORS} are allowed.")
     left_out = [f"{lidar.name}: {line}" for lidar in lidars for line in lidar.left_out]
     files = _Files()
     data = {
@@ -79,15 +78,14 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
     """Return a world; LidarError if it cannot be read."""
-    with explained(f"{world} cannot be read"), prefixed(world):
+    with explained("it cannot be read"):
         data = read_input(world)
     try:
-        with prefixed(world):
-            return load_world(data, world, (world.parent.resolve(), *(f.resolve() for f in assets)))
+        return load_world(data, world, (world.parent.resolve(), *(f.resolve() for f in assets)))
     except MeshFileError as error:
-        raise LidarError(f"{world} {error}.") from error
+        raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(f"{world} is broken or cut short ({error}): export it again.") from error
+        raise LidarError(f"it is broken or cut short ({error}): export it again.") from error
 
 
 def _entry(world: Path, folder: Path, assets: Sequence[Path]) -> Any:
@@ -134,7 +132,7 @@ def _pose(matrix: Floats) -> dict[str, Any]:
 
 def _materials(world: World) -> dict[str, Any]:
     """Return the section of materials, if a shape states how it reflects a lidar's light."""
-    if not any(_has_retro(link.link.element) for link in world.links()):
+    if not any(_has_retro(link.link.element) for link in world.links):
         return {}
     return {"materials": [{"objects": "*", "reflectance": "texture"}]}
 

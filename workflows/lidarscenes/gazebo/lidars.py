@@ -60,7 +60,7 @@ class Lidar(NamedTuple):
 
 def lidars_of(world: World) -> Iterator[Lidar]:
     """Yield the lidars of a world; LidarError if figures of one are impossible."""
-    for link in world.links():
+    for link in world.links:
         for element in link.link.element.findall("sensor"):
             if element.get("type") in LIDARS:
                 name = printable(element.get("name", "")) or "lidar"

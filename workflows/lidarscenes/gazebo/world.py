@@ -8,18 +8,18 @@ Gazebo alone.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.errors import prefixed
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import listed, printable
 from lidarsim.scene.files.scene_graph import (
-    MAX_NODES,
     Content,
     MeshFileError,
     PlacedNode,
@@ -64,16 +64,11 @@ class World:
     resources: Resources
     notes: Notes
     allowance: Allowance
-    _links: list[PlacedLink] = field(default_factory=list)
 
+    @cached_property
     def links(self) -> list[PlacedLink]:
-        """Return all links; LidarError if there are too many."""
-        if not self._links:
-            for link in self._placed_links():
-                self._links.append(link)
-                if len(self._links) > MAX_NODES:
-                    raise LidarError(f"it places more than {MAX_NODES:,} links: divide it.")
-        return self._links
+        """All links."""
+        return [*self._placed_links()]
 
     def _placed_links(self) -> Iterator[PlacedLink]:
         """Yield the links of all models, the state's poses first."""
@@ -84,12 +79,8 @@ class World:
             for child in reversed(self.body.children)
             if child.name not in state.deleted
         ]
-        visited = 0
         while stack:
             instance, outer, around, outermost = stack.pop()
-            visited += 1
-            if visited > MAX_NODES:
-                raise LidarError(f"it places more than {MAX_NODES:,} models: divide it.")
             path = (*outer, instance.name)
             matrix = instance.matrix if around is None else matmul(around, instance.matrix)
             matrix = state.poses.get(scoped(path), matrix)
@@ -112,7 +103,7 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     world = load_world(data, path, options.folders)
     meshes = LinkMeshes(world.resources, options, world.notes, world.allowance)
     placed = []
-    for link in world.links():
+    for link in world.links:
         mesh = meshes.mesh_of(link.body, link.link, scoped(link.path), link.scale)
         if mesh is not None:
             placed.append(PlacedNode(mesh, link.matrix, "/".join(link.path)))
@@ -125,6 +116,8 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     if not content.meshes and not content.moving:
         missing = [*world.notes.missing_models, *world.notes.missing_files]
         reason = f": it lacks {listed(missing, 12)}" if missing else ""
+        if world.notes.without_visuals:
+            reason += "; give geometry: collision, since links have collision shapes"
         raise MeshFileError(f"has nothing that a lidar sees{reason}")
     return content
 

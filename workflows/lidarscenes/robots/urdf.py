@@ -117,7 +117,7 @@ def _read_root(path: Path) -> tuple[Element, int]:
     if any("xacro" in element.tag for element in root.iter()):
         raise LidarError(expand)
     if root.tag != "robot":
-        advice = "; an SDF is no robot with joints, but a scene" * (root.tag == "sdf")
+        advice = "; give a file of Gazebo the ending .sdf, as a scene" * (root.tag == "sdf")
         raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{advice}.")
     return root, len(data)
 
