@@ -139,7 +139,8 @@ class Resources:
 
     def _in_folders(self, location: str) -> Iterator[tuple[Path, Path]]:
         """Yield the paths NAME/FILE in all folders."""
-        name, _, file = location.strip("/").partition("/")
+        name, _, file = location.lstrip("/").partition("/")
+        file = file.lstrip("/")  # which would else be a path of its own
         if name in ("", ".", ".."):
             return
         for folder in self.folders:
