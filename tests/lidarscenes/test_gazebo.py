@@ -303,7 +303,8 @@ def test_meshes_keep_the_axes_of_their_file(tmp_path):
         write(folder / "leg" / "model.sdf", sdf(model("leg", link(inside=shape(text)))))
         return load(folder, world(include("model://leg")))[0]["leg/link"]
 
-    for uri in ("meshes/leg.dae", "model://leg/meshes/leg.dae", "file://meshes/leg.dae"):
+    names = ("meshes/leg.dae", "model://leg/meshes/leg.dae", "model://leg//meshes/leg.dae")
+    for uri in (*names, "file://meshes/leg.dae", "package://leg/meshes/leg.dae"):
         assert bounds(mesh(uri))[1] == [1, 0, 3], uri  # its unit counts, Y_UP does not
     assert bounds(mesh("meshes/leg.dae", "<scale>2 1 -1</scale>"))[0] == [0, 0, -3]
     part = "<submesh><name>right</name><center>true</center></submesh>"
@@ -360,6 +361,21 @@ def test_actors_follow_their_waypoints(tmp_path):
         tmp_path, world(f"<actor name='a'><pose>1 2 3 0 0 0</pose>{skin}</actor>")
     )
     assert not actors and bounds(objects["a"])[0] == [1, 2, 3]
+
+
+def test_skins_of_actors_are_at_rest(tmp_path):
+    matrix = "1 0 0 0  0 1 0 0  0 0 1 0.5  0 0 0 1"
+    skin = f"<skin source='#g'><bind_shape_matrix>{matrix}</bind_shape_matrix></skin>"
+    controllers = f"<library_controllers><controller id='c'>{skin}</controller>"
+    text = DAE.replace("<library_visual", f"{controllers}</library_controllers><library_visual")
+    text = text.replace("instance_geometry", "instance_controller").replace("'#g'/>", "'#c'/>")
+    write(tmp_path / "walk.dae", text.replace('url="#g"', 'url="#c"'))
+    actor = "<actor name='a'><skin><filename>walk.dae</filename></skin></actor>"
+    objects, _, _ = load(tmp_path, world(actor))
+    assert bounds(objects["a"]) == [[0, 0, 0.005], [1, 0, 3.005]]  # its unit is a centimetre
+    mesh = model("m", link(inside=shape("<mesh><uri>walk.dae</uri></mesh>")), link("box"))
+    _, _, (note,) = load(tmp_path, world(mesh))
+    assert "walk.dae, which is left out: walk.dae moves vertices by a skin" in note
 
 
 BROKEN = {

@@ -52,7 +52,7 @@ def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) 
 
 
 def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
-    """Return the skin of an actor; None without one, or if its file is missing."""
+    """Return the skin of an actor; None without a skin, or if its file is missing."""
     skin = actor.find("skin")
     if skin is None:
         return None
@@ -65,7 +65,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element) -> tuple[Floats, Floats]:
-    """Return times (k,), seconds, and poses (k, 4, 4) of an actor; one of each if it stands."""
+    """Return times (k,), seconds, and poses (k, 4, 4) of an actor; k is 1 if the actor stands."""
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
     if not entries:
@@ -82,7 +82,7 @@ def _waypoints(actor: Element) -> tuple[Floats, Floats]:
 
 
 def _waypoint_pose(waypoint: Element) -> Floats:
-    """Return the pose (4, 4) of a waypoint in the world; LidarError without one."""
+    """Return the pose (4, 4) of a waypoint in the world; LidarError without a pose."""
     pose = waypoint.find("pose")
     if pose is None:
         raise LidarError("a <waypoint> has no <pose>.")

@@ -57,7 +57,7 @@ class Instance(NamedTuple):
 
 @dataclass(eq=False)
 class Body:
-    """A model, or a world, without its pose; included models share it.
+    """A model, or a world, without its pose; equal includes share a body.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Body:
 
     @cached_property
     def size(self) -> int:
-        """Number of links and models in the model, with those of all models in it."""
+        """Number of links and models in the model, at all depths."""
         return len(self.links) + sum(1 + child.body.size for child in self.children)
 
 
@@ -144,14 +144,14 @@ class BodyReader:
     def _include(
         self, body: Body, include: Element, source: Source
     ) -> Iterator[tuple[str, Body, RelativePose]]:
-        """Yield the model that an <include> names, or merge it into the body."""
+        """Yield the model that an <include> names, or merge the model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
         included = self._included(uri, source)
         if included is None:
             return
-        given = printable(include.findtext("name") or "")
-        name = given or _name(included.element) or short_name(uri)
+        include_name = printable(include.findtext("name") or "")
+        name = include_name or _name(included.element) or short_name(uri)
         with prefixed(f"model {name!r}"):
             nested = self.model(included.element, included.source)
             posed = include if include.find("pose") is not None else included.element
@@ -256,5 +256,5 @@ def _name(element: Element) -> str:
 
 
 def scoped(path: tuple[str, ...]) -> str:
-    """Return the name of a model or link within others, as Gazebo writes it."""
+    """Return the name of a model or link within models, as Gazebo writes names."""
     return _SEPARATOR.join(path)

@@ -77,7 +77,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
-    """Return a world; LidarError if it cannot be read."""
+    """Return a world; LidarError if the file cannot be read."""
     with explained("it cannot be read"):
         data = read_input(world)
     try:
@@ -144,7 +144,7 @@ def _has_retro(link: Element) -> bool:
 
 
 class _Files:
-    """Data files of lidars; lidars with the same figures share one."""
+    """Data files of lidars; lidars with the same figures share a file."""
 
     def __init__(self) -> None:
         self._data: dict[str, dict[str, Any]] = {}  # {name: content}

@@ -59,7 +59,7 @@ class Lidar(NamedTuple):
 
 
 def lidars_of(world: World) -> Iterator[Lidar]:
-    """Yield the lidars of a world; LidarError if figures of one are impossible."""
+    """Yield the lidars of a world; LidarError if figures of a lidar are impossible."""
     for link in world.links:
         for element in link.link.element.findall("sensor"):
             if element.get("type") in LIDARS:
@@ -118,7 +118,7 @@ class _Scan(NamedTuple):
 
     @property
     def step_deg(self) -> float:
-        """Angle between two samples; 0 of one sample."""
+        """Angle between two samples; 0 of a single sample."""
         return (self.last_deg - self.first_deg) / (self.samples - 1) if self.samples > 1 else 0.0
 
 
@@ -130,7 +130,7 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
     count = round(stated * numbers_of(scan, "resolution", 1, "1", at_least=0).item())
     if count > _MAX_SAMPLES:
         raise LidarError(f"<{name}> has {count:,} samples; at most {_MAX_SAMPLES:,} are allowed.")
-    angles = [numbers_of(scan, end, 1, "0").item() for end in ("min_angle", "max_angle")]
+    angles = [numbers_of(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
     first_deg, last_deg = np.degrees(angles).tolist()
     if last_deg < first_deg:
         raise LidarError(f"<{name}> has a <max_angle> below its <min_angle>.")
@@ -142,8 +142,8 @@ def _directions(figures: Element) -> dict[str, Any]:
     vertical = _scan(figures, "vertical", "1")
     elevations: Any = [clean(vertical.first_deg)]
     if vertical.samples > 1:
-        ends = {"first": clean(vertical.first_deg), "last": clean(vertical.last_deg)}
-        elevations = {**ends, "count": vertical.samples}
+        limits = {"first": clean(vertical.first_deg), "last": clean(vertical.last_deg)}
+        elevations = {**limits, "count": vertical.samples}
     horizontal = _scan(figures, "horizontal", "640")
     step_deg = horizontal.step_deg
     count = horizontal.samples
@@ -170,7 +170,7 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
 
 
 def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
-    """Return the fields of a data file for noise; what is not as in Gazebo goes to `left_out`."""
+    """Return the fields of a data file for noise; differences to Gazebo go to `left_out`."""
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:

@@ -104,7 +104,7 @@ class LinkMeshes:
         return moved
 
     def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
-        """Return a mesh with the colour and material of its visual, as far as it has none."""
+        """Return a mesh with colour and material of its visual, unless its file has them."""
         colour = appearance.colour
         is_plain = mesh.colours is None or appearance.is_retro
         if self.options.colours and colour is not None and is_plain:
@@ -114,7 +114,7 @@ class LinkMeshes:
         return mesh
 
     def geometry(self, geometry: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a <geometry>; empty for one that is missing or has no size."""
+        """Return the meshes of a <geometry>; empty for a shape without a size or file."""
         shapes = [child for child in geometry if ":" not in child.tag]
         if not shapes:
             return []
@@ -136,7 +136,7 @@ class LinkMeshes:
         return [] if mesh is None else [mesh]
 
     def _mesh(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a file, or of a part of it, scaled."""
+        """Return the meshes of a file, or of its <submesh>, scaled."""
         uri = (shape.findtext("uri") or "").strip()
         scale = numbers_of(shape, "scale", 3, "1 1 1")
         meshes = self.file_meshes(uri, source)
@@ -148,7 +148,7 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
 
     def _part(self, meshes: list[SceneMesh], part: Element, uri: str) -> list[SceneMesh]:
-        """Return the meshes of a <submesh>, moved to its middle if it says so."""
+        """Return the meshes of a <submesh>, with the middle at zero if <center> is true."""
         name = printable(part.findtext("name") or "")
         if not name or not meshes:
             return meshes
@@ -181,17 +181,17 @@ class LinkMeshes:
             return []
 
     def file_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a file in its axes; none if it is missing or cannot be read."""
+        """Return the meshes of a file in its axes; empty, with a note, for an unusable file."""
         return self._read_once(uri, source, self._load)
 
     def skin_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the skin of an actor at rest; none if it is missing or cannot be read."""
+        """Return the skin of an actor at rest; empty, with a note, for an unusable file."""
         return self._read_once(uri, source, self._load_skin)
 
     def _read_once(
         self, uri: str, source: Source, load: Callable[[Source], list[SceneMesh]]
     ) -> list[SceneMesh]:
-        """Return the meshes of a file, from the cache or by `load`; none, with a note, if not."""
+        """Return the meshes of a file, from the cache or by `load`; empty for an unusable file."""
         file = self._file(uri, source)
         if file is None:
             return []
@@ -206,7 +206,7 @@ class LinkMeshes:
         return self._files[key]
 
     def _load(self, file: Source) -> list[SceneMesh]:
-        """Return the meshes of a file; LidarError if it cannot be read."""
+        """Return the meshes of a file; LidarError for an unusable file."""
         if file.path.suffix.lower() not in MESHES:
             raise LidarError(f"Gazebo reads meshes of {' '.join(MESHES)}.")
         # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
@@ -222,7 +222,7 @@ class LinkMeshes:
         return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
 
     def _load_skin(self, file: Source) -> list[SceneMesh]:
-        """Return the meshes of a file, those that a skeleton moves at rest."""
+        """Return the meshes of a file, with skins at rest."""
         if file.path.suffix.lower() != ".dae":
             return self._load(file)
         options = self.options._replace(
@@ -240,7 +240,7 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
 
     def _file(self, uri: str, source: Source) -> Source | None:
-        """Return the file of a URI; None, with a note, if it is missing."""
+        """Return the file of a URI; None, with a note, for a missing file."""
         try:
             return self.resources.file(uri, source)
         except MissingFileError as error:
@@ -249,7 +249,7 @@ class LinkMeshes:
 
 
 def _retro(link: Element, shape: Element) -> float:
-    """Return the <laser_retro> of a shape, or else of the first collision shape with one; or 0."""
+    """Return the <laser_retro> of a shape, or of the first collision shape that has any; else 0."""
     for candidate in (shape, *link.findall("collision")):
         value = float(numbers_of(candidate, "laser_retro", 1, "0").item())
         if value > 0:

@@ -52,9 +52,9 @@ class Notes:
 
     def check_children(self, element: Element) -> None:
         """Note the children of an element that SDFormat does not define; prefixes are free."""
-        known = _KNOWN[element.tag]
+        defined_tags = _KNOWN[element.tag]
         for child in element:
-            if child.tag not in known and ":" not in child.tag and child.tag not in _POSED:
+            if child.tag not in defined_tags and ":" not in child.tag and child.tag not in _POSED:
                 self.unknown[f"{element.tag}/{printable(child.tag)[:40]}"] = None
 
     def lines(self) -> Iterator[str]:
@@ -80,13 +80,13 @@ def _line(verb: str, noun: str, names: Counter[str]) -> Iterator[str]:
     """Yield a clause on missing things, if any, with all names up to a limit."""
     if names:
         count = plural(len(names), noun)
-        places = f", in {sum(names.values()):,} places" if names.total() > len(names) else ""
+        uses = f", in {sum(names.values()):,} places" if names.total() > len(names) else ""
         pronoun = "which is" if len(names) == 1 else "which are"
-        yield f"{verb} {count}, {pronoun} left out{places}: {listed([*names], _MAX_NAMES)}"
+        yield f"{verb} {count}, {pronoun} left out{uses}: {listed([*names], _MAX_NAMES)}"
 
 
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
-    """Yield the first lines on meshes, and the number of further ones."""
+    """Yield the first lines on meshes, and the number of further lines."""
     all_lines = [*lines]
     yield from (f"names a mesh: {line}" for line in all_lines[:max_lines])
     further = len(all_lines) - max_lines

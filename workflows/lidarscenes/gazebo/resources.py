@@ -38,7 +38,7 @@ class MissingFileError(Exception):
 
 
 class Source(NamedTuple):
-    """A file of SDFormat, and the folder that must contain what its relative names lead to."""
+    """A file of SDFormat, and the folder that must contain the files of its relative names."""
 
     path: Path
     root: Path
@@ -74,8 +74,8 @@ class Resources:
         default = folder.parent if folder.name.lower() in _WORLD_FOLDERS else folder
         root = next((f for f in above if (f / "package.xml").is_file()), default)
         named = [*assets, *_folders_of(FOLDER_VARIABLES), *_existing([_MODELS])]
-        near = [f / name for f in above for name in ("", "models")]
-        folders = dict.fromkeys([*named, *(f for f in near if f.is_dir())])
+        nearby = [f / name for f in above for name in ("", "models")]
+        folders = dict.fromkeys([*named, *(f for f in nearby if f.is_dir())])
         caches = [*_folders_of(CACHE_VARIABLES), *_existing(CACHES)]
         trusted = [f.resolve() for f in [root, *named, *caches]]
         return cls(Source(path, root), tuple(folders), tuple(trusted), tuple(caches))
@@ -105,7 +105,7 @@ class Resources:
         raise MissingFileError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield what a URI may name, as far as it exists; LidarError if it must not be read."""
+        """Yield the existing paths that a URI may name; LidarError if a path must not be read."""
         for path, root in self._candidates(uri, source):
             try:
                 if not path.exists():
@@ -155,9 +155,9 @@ class Resources:
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
             return
-        _, owner, _, name, *rest = parts
-        version = rest[0] if rest and rest[0] != "files" else ""
-        file = "/".join(rest[rest.index("files") + 1 :]) if "files" in rest else ""
+        _, owner, _, name, *options = parts
+        version = options[0] if options and options[0] != "files" else ""
+        file = "/".join(options[options.index("files") + 1 :]) if "files" in options else ""
         for cache in self.caches:
             for host in _existing_folders(cache, "*"):
                 folders = [host]
@@ -186,7 +186,7 @@ def _folders_of(variables: tuple[str, ...]) -> list[Path]:
 
 
 def _existing(names: list[str] | tuple[str, ...]) -> list[Path]:
-    """Return the folders of some names that exist."""
+    """Return the folders that exist among names."""
     folders = [Path(os.path.expanduser(name)) for name in names]  # noqa: PTH111 - never fails
     return [folder for folder in folders if folder.is_dir()]
 
@@ -216,10 +216,10 @@ def _newest_file(folder: Path) -> Path:
     for name in _CONFIGS:
         if (folder / name).is_file():
             files = _configured_files(folder / name)
-            known = {version: file for version, file in files.items() if version <= _SDF_VERSION}
-            for version in sorted(known, reverse=True):
-                if "/" not in known[version] and (folder / known[version]).is_file():
-                    return folder / known[version]
+            for version in sorted(files, reverse=True):
+                file = folder / files[version]
+                if version <= _SDF_VERSION and file.parent == folder and file.is_file():
+                    return file
     if (folder / "model.sdf").is_file():
         return folder / "model.sdf"
     raise MissingFileError(printable(folder.name))
@@ -235,6 +235,6 @@ def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
 
 
 def _version(entry: Element) -> tuple[int, ...]:
-    """Return the version of an <sdf>: (1, 6); (0,) if it states none."""
+    """Return the version of an <sdf>: (1, 6); (0,) without a version."""
     parts = entry.get("version", "").split(".")
     return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else (0,)

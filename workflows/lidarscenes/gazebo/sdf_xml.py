@@ -61,7 +61,7 @@ class _Parser:
         return self._root
 
     def _after_markup(self, start: int) -> int:
-        """Read the markup at a position; return the position after it."""
+        """Read the markup at a position; return the position after the markup."""
         text = self._text
         for first, last in _SKIPPED.items():
             if text.startswith(first, start):
@@ -90,7 +90,7 @@ class _Parser:
         return stop + len(mark)
 
     def _after_declaration(self, start: int) -> int:
-        """Return the position after a <!DOCTYPE …>; ValueError if it declares anything."""
+        """Return the position after a <!DOCTYPE …>; ValueError for declarations."""
         stop = self._end_of(start, ">")
         declaration = self._text[start:stop]
         if "[" in declaration or not declaration.upper().startswith("<!DOCTYPE"):
@@ -98,7 +98,7 @@ class _Parser:
         return stop
 
     def _start_element(self, tag: re.Match[str], start: int) -> None:
-        """Open an element, and end an empty one."""
+        """Open an element, which is closed if empty."""
         self._count += 1
         if self._count > MAX_ELEMENTS:
             raise ValueError(f"it has more than {MAX_ELEMENTS:,} elements")
@@ -140,7 +140,7 @@ class _Parser:
 
 
 def _character(reference: re.Match[str]) -> str:
-    """Return the character of a reference; ValueError for other entities."""
+    """Return the character of a reference; ValueError for an entity."""
     name = reference[1]
     if name in _CHARACTERS:
         return _CHARACTERS[name]

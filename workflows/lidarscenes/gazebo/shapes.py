@@ -233,16 +233,17 @@ def road_mesh(road: Element) -> SceneMesh | None:
     points = points[follows]
     if len(points) < 2 or not width:
         return None
-    along = np.gradient(points[:, :2], axis=0)
-    lengths = length(along)[:, None]
-    along = np.where(lengths > 0, along / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
-    across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(points))]) * (width / 2)
-    left = np.arange(len(points))
-    right = left + len(points)
+    steps = np.gradient(points[:, :2], axis=0)
+    lengths = length(steps)[:, None]
+    directions = np.where(lengths > 0, steps / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
+    across = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))])
+    across *= width / 2
+    left_rim = np.arange(len(points))
+    right_rim = left_rim + len(points)
     faces = np.concatenate(
         [
-            np.stack([right[:-1], right[1:], left[:-1]], axis=1),
-            np.stack([right[1:], left[1:], left[:-1]], axis=1),
+            np.stack([right_rim[:-1], right_rim[1:], left_rim[:-1]], axis=1),
+            np.stack([right_rim[1:], left_rim[1:], left_rim[:-1]], axis=1),
         ]
     )
     return SceneMesh("road", np.concatenate([points + across, points - across]), faces)

@@ -27,7 +27,7 @@ class State:
 
 
 def state_of(world: Element) -> State:
-    """Return the last state of a world; an empty one without <state>."""
+    """Return the last state of a world; an empty state without <state>."""
     state = State()
     elements = world.findall("state")
     if not elements:

@@ -80,9 +80,11 @@ class World:
             if child.name not in state.deleted
         ]
         while stack:
-            instance, outer, around, outermost = stack.pop()
+            instance, outer, outer_matrix, outermost = stack.pop()
             path = (*outer, instance.name)
-            matrix = instance.matrix if around is None else matmul(around, instance.matrix)
+            matrix = instance.matrix
+            if outer_matrix is not None:
+                matrix = matmul(outer_matrix, matrix)
             matrix = state.poses.get(scoped(path), matrix)
             outermost = matrix if outermost is None else outermost
             scale = state.scales.get(path[0], NO_SCALE)
