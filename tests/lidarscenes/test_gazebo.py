@@ -339,6 +339,21 @@ def test_colours_materials_and_retro_are_those_of_visuals(tmp_path):
     assert load(tmp_path, text)[0]["red/link"].colours is None
 
 
+def test_images_of_meshes_are_in_the_folder_of_textures(tmp_path):
+    mesh = "<mesh><uri>model://chair/meshes/chair.obj</uri></mesh>"
+    add_model(tmp_path, "chair", sdf(model("chair", link(inside=shape(mesh)))))
+    write(tmp_path / "chair" / "meshes" / "chair.mtl", "newmtl wood\nmap_Kd wood.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    text = f"mtllib chair.mtl\n{corners}usemtl wood\nf 1/1 2/2 3/3\n"
+    textures = tmp_path / "chair" / "materials" / "textures"
+    write(tmp_path / "chair" / "meshes" / "chair.obj", text)
+    textures.mkdir(parents=True)
+    Image.new("RGB", (4, 4), (200, 100, 50)).save(textures / "wood.png")
+    objects, _, notes = load(tmp_path, world(include("model://chair")), colours=True)
+    assert not notes
+    assert objects["chair/link"].colours.means().tolist() == [[200, 100, 50]]
+
+
 def test_actors_follow_their_waypoints(tmp_path):
     write(tmp_path / "skin.dae", DAE)
     script = """<script><loop>{loop}</loop><delay_start>1</delay_start>

@@ -216,7 +216,7 @@ class LinkMeshes:
             opacity="mask" if self.options.masks else "ignore",
             colours=self.options.colours,
             materials=self.options.materials,
-            assets=file.root,
+            assets=self._asset_folders(file),
             tell=lambda line: self.notes.of_meshes.setdefault(_without_path(line, file.path)),
         )
         return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
@@ -226,7 +226,7 @@ class LinkMeshes:
         if file.path.suffix.lower() != ".dae":
             return self._load(file)
         options = self.options._replace(
-            folders=(file.path.parent.resolve(), file.root), skins_at_rest=True
+            folders=(file.path.parent.resolve(), *self._asset_folders(file)), skins_at_rest=True
         )
         try:
             with np.errstate(all="ignore"):
@@ -238,6 +238,13 @@ class LinkMeshes:
         flat = [item.flat() if isinstance(item, SceneInstance) else item for item in content.meshes]
         unit = (content.unit_m or 1.0) * np.eye(3)
         return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
+
+    def _asset_folders(self, file: Source) -> list[Path]:
+        """Return the folders from which a mesh file may take images, the model's textures first."""
+        textures = (folder / "materials" / "textures" for folder in file.path.resolve().parents)
+        within = (folder for folder in textures if folder.is_relative_to(file.root))
+        existing = (folder for folder in within if folder.is_dir())
+        return [*existing, file.root, *self.resources.trusted]
 
     def _file(self, uri: str, source: Source) -> Source | None:
         """Return the file of a URI; None, with a note, for a missing file."""

@@ -99,7 +99,7 @@ def load_objects(
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
-    assets: str | Path | None = None,
+    assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
     geometry: Geometry | None = None,
     tell: Callable[[str], None] = warn,
@@ -115,7 +115,7 @@ def load_objects(
     ----------
     path, unit, up_axis, transform, opacity, colours, materials, assets
         See `Scene.load`; the path has an ending of `mesh_formats`, in upper or lower case. The unit
-        of a raster is the unit of its heights.
+        of a raster is the unit of its heights. `assets` may be several folders.
     step_m
         Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
     window
@@ -155,11 +155,11 @@ def load_objects(
     _check_geometry(path, row, geometry)
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
-    folders = [path.parent] if assets is None else [path.parent, Path(assets)]
+    asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
     options = ReadOptions(
         masks=opacity == "mask" and animation is None,
         colours=colours,
-        folders=tuple(folder.resolve() for folder in folders),
+        folders=tuple(folder.resolve() for folder in (path.parent, *asset_folders)),
         animation=animation,
         materials=materials,
         raster=raster,
