@@ -185,7 +185,7 @@ class BodyReader:
         ]
 
     def model(self, element: Element, source: Source) -> Body:
-        """Return the body of a <model>; LidarError if models include each other in a circle."""
+        """Return the body of a <model>; LidarError if includes go in a circle."""
         key = id(element)
         if key in self._open_elements:
             raise LidarError("it includes itself, by its own files: remove an <include>.")
@@ -224,7 +224,7 @@ class BodyReader:
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
-        """Return the model of a file; None without one, or if the file cannot be read."""
+        """Return the model of a file; None without a model, or for an unreadable file."""
         path = source.path.resolve()
         if path not in self._files:
             self._files[path] = None

@@ -131,7 +131,7 @@ def _pose(matrix: Floats) -> dict[str, Any]:
 
 
 def _materials(world: World) -> dict[str, Any]:
-    """Return the section of materials, if a shape states how it reflects a lidar's light."""
+    """Return the section of materials, for shapes with a <laser_retro>."""
     if not any(_has_retro(link.link.element) for link in world.links):
         return {}
     return {"materials": [{"objects": "*", "reflectance": "texture"}]}

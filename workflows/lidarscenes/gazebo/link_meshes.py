@@ -104,7 +104,7 @@ class LinkMeshes:
         return moved
 
     def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
-        """Return a mesh with colour and material of its visual, unless its file has them."""
+        """Return a mesh with colour and material of its visual, unless its file has any."""
         colour = appearance.colour
         is_plain = mesh.colours is None or appearance.is_retro
         if self.options.colours and colour is not None and is_plain:

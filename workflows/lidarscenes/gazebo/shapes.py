@@ -153,7 +153,7 @@ def _ring(polyline: Element) -> Floats:
 
 
 def _area(ring: Floats) -> float:
-    """Return the area of a ring (n, 2), positive if it runs anticlockwise."""
+    """Return the area of a ring (n, 2), positive for an anticlockwise ring."""
     x, y = (ring - ring[0]).T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 

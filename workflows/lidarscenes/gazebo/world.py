@@ -55,7 +55,7 @@ class PlacedLink(NamedTuple):
 
 @dataclass(eq=False)
 class World:
-    """A world, or a file of models, with the links of all models in it."""
+    """A world, or a file of models, with the links of all models."""
 
     element: Element
     source: Source
@@ -125,7 +125,7 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
-    """Read a file of SDFormat, and the models that it includes.
+    """Read a file of SDFormat, and the included models.
 
     Parameters
     ----------
