@@ -265,7 +265,7 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
             "xacro arm.urdf > arm.exp",
         ),
         ("<robot><xacro:arm/></robot>", "xacro arm.urdf > arm.expanded.urdf"),
-        ("<sdf version='1.7'/>", "convert an SDF"),
+        ("<sdf version='1.7'/>", "the ending .sdf, as a scene"),
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "XML entity"),
     ):
         path.write_text(text)
@@ -575,7 +575,6 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
 @pytest.mark.parametrize(
     ("name", "way"),
     [
-        ("a.sdf", "sdf2usd"),
         ("a.xml", "mujoco-usd-converter, lidarpool import"),
         ("a.mjcf", "mujoco"),
     ],

@@ -92,7 +92,6 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
     [
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
         (["--mesh", "notes.txt"], "notes.txt has the ending .txt, which is not a mesh format"),
-        (["--mesh", "rover.sdf"], "rover.sdf is not read: it is a world or model of Gazebo"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),

@@ -47,9 +47,41 @@ def import_by(
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
+    """Write a survey as a scenario by a plug-in; see `import_whole`, whose errors it raises.
+
+    Raises
+    ------
+    LidarError
+        Also if the plug-in fails.
+    """
+    load: Importer = plugin.load(Callable)  # type: ignore[arg-type]
+
+    def write(survey: Path, partial: Path, assets: Sequence[Path]) -> list[str]:
+        try:
+            left_out = [*map(str, load(survey, partial, assets))]
+        except LidarError:
+            raise
+        except Exception as error:  # a plug-in may raise anything
+            reason = printable(str(error)) or type(error).__name__
+            raise LidarError(f"{plugin} fails ({reason}).") from error
+        if not (partial / SCENARIO_FILE).is_file():
+            raise LidarError(f"{plugin} wrote no {SCENARIO_FILE}.")
+        return left_out
+
+    return import_whole(write, survey, folder, assets, check)
+
+
+def import_whole(
+    write: Importer,
+    survey: Path,
+    folder: Path,
+    assets: Sequence[Path],
+    check: Callable[[Path], object],
+) -> list[str]:
     """Write a survey as a scenario into a new folder, completely or not at all.
 
-    `check` reads the scenario and raises LidarError for a scenario that cannot be simulated.
+    `write` writes the files; `check` reads the scenario and raises LidarError for a scenario that
+    cannot be simulated.
 
     Returns
     -------
@@ -58,26 +90,20 @@ def import_by(
     Raises
     ------
     LidarError
-        If the folder exists, the plug-in fails, or the scenario is refused.
+        If the folder exists, the survey cannot be written, or the scenario is refused.
     """
     if folder.exists():
         raise LidarError(f"{folder} exists: name another folder, --out DIR.")
-    write: Importer = plugin.load(Callable)  # type: ignore[arg-type]
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        left_out = [*map(str, write(survey, partial, assets))]
-        if not (partial / SCENARIO_FILE).is_file():
-            raise LidarError(f"{plugin} wrote no {SCENARIO_FILE}.")
+        left_out = [*write(survey, partial, assets)]
         check(partial / SCENARIO_FILE)
         partial.chmod(0o755)  # temporary folders are their owner's alone
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
         raise LidarError(f"{survey} makes no scenario: {message}") from error
-    except Exception as error:  # a plug-in may raise anything
-        reason = printable(str(error)) or type(error).__name__
-        raise LidarError(f"{survey} makes no scenario: {plugin} fails ({reason}).") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return left_out

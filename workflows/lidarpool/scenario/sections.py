@@ -31,7 +31,7 @@ from lidarsim.base.declared import (
 )
 from lidarsim.base.validation import STRICT
 from lidarsim.base.vocabulary import BACKENDS, UNITS_M
-from lidarsim.scene.files.meshfile import OpacityMode
+from lidarsim.scene.files.meshfile import Geometry, OpacityMode
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor import Mounted, Noise, Pose, Returns, Sensor
 from lidarsim.sensor.beams import Rate, Step
@@ -85,8 +85,8 @@ class MeshFile(Section):
         str,
         about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
-            "AMAPVox (.vox), a robot that stands still (.urdf), or a raster of heights: .tif .asc "
-            ".hgt .img .dem .dt2; from the scenario's folder",
+            "AMAPVox (.vox), a world of Gazebo (.sdf), a robot that stands still (.urdf), or a "
+            "raster of heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -122,6 +122,10 @@ class MeshFile(Section):
         OpacityMode,
         about("mask: light passes where the image of a material is transparent; ignore: nowhere"),
     ] = "mask"
+    geometry: Annotated[
+        Geometry | None,
+        about("of a world of Gazebo: its visual shapes, or those for collision", "collision"),
+    ] = None
     assets: Annotated[
         Text | None,
         about(

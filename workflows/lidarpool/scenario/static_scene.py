@@ -44,6 +44,8 @@ from .sections import (
     file_states,
 )
 
+# Fields of a mesh file's entry that are options of `load_objects`, with the same names.
+_READING_FIELDS = {"unit", "up_axis", "opacity", "step_m", "window", "geometry"}
 # Fields of a mesh file's entry that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
 
@@ -235,7 +237,7 @@ class Shapes:
             return self._still_robot(entry, transform)
         objects = load_objects(
             scenario.path(entry.file),
-            **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
+            **entry.model_dump(include=_READING_FIELDS),
             transform=transform,
             colours=scenario.coloured,
             materials=scenario.names_materials,

@@ -62,7 +62,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     allowance = Allowance(len(data), SMALLER)
     paint = _Effects(path, options, allowance) if options.colours else None
-    document = _Document(root, allowance, paint, name_materials=options.materials)
+    document = _Document(root, allowance, paint, options)
     content = placed_content(placed_nodes(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
@@ -79,12 +79,13 @@ class _Document:
     """Elements of a file by their ids; each geometry is read once."""
 
     def __init__(
-        self, root: Element, allowance: Allowance, paint: _Effects | None, *, name_materials: bool
+        self, root: Element, allowance: Allowance, paint: _Effects | None, options: ReadOptions
     ) -> None:
         self._root = root
         self._allowance = allowance
         self._paint = paint
-        self._names_materials = name_materials
+        self._names_materials = options.materials
+        self._skins_at_rest = options.skins_at_rest
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
@@ -105,6 +106,7 @@ class _Document:
         meshes: list[SceneMesh] = []
         children = []
         matrix = np.eye(4)
+        is_skinned = False
         for child in element:
             if child.tag == "node":
                 children.append(child)
@@ -113,6 +115,9 @@ class _Document:
             elif child.tag == "instance_geometry":
                 bound = self._bound_materials(child) if self._paint or self._names_materials else ()
                 meshes += self._geometry(self._target(child, "geometry"), bound)
+            elif child.tag == "instance_controller" and self._skins_at_rest:
+                meshes += self._skin(self._target(child, "controller"), child)
+                is_skinned = True
             elif child.tag == "instance_controller":
                 raise MeshFileError(
                     "moves vertices by a skin (a skeleton) or a morph, which is not supported: "
@@ -123,7 +128,20 @@ class _Document:
             elif child.tag == "skew":
                 raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
         name = element.get("name", "") if element.tag == "node" else ""
-        return Node(name, matrix, meshes, children)
+        return Node(name, matrix, meshes, children, skinned=is_skinned)
+
+    def _skin(self, controller: Element, instance: Element) -> list[SceneMesh]:
+        """Return the meshes of a skin where its joints are at rest, in the file's coordinates."""
+        skin = controller.find("skin")
+        if skin is None:
+            raise MeshFileError("moves vertices by a morph, which is not supported: apply it")
+        bound = self._bound_materials(instance) if self._paint or self._names_materials else ()
+        shape = skin.find("bind_shape_matrix")
+        matrix = np.eye(4) if shape is None else _numbers(shape).reshape(4, 4)
+        return [
+            mesh.moved(mesh.name, matrix[:3, :3], matrix[:3, 3])
+            for mesh in self._geometry(self._target(skin, "geometry"), bound)
+        ]
 
     def _target(self, element: Element, kind: str) -> Element:
         """Return the element of a kind that an element names, or raise MeshFileError."""

@@ -6,6 +6,7 @@ from lidarsim.scene.files.mesh_formats import MeshFormat
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
 ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
+WORLDS = (".sdf", ".world")  # of Gazebo
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"
@@ -31,5 +32,6 @@ MESH_FORMATS = (
         from_path=True,
         raster=True,
     ),
+    MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

@@ -24,20 +24,20 @@ from lidarsim.base.validation import checked, shown
 from lidarsim.base.vectors import length
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
-from lidarsim.scene.actors import box, join_meshes
+from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import OpacityMode, load_meshes, warn
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.scene.shapes import capsule, cylinder
+from lidarsim.scene.shapes import capsule
 from lidarsim.scene.transform import affine
 from lidarsim.sensor.trajectory import rotations_of
 
+from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot
 
 _MAX_LINKS = 1000  # humanoids with hands have 150
-_SIDES = 64  # of a cylinder: its faces are 0.12 % of the radius inside it at most
 _MAX_FOLDERS_UP = 5  # folders above a robot's file in which its packages are looked for
 _MAX_NUMBER = 1e8  # in a file
 
@@ -117,7 +117,7 @@ def _read_root(path: Path) -> tuple[Element, int]:
     if any("xacro" in element.tag for element in root.iter()):
         raise LidarError(expand)
     if root.tag != "robot":
-        advice = "; convert an SDF to URDF first" * (root.tag == "sdf")
+        advice = "; give a file of Gazebo the ending .sdf, as a scene" * (root.tag == "sdf")
         raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{advice}.")
     return root, len(data)
 
@@ -327,20 +327,20 @@ class _LinkMeshes:
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
         if shape.tag == "box":
             size = self._sizes(_numbers(shape, "size", 3, ""))
-            return size, [_BOX]
+            return size, [UNIT_BOX]
         if shape.tag not in ("cylinder", "sphere", "capsule"):
             raise LidarError(
                 f"its shape is <{shape.tag[:40]}>; there are mesh, box, cylinder, sphere, capsule."
             )
         (radius,) = self._sizes(_numbers(shape, "radius", 1, ""))
         if shape.tag == "sphere":
-            return np.full(3, radius), [_BALL]
+            return np.full(3, radius), [UNIT_BALL]
         (length,) = self._sizes(_numbers(shape, "length", 1, ""))
         if shape.tag == "cylinder":
-            return np.array([radius, radius, length]), [_ROD]
+            return np.array([radius, radius, length]), [UNIT_CYLINDER]
         if not radius:
             return np.zeros(3), []
-        return np.ones(3), [capsule(radius, length, _SIDES, "capsule")]
+        return np.ones(3), [capsule(radius, length, SIDES, "capsule")]
 
     def _sizes(self, sizes: Floats) -> Floats:
         """Return sizes of a shape; LidarError for a negative size."""
@@ -404,9 +404,3 @@ def _package_name(folder: Path) -> str:
         return (xml_root(read_input(file)).findtext("name") or "").strip()
     except (OSError, ValueError, LookupError, ParseError, LidarError):
         return ""
-
-
-# Shapes of size 1, or of radius 1.
-_BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
-_BALL = capsule(1, 0, _SIDES, "sphere")
-_ROD = cylinder(1, 1, _SIDES, "cylinder")

@@ -85,6 +85,29 @@ def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) ->
         return np.asarray(rgb)
 
 
+def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Floats:
+    """Return the brightness of an image, a height map: float64 (h, w), from 0 up.
+
+    Memory for `bytes_per_pixel` more, for the mesh that is made of the pixels, is taken from the
+    allowance before the image is decoded.
+
+    Raises
+    ------
+    MaskError
+        If the image cannot be decoded, or takes more memory than allowed.
+    """
+    with _opened(image) as opened:
+        pixels = opened.width * opened.height
+        if not allowance.fits((PIXEL_BYTES + bytes_per_pixel) * pixels):
+            raise _TooLargeError
+        allowance.take((8 + bytes_per_pixel) * pixels)
+        is_grey = opened.mode in ("L", "I", "F") or opened.mode.startswith("I;16")
+        values = np.asarray(opened if is_grey else opened.convert("L"), np.float64)
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise MaskError(f"{image.name} has no heights")
+    return values
+
+
 @contextmanager
 def _opened(image: Path | bytes) -> Iterator[Image.Image]:
     """Open an image for the body; MaskError for all errors, also in the body."""

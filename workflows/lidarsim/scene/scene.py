@@ -23,7 +23,7 @@ from ..sensor.materials import SurfaceKinds
 from .actors import Actor
 from .colours import GREY, Colours, are_indices, join_colours
 from .face_materials import ObjectMaterials
-from .files.meshfile import Objects, OpacityMode, load_objects, warn
+from .files.meshfile import Geometry, Objects, OpacityMode, load_objects, warn
 from .files.scene_graph import Window
 from .object_names import SameNames, resolve_same_names, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
@@ -142,6 +142,7 @@ class Scene:
         window: Window | None = None,
         epsg: int | None = None,
         assets: str | Path | None = None,
+        geometry: Geometry | None = None,
         same_names: SameNames = "number",
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
@@ -172,7 +173,10 @@ class Scene:
             Options of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
         assets
             A folder: further files that the scene file names are read from this folder and from
-            the folder of the scene file, and from the folders below.
+            the folder of the scene file, and from the folders below. Of a world of Gazebo, models
+            are looked for in it first.
+        geometry
+            Of a world of Gazebo, its "visual" shapes, as by default, or those for "collision".
         same_names
             With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
             objects of a name are one object.
@@ -198,6 +202,7 @@ class Scene:
             window=window,
             epsg=epsg,
             assets=assets,
+            geometry=geometry,
         )
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")

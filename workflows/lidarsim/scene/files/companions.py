@@ -16,8 +16,9 @@ def named_file(
     """Return the path of a file that a mesh file names, or None if the file does not exist.
 
     Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
-    be of another machine: then their last part counts, if `allow_moved`. A pipe does not count as
-    a file, since reading a pipe would wait for ever.
+    be of another machine: then their last part counts, if `allow_moved`, in the folder of the mesh
+    file and in those of assets. A pipe does not count as a file, since reading a pipe would wait
+    for ever.
 
     Raises
     ------
@@ -27,9 +28,12 @@ def named_file(
     name = name.strip().removeprefix("file://")
     windows = PureWindowsPath(unquote(name))
     refused = False
-    base_name = windows.name if allow_moved else ""
-    for candidate in filter(None, (name, unquote(name), windows.as_posix(), base_name)):
-        target = mesh.parent.resolve() / candidate
+    names = filter(None, (name, unquote(name), windows.as_posix()))
+    targets = [mesh.parent.resolve() / candidate for candidate in names]
+    if allow_moved and windows.name:
+        folders = dict.fromkeys((mesh.parent.resolve(), *options.folders))
+        targets += [folder / windows.name for folder in folders]
+    for target in targets:
         try:
             if not options.allows(target):
                 refused = True

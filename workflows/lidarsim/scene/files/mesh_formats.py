@@ -50,6 +50,8 @@ class MeshFormat:
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
         Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
+    collisions
+        Whether files may have shapes for collisions, see `ReadOptions.collisions`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -62,6 +64,7 @@ class MeshFormat:
     signatures: tuple[bytes, ...] = ()
     from_path: bool = False
     raster: bool = False
+    collisions: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -120,11 +123,6 @@ _NOT_READ = (
         (".pcap", ".mcap", ".bag", ".db3", ".osf"),
         advice="it is a recording, write its points as .ply, .pcd or .las and make a mesh of "
         "these by lidarpool scene points",
-    ),
-    MeshFormat(
-        (".sdf", ".world"),
-        advice="it is a world or model of Gazebo, convert it to OpenUSD (sdf2usd of gz-usd) or "
-        "URDF, or name the meshes that it names",
     ),
     MeshFormat(
         (".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"),

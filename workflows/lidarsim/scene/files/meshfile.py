@@ -55,6 +55,7 @@ _MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
 _HEAD_BYTES = 200  # bytes of a file that contain such a comment
 
 OpacityMode = Literal["mask", "ignore"]
+Geometry = Literal["visual", "collision"]
 
 _log = logging.getLogger(__name__)
 
@@ -98,8 +99,9 @@ def load_objects(
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
-    assets: str | Path | None = None,
+    assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
+    geometry: Geometry | None = None,
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
@@ -113,7 +115,7 @@ def load_objects(
     ----------
     path, unit, up_axis, transform, opacity, colours, materials, assets
         See `Scene.load`; the path has an ending of `mesh_formats`, in upper or lower case. The unit
-        of a raster is the unit of its heights.
+        of a raster is the unit of its heights. `assets` may be several folders.
     step_m
         Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
     window
@@ -126,6 +128,8 @@ def load_objects(
         Name of the animation to play by the meshes, or the number of an animation without a name;
         "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
         leaves all meshes static.
+    geometry
+        Of a world of Gazebo: its "visual" shapes, which is None as well, or those for "collision".
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -148,16 +152,18 @@ def load_objects(
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
     raster = RasterOptions(unit, step_m, window, epsg)
     _check_options(path, row, raster, up_axis, animation)
+    _check_geometry(path, row, geometry)
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
-    folders = [path.parent] if assets is None else [path.parent, Path(assets)]
+    asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
     options = ReadOptions(
         masks=opacity == "mask" and animation is None,
         colours=colours,
-        folders=tuple(folder.resolve() for folder in folders),
+        folders=tuple(folder.resolve() for folder in (path.parent, *asset_folders)),
         animation=animation,
         materials=materials,
         raster=raster,
+        collisions=geometry == "collision",
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
@@ -234,6 +240,15 @@ def _check_options(
         raise LidarError(
             f"{path} has no animations that are read: give a {' or '.join(animated)}, or leave out "
             "animation."
+        )
+
+
+def _check_geometry(path: Path, row: MeshFormat, geometry: Geometry | None) -> None:
+    """Check that a format has shapes for collisions if a kind is asked for; LidarError if not."""
+    if geometry is not None and not row.collisions:
+        raise LidarError(
+            f"{path} has no shapes for collisions: leave out geometry, or give a "
+            f"{' or '.join(endings(lambda row: row.collisions))}."
         )
 
 

@@ -75,6 +75,8 @@ class ReadOptions(NamedTuple):
     animation: str | None = None  # name of the animation to bake; "" for the first
     materials: bool = False  # names of the materials of faces
     raster: RasterOptions = RasterOptions()
+    collisions: bool = False  # shapes for collisions in place of visible ones, of worlds
+    skins_at_rest: bool = False  # meshes that a skeleton moves, which else are refused
 
     def allows(self, file: Path) -> bool:
         """Return True if a file that the mesh file names may be read."""

@@ -1,0 +1,14 @@
+"""Shapes of size 1, or of radius 1, around zero, which robots and worlds are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsim.scene.actors import box
+from lidarsim.scene.shapes import capsule, cylinder
+
+SIDES = 64  # of a circle: its sides are 0.12 % of the radius inside it at most
+
+UNIT_BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
+UNIT_BALL = capsule(1, 0, SIDES, "sphere")
+UNIT_CYLINDER = cylinder(1, 1, SIDES, "cylinder")

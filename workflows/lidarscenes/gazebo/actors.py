@@ -1,0 +1,101 @@
+"""Actors of Gazebo: skins that follow waypoints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.words import printable
+from lidarsim.scene.actors import join_meshes
+from lidarsim.scene.files.scene_graph import PlacedNode, RigidPart
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from .frames import matrix_of, numbers_of, pose_of
+from .link_meshes import LinkMeshes
+from .notes import Notes
+from .resources import Source
+
+_LOOP_S = 600.0  # for which a script that loops is repeated
+_MAX_POSES = 5000  # of an actor
+_JUMP_S = 1e-3  # in which an actor goes from its last waypoint to its first
+
+
+class Actors(NamedTuple):
+    """Actors of a world."""
+
+    moving: list[RigidPart]
+    standing: list[PlacedNode]
+
+
+def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
+    """Return the actors of a world, with their skins at rest."""
+    actors = Actors([], [])
+    for element in world.findall("actor"):
+        notes.check_children(element)
+        name = printable(element.get("name", "")) or "actor"
+        with prefixed(f"actor {name!r}"):
+            mesh = _skin(element, source, meshes)
+            if mesh is None:
+                continue
+            notes.further["has actors, whose skins are at rest"] = None
+            times_s, poses = _waypoints(element)
+            if len(times_s) < 2:
+                actors.standing.append(PlacedNode(mesh, poses[0], name))
+            else:
+                part = RigidPart(name, [mesh], times_s, poses[:, :3, 3], poses[:, :3, :3])
+                actors.moving.append(part)
+    return actors
+
+
+def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
+    """Return the skin of an actor; None without a skin, or if its file is missing."""
+    skin = actor.find("skin")
+    if skin is None:
+        return None
+    parts = meshes.skin_meshes((skin.findtext("filename") or "").strip(), source)
+    scale = numbers_of(skin, "scale", 1, "1").item()
+    if not parts or not scale:
+        return None
+    joined = join_meshes("skin", parts)
+    return joined.moved("skin", scale * np.eye(3), np.zeros(3))
+
+
+def _waypoints(actor: Element) -> tuple[Floats, Floats]:
+    """Return times (k,), seconds, and poses (k, 4, 4) of an actor; k is 1 if the actor stands."""
+    script = actor.find("script")
+    entries = [] if script is None else script.findall("trajectory/waypoint")
+    if not entries:
+        return np.zeros(1), pose_of(actor).matrix[None]
+    times_s = np.array([numbers_of(entry, "time", 1, "0").item() for entry in entries])
+    poses = np.array([_waypoint_pose(entry) for entry in entries])
+    times_s, rows = np.unique(times_s, return_index=True)
+    poses = poses[rows]
+    assert script is not None, "of entries"
+    delay_s = numbers_of(script, "delay_start", 1, "0").item()
+    if (script.findtext("loop") or "true").strip() in ("true", "1") and times_s[-1] > 0:
+        times_s, poses = _repeated(times_s, poses)
+    return times_s + delay_s, poses
+
+
+def _waypoint_pose(waypoint: Element) -> Floats:
+    """Return the pose (4, 4) of a waypoint in the world; LidarError without a pose."""
+    pose = waypoint.find("pose")
+    if pose is None:
+        raise LidarError("a <waypoint> has no <pose>.")
+    return matrix_of(pose)
+
+
+def _repeated(times_s: Floats, poses: Floats) -> tuple[Floats, Floats]:
+    """Return waypoints repeated for `_LOOP_S` or longer, but `_MAX_POSES` at most."""
+    duration_s = float(times_s[-1])
+    # A second round begins a moment after the first one ends.
+    start_s = np.maximum(times_s, _JUMP_S) if duration_s > _JUMP_S else times_s
+    start_s, rows = np.unique(start_s, return_index=True)
+    rounds = int(min(np.ceil(_LOOP_S / duration_s), _MAX_POSES // len(poses)))
+    later = [start_s + k * duration_s for k in range(1, max(rounds, 1))]
+    all_times = np.concatenate([times_s, *later])
+    return all_times, np.concatenate([poses, *[poses[rows]] * len(later)])

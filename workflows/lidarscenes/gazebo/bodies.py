@@ -1,0 +1,260 @@
+"""Models of SDFormat as trees of bodies, with the frames that place links and nested models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.input_files import read_input
+from lidarsim.base.vectors import matmul
+from lidarsim.base.words import printable
+from lidarsim.scene.files.scene_graph import MAX_NODES
+
+from .frames import Frames, RelativePose, placed_by, pose_of
+from .notes import Notes
+from .resources import MissingFileError, Resources, Source, short_name
+from .sdf_xml import sdf_root
+
+_MAX_NESTED = 30  # models within each other
+_MODEL_FRAME = "__model__"
+WORLD_FRAME = "world"
+_SEPARATOR = "::"
+
+GROUND_PLANE = """
+<model name="ground_plane"><static>true</static><link name="link">
+  <visual name="visual"><geometry><plane><normal>0 0 1</normal><size>100 100</size></plane>
+  </geometry><material><script><name>Gazebo/Grey</name></script></material></visual>
+  <collision name="collision"><geometry><plane><normal>0 0 1</normal><size>100 100</size></plane>
+  </geometry></collision>
+</link></model>
+"""
+_GROUND_PLANES = ("ground_plane", "ground plane")
+_LIGHTS = ("sun",)
+
+
+class Link(NamedTuple):
+    """A link of a model."""
+
+    name: str
+    element: Element
+    source: Source  # file that the link is in
+
+
+class Instance(NamedTuple):
+    """A model in a world or in another model."""
+
+    name: str
+    body: Body
+    matrix: Floats  # (4, 4), to the frame of the world or model
+
+
+@dataclass(eq=False)
+class Body:
+    """A model, or a world, without its pose; equal includes share a body.
+
+    Attributes
+    ----------
+    frames
+        Frames of the model, with those of its nested models.
+    links
+        Links of the model itself.
+    children
+        Models in it.
+    """
+
+    frames: Frames
+    links: list[Link] = field(default_factory=list)
+    children: list[Instance] = field(default_factory=list)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of links and models in the model, at all depths."""
+        return len(self.links) + sum(1 + child.body.size for child in self.children)
+
+
+class _Included(NamedTuple):
+    """The content of a file of a model."""
+
+    element: Element  # its <model>
+    source: Source
+
+
+class BodyReader:
+    """Reader of the bodies of a world; each file and each model is read once."""
+
+    def __init__(self, resources: Resources, notes: Notes, allowance: Allowance) -> None:
+        self.resources = resources
+        self.notes = notes
+        self.allowance = allowance
+        self._files: dict[Path, _Included | None] = {}
+        self._bodies: dict[int, Body] = {}  # {id of a <model>: body}
+        self._open_elements: list[int] = []  # ids of the <model>s that are being read
+        self._ground: Element | None = None
+
+    def world(self, element: Element, source: Source) -> Body:
+        """Return the body of a <world>, or of a root with models."""
+        body = Body(Frames(WORLD_FRAME))
+        self._fill(body, element, source)
+        if body.size > MAX_NODES:
+            raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
+        return body
+
+    def _fill(self, body: Body, element: Element, source: Source) -> None:
+        """Read links, frames and models of an element into a body."""
+        self.notes.check_children(element)
+        frames = body.frames
+        for link in element.findall("link"):
+            with prefixed(f"link {_name(link)!r}"):
+                name = frames.define(_name(link), pose_of(link), frames.root)
+            body.links.append(Link(name, link, source))
+        for frame in element.findall("frame"):
+            attached = printable(frame.get("attached_to", "")) or frames.root
+            with prefixed(f"frame {_name(frame)!r}"):
+                frames.define(_name(frame), pose_of(frame), attached)
+        for joint in element.findall("joint"):
+            child = joint.find("child")
+            link_name = "" if child is None else (child.get("link") or child.text or "")
+            if child is not None:
+                frames.define(_name(joint), pose_of(joint), printable(link_name) or frames.root)
+        nested = [*self._nested(body, element, source)]
+        for name, child_body, _ in nested:
+            with prefixed(f"model {name!r}"):
+                body.children.append(Instance(name, child_body, frames.matrix(name)))
+
+    def _nested(
+        self, body: Body, element: Element, source: Source
+    ) -> Iterator[tuple[str, Body, RelativePose]]:
+        """Yield names, bodies and poses of the models in an element, with their frames defined."""
+        for child in element:
+            if child.tag == "model":
+                name = _name(child)
+                with prefixed(f"model {name!r}"):
+                    nested = self.model(child, source)
+                    yield self._define(body, name, nested, child, child)
+            elif child.tag == "include":
+                yield from self._include(body, child, source)
+
+    def _include(
+        self, body: Body, include: Element, source: Source
+    ) -> Iterator[tuple[str, Body, RelativePose]]:
+        """Yield the model that an <include> names, or merge the model into the body."""
+        self.notes.check_children(include)
+        uri = (include.findtext("uri") or "").strip()
+        included = self._included(uri, source)
+        if included is None:
+            return
+        include_name = printable(include.findtext("name") or "")
+        name = include_name or _name(included.element) or short_name(uri)
+        with prefixed(f"model {name!r}"):
+            nested = self.model(included.element, included.source)
+            posed = include if include.find("pose") is not None else included.element
+            if include.get("merge") in ("true", "1"):
+                self._merge(body, nested, posed, include)
+                return
+            yield self._define(body, name, nested, posed, include)
+
+    def _define(
+        self, body: Body, name: str, nested: Body, posed: Element, placing: Element
+    ) -> tuple[str, Body, RelativePose]:
+        """Define the frame of a nested model; return name, body and pose of the model."""
+        placement = _placement_frame(placing, posed)
+        pose = pose_of(posed)
+        pose = pose._replace(matrix=placed_by(pose.matrix, nested.frames, placement))
+        frames = body.frames
+        name = frames.define(name, pose, frames.root)
+        frames.nested[name] = nested.frames
+        return name, nested, pose
+
+    def _merge(self, body: Body, nested: Body, posed: Element, placing: Element) -> None:
+        """Add links and models of an included model to the body."""
+        pose = pose_of(posed)
+        frames = body.frames
+        matrix = placed_by(pose.matrix, nested.frames, _placement_frame(placing, posed))
+        matrix = matmul(frames.matrix(pose.frame or frames.root), matrix)
+        frames.adopt(nested.frames, matrix)
+        body.links += nested.links
+        body.children += [
+            child._replace(matrix=matmul(matrix, child.matrix)) for child in nested.children
+        ]
+
+    def model(self, element: Element, source: Source) -> Body:
+        """Return the body of a <model>; LidarError if includes go in a circle."""
+        key = id(element)
+        if key in self._open_elements:
+            raise LidarError("it includes itself, by its own files: remove an <include>.")
+        if len(self._open_elements) > _MAX_NESTED:
+            raise LidarError(f"more than {_MAX_NESTED} models are within each other.")
+        if key not in self._bodies:
+            self._open_elements.append(key)
+            body = Body(Frames(_MODEL_FRAME))
+            self._fill(body, element, source)
+            if body.size > MAX_NODES:
+                raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
+            self._bodies[key] = body
+            self._open_elements.pop()
+        return self._bodies[key]
+
+    def _included(self, uri: str, source: Source) -> _Included | None:
+        """Return the model of a URI; None for a light, or for a model that is missing."""
+        if not uri:
+            self.notes.missing_models["an <include> without <uri>"] += 1
+            return None
+        name = short_name(uri).rpartition("/")[2].lower()
+        try:
+            file = self.resources.model(uri, source)
+        except MissingFileError as error:
+            if name in _GROUND_PLANES:
+                return _Included(self._ground_plane(), source)
+            if name not in _LIGHTS:
+                self.notes.missing_models[str(error)] += 1
+            return None
+        return self._read(file)
+
+    def _ground_plane(self) -> Element:
+        """Return the model of the ground plane that Gazebo brings."""
+        if self._ground is None:
+            self._ground = sdf_root(GROUND_PLANE.encode())
+        return self._ground
+
+    def _read(self, source: Source) -> _Included | None:
+        """Return the model of a file; None without a model, or for an unreadable file."""
+        path = source.path.resolve()
+        if path not in self._files:
+            self._files[path] = None
+            try:
+                data = read_input(path)
+                root = sdf_root(data)
+            except (OSError, ValueError, LidarError) as error:
+                reason = getattr(error, "strerror", None) or error
+                self.notes.unread_files[f"{path.parent.name}/{path.name}"] = f"{reason}"
+                return None
+            self.allowance.add_file(path)
+            element = root if root.tag == "model" else root.find("model")
+            if element is not None:
+                self._files[path] = _Included(element, source)
+            elif root.find("light") is None and root.find("actor") is None:
+                self.notes.unread_files[f"{path.parent.name}/{path.name}"] = "it has no <model>"
+        return self._files[path]
+
+
+def _placement_frame(placing: Element, posed: Element) -> str:
+    """Return the frame of a model that its pose is for; empty for the model's own."""
+    text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
+    return printable(text)
+
+
+def _name(element: Element) -> str:
+    """Return the name of an element, without characters that cannot be printed."""
+    return printable(element.get("name", ""))
+
+
+def scoped(path: tuple[str, ...]) -> str:
+    """Return the name of a model or link within models, as Gazebo writes names."""
+    return _SEPARATOR.join(path)

@@ -1,0 +1,168 @@
+"""Poses of SDFormat, and frames that poses are relative to."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import shown
+from lidarsim.base.vectors import applied, length, matmul
+from lidarsim.base.words import did_you_mean, printable
+from lidarsim.scene.transform import affine
+from lidarsim.sensor.trajectory import matrices, rotations_of
+
+MAX_NUMBER = 1e8  # in a file
+_MIN_NORM = 1e-6  # of a quaternion
+
+
+class RelativePose(NamedTuple):
+    """A pose in a named frame."""
+
+    matrix: Floats  # (4, 4), from the posed frame to the named frame
+    frame: str  # empty for the default of the element
+
+
+def numbers_of(
+    element: Element, name: str, count: int, default: str, *, at_least: float | None = None
+) -> Floats:
+    """Return `count` numbers of the text of a child element, or of `default` without a text.
+
+    Raises
+    ------
+    LidarError
+        If the text is other than `count` finite numbers, or a number is below `at_least`.
+    """
+    text = (element.findtext(name) or "").strip() or default
+    return numbers_in(text, f"<{name}>", count, at_least=at_least)
+
+
+def numbers_in(text: str, subject: str, count: int, *, at_least: float | None = None) -> Floats:
+    """Return the numbers of a text; LidarError, which names `subject`, as `numbers_of`."""
+    try:
+        values = np.array(text.split(), np.float64)
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not (np.abs(values) <= MAX_NUMBER).all():  # nor NaN
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise LidarError(f"{subject} is {shown(text)}; it must be {expected}.")
+    if at_least is not None and (values < at_least).any():
+        raise LidarError(f"{subject} is {shown(text)}; it must not be below {at_least:g}.")
+    return values
+
+
+def pose_of(element: Element) -> RelativePose:
+    """Return the pose of an element; identity without <pose>."""
+    pose = element.find("pose")
+    if pose is None:
+        return RelativePose(np.eye(4), "")
+    frame = pose.get("relative_to") or pose.get("frame") or ""
+    return RelativePose(matrix_of(pose), printable(frame))
+
+
+def matrix_of(pose: Element) -> Floats:
+    """Return the matrix (4, 4) of a <pose>: x, y, z, and roll, pitch, yaw or a quaternion.
+
+    Raises
+    ------
+    LidarError
+        If the numbers are not finite, or as many as expected, or the quaternion has no length.
+    """
+    text = (pose.text or "").strip()
+    is_quaternion = pose.get("rotation_format") == "quat_xyzw"
+    if not text:
+        return np.eye(4)
+    if is_quaternion:
+        values = numbers_in(text, "<pose>", 7)
+        norm = length(values[3:])
+        if not norm > _MIN_NORM:
+            raise LidarError(f"<pose> is {shown(text)}, whose quaternion has no length.")
+        x, y, z, w = values[3:] / norm
+        return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
+    values = numbers_in(text, "<pose>", 6)
+    angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])
+    return affine(rotations_of(angles[::-1]) if angles.any() else np.eye(3), values[:3])
+
+
+class Frames:
+    """Frames of a world or model, by name; `root` is the name of its own frame."""
+
+    def __init__(self, root: str) -> None:
+        self.root = root
+        self.nested: dict[str, Frames] = {}  # {name of a nested model: its frames}
+        self._matrices: dict[str, Floats] = {root: np.eye(4)}  # (4, 4), to the root
+        self._poses: dict[str, RelativePose] = {}
+
+    def define(self, name: str, pose: RelativePose, default: str) -> str:
+        """Define a frame by its pose; `default` is the frame of poses that name none.
+
+        Returns the name, with a number if the name is in use.
+        """
+        unique = name
+        number = 0
+        while unique in self._poses or unique == self.root:
+            unique = f"{name}_{number}"
+            number += 1
+        self._poses[unique] = pose._replace(frame=pose.frame or default)
+        return unique
+
+    def names(self) -> list[str]:
+        """Return the names of all defined frames."""
+        return [self.root, *self._poses]
+
+    def adopt(self, nested: Frames, placement: Floats) -> None:
+        """Define the frames of a merged model, whose root is at `placement` (4, 4), as own."""
+        for name in nested.names()[1:]:
+            matrix = matmul(placement, nested.matrix(name))
+            self.define(name, RelativePose(matrix, self.root), self.root)
+        self.nested.update(nested.nested)
+
+    def matrix(self, name: str) -> Floats:
+        """Return the matrix (4, 4) from a frame to the root.
+
+        Raises
+        ------
+        LidarError
+            If the frame, or one that it is relative to, is not defined, or they go in a circle.
+        """
+        chain: list[str] = []
+        while name not in self._matrices:
+            if name in chain:
+                raise LidarError(f"the frame {name[:80]!r} is relative to itself.")
+            chain.append(name)
+            name = self._pose(name).frame
+        for link in reversed(chain):
+            pose = self._poses[link]
+            self._matrices[link] = matmul(self._matrices[pose.frame], pose.matrix)
+        return self._matrices[chain[0] if chain else name]
+
+    def _pose(self, name: str) -> RelativePose:
+        """Return the pose of a frame, also of a frame MODEL::FRAME of a nested model."""
+        model, mark, inner = name.partition("::")
+        if name not in self._poses and mark and model in self.nested:
+            self._poses[name] = RelativePose(self.nested[model].matrix(inner), model)
+        if name not in self._poses:
+            raise LidarError(
+                f"the frame {name[:80]!r} is not defined.{did_you_mean(name, self.names())}"
+            )
+        return self._poses[name]
+
+    def between(self, frame: str, target: str) -> Floats:
+        """Return the matrix (4, 4) from a frame to another frame."""
+        return matmul(inverted(self.matrix(target)), self.matrix(frame))
+
+
+def placed_by(pose: Floats, frames: Frames, placement_frame: str) -> Floats:
+    """Return the matrix (4, 4) of a model whose `placement_frame` is at a pose (4, 4)."""
+    if not placement_frame:
+        return pose
+    return matmul(pose, inverted(frames.matrix(placement_frame)))
+
+
+def inverted(matrix: Floats) -> Floats:
+    """Return the inverse (4, 4) of the matrix (4, 4) of a pose."""
+    back = matrix[:3, :3].T
+    return affine(back, -applied(back, matrix[:3, 3]))

@@ -1,0 +1,190 @@
+"""Lidars of Gazebo, <sensor type="gpu_lidar"> and the like, as data files of sensors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.vectors import matmul
+from lidarsim.base.words import printable
+
+from .bodies import scoped
+from .frames import numbers_in, numbers_of, pose_of
+from .world import PlacedLink, World
+
+LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")
+_COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
+_RATE_HZ = 10.0  # of sensors that state none
+_FULL_TURN = 360.0
+_SLACK_DEG = 1e-3
+_MAX_SAMPLES = 1_000_000
+_ZERO = 1e-9  # numbers below are roundings
+
+
+class Lidar(NamedTuple):
+    """A lidar of a world.
+
+    Attributes
+    ----------
+    name
+        Names of its models, its link and its own: MODEL::LINK::SENSOR.
+    sensor
+        Name of the sensor alone.
+    model
+        Name of the outermost model.
+    data
+        Content of a data file of the sensor.
+    range_m
+        Shortest and longest range, metres; the longest may be infinite.
+    matrix, model_matrix
+        From the frames of the lidar and of the outermost model to the world, (4, 4).
+    left_out
+        What is not as in Gazebo, a clause each.
+    """
+
+    name: str
+    sensor: str
+    model: str
+    data: dict[str, Any]
+    range_m: tuple[float, float]
+    matrix: Floats
+    model_matrix: Floats
+    left_out: tuple[str, ...]
+
+
+def lidars_of(world: World) -> Iterator[Lidar]:
+    """Yield the lidars of a world; LidarError if figures of a lidar are impossible."""
+    for link in world.links:
+        for element in link.link.element.findall("sensor"):
+            if element.get("type") in LIDARS:
+                name = printable(element.get("name", "")) or "lidar"
+                full_name = scoped((*link.path, name))
+                with prefixed(f"sensor {full_name!r}"):
+                    yield _lidar(element, link, name, full_name)
+
+
+def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
+    """Return the lidar of a <sensor>."""
+    figures = element.find("lidar")
+    figures = element.find("ray") if figures is None else figures
+    if figures is None:
+        raise LidarError("it has neither <lidar> nor <ray>.")
+    pose = pose_of(element)
+    matrix = pose.matrix
+    if pose.frame and pose.frame != link.link.name:
+        matrix = matmul(link.body.frames.between(pose.frame, link.link.name), matrix)
+    left_out: list[str] = []
+    rate_hz = numbers_of(element, "update_rate", 1, "0").item()
+    if rate_hz <= 0:
+        rate_hz = _RATE_HZ
+        left_out.append(f"no update_rate: it turns {_RATE_HZ:g} times a second")
+    data: dict[str, Any] = {
+        "name": f"{full_name} of Gazebo",
+        "sources": {"all": "the world's <sensor>"},
+        "rate_hz": clean(rate_hz),
+        **_directions(figures),
+    }
+    ranges = figures.find("range")
+    resolution_m = 0.0 if ranges is None else numbers_of(ranges, "resolution", 1, "0").item()
+    if resolution_m > 0:
+        data["optics"] = {"resolution_m": clean(resolution_m)}
+    data |= _noise(element, figures, left_out)
+    if element.get("type") in _COLLISION_LIDARS:
+        left_out.append("it meets collision shapes in Gazebo: geometry: collision of scene.files")
+    return Lidar(
+        full_name,
+        name,
+        link.path[0],
+        data,
+        _range_m(ranges),
+        matmul(link.matrix, matrix),
+        link.model,
+        tuple(left_out),
+    )
+
+
+class _Scan(NamedTuple):
+    """Evenly spaced angles, both ends included."""
+
+    first_deg: float
+    last_deg: float
+    samples: int
+
+    @property
+    def step_deg(self) -> float:
+        """Angle between two samples; 0 of a single sample."""
+        return (self.last_deg - self.first_deg) / (self.samples - 1) if self.samples > 1 else 0.0
+
+
+def _scan(figures: Element, name: str, samples: str) -> _Scan:
+    """Return the samples of <horizontal> or <vertical>; `samples` is the default number."""
+    scan = figures.find(f"scan/{name}")
+    scan = Element(name) if scan is None else scan
+    stated = numbers_of(scan, "samples", 1, samples, at_least=1).item()
+    count = round(stated * numbers_of(scan, "resolution", 1, "1", at_least=0).item())
+    if count > _MAX_SAMPLES:
+        raise LidarError(f"<{name}> has {count:,} samples; at most {_MAX_SAMPLES:,} are allowed.")
+    angles = [numbers_of(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
+    first_deg, last_deg = np.degrees(angles).tolist()
+    if last_deg < first_deg:
+        raise LidarError(f"<{name}> has a <max_angle> below its <min_angle>.")
+    return _Scan(first_deg, last_deg, max(count, 1) if last_deg > first_deg else 1)
+
+
+def _directions(figures: Element) -> dict[str, Any]:
+    """Return the fields of a data file for the directions of the rays."""
+    vertical = _scan(figures, "vertical", "1")
+    elevations: Any = [clean(vertical.first_deg)]
+    if vertical.samples > 1:
+        limits = {"first": clean(vertical.first_deg), "last": clean(vertical.last_deg)}
+        elevations = {**limits, "count": vertical.samples}
+    horizontal = _scan(figures, "horizontal", "640")
+    step_deg = horizontal.step_deg
+    count = horizontal.samples
+    while count > 1 and count * step_deg > _FULL_TURN + _SLACK_DEG:
+        count -= 1  # the last sample is the first again
+    fields: dict[str, Any] = {"firings_per_turn": count}
+    if count == 1 or count * step_deg > _FULL_TURN - _SLACK_DEG:
+        fields["zero_deg"] = clean(horizontal.first_deg)
+    else:  # firings of a line begin at its start, and end a step before its end
+        width_deg = count * step_deg
+        fields["zero_deg"] = clean(horizontal.first_deg + width_deg / 2)
+        fields["mirror"] = {"motion": "sawtooth", "width_deg": clean(width_deg)}
+    return {**fields, "beams": {"elevation_deg": elevations}}
+
+
+def _range_m(ranges: Element | None) -> tuple[float, float]:
+    """Return the shortest and the longest range, metres."""
+    if ranges is None:
+        return 0.0, math.inf
+    longest = (ranges.findtext("max") or "inf").strip()
+    is_infinite = longest.lower().lstrip("+").startswith("inf")
+    max_range_m = math.inf if is_infinite else numbers_in(longest, "<max>", 1).item()
+    return numbers_of(ranges, "min", 1, "0", at_least=0).item(), max_range_m
+
+
+def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
+    """Return the fields of a data file for noise; differences to Gazebo go to `left_out`."""
+    noise = figures.find("noise")
+    noise = element.find("noise") if noise is None else noise
+    if noise is None:
+        return {}
+    kind = (noise.findtext("type") or noise.get("type") or "gaussian").strip()
+    if kind not in ("gaussian", "gaussian_quantized", "none"):
+        left_out.append(f"noise of type {printable(kind)[:30]!r}")
+        return {}
+    if numbers_of(noise, "mean", 1, "0").item():
+        left_out.append("a mean of its noise")
+    sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
+    return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}
+
+
+def clean(value: float) -> float:
+    """Return a number for a file, rounded to 12 digits; roundings of zero are zero."""
+    return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0

@@ -1,0 +1,269 @@
+"""Meshes of the links of models, in the frames of the links."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.input_files import read_input
+from lidarsim.base.vectors import matmul
+from lidarsim.base.words import listed, printable
+from lidarsim.scene.actors import join_meshes
+from lidarsim.scene.colours import Colours
+from lidarsim.scene.face_materials import FaceMaterials
+from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.files.scene_graph import ReadOptions
+from lidarsim.scene.masks import MaskError
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from ..files.dae import read_dae
+from .appearance import FULL_RETRO, Appearance, appearance_of
+from .bodies import Body, Link
+from .frames import numbers_of, pose_of
+from .notes import Notes
+from .resources import MissingFileError, Resources, Source
+from .shapes import height_map_mesh, polyline_mesh, shape_mesh
+
+# Formats that Gazebo reads; worlds would be read without end.
+MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")
+
+
+@dataclass(eq=False)
+class LinkMeshes:
+    """Reader of the visuals, or the collision shapes, of links; each file is read once."""
+
+    resources: Resources
+    options: ReadOptions
+    notes: Notes
+    allowance: Allowance
+    # {(path, name of the function that reads it): meshes}
+    _files: dict[tuple[Path, str], list[SceneMesh]] = field(default_factory=dict)
+    _links: dict[tuple[int, tuple[float, ...]], SceneMesh | None] = field(default_factory=dict)
+
+    def mesh_of(
+        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+    ) -> SceneMesh | None:
+        """Return the mesh of a link, which instances of the model share; None without shapes.
+
+        `name` is that of the link in the world, for notes; `scale` are three factors for all
+        shapes.
+        """
+        key = (id(link.element), scale)
+        if key not in self._links:
+            with prefixed(f"link {link.name!r}"):
+                parts = [
+                    part
+                    for shape in self._shapes(link, name)
+                    for part in self._shape_meshes(body, link, shape, name, scale)
+                ]
+                self._links[key] = join_meshes(link.name or "link", parts) if parts else None
+        return self._links[key]
+
+    def _shapes(self, link: Link, name: str) -> list[Element]:
+        """Return the shapes of a link that are read."""
+        self.notes.check_children(link.element)
+        kind = "collision" if self.options.collisions else "visual"
+        shapes = link.element.findall(kind)
+        has_collisions = link.element.find("collision/geometry") is not None
+        if has_collisions and not shapes and not self.options.collisions:
+            self.notes.without_visuals[name] = None
+        return shapes
+
+    def _shape_meshes(
+        self, body: Body, link: Link, shape: Element, name: str, scale: tuple[float, ...]
+    ) -> list[SceneMesh]:
+        """Return the meshes of a visual or a collision shape in the frame of its link."""
+        self.notes.check_children(shape)
+        with prefixed(f"{shape.tag} {printable(shape.get('name', ''))!r}"):
+            retro = _retro(link.element, shape)
+            if retro > FULL_RETRO:
+                self.notes.bright[name] = None
+            appearance = appearance_of(shape, retro)
+            if appearance.is_hidden:
+                self.notes.hidden[name] = None
+                return []
+            geometry = shape.find("geometry")
+            parts = [] if geometry is None else self.geometry(geometry, link.source)
+            pose = pose_of(shape)
+            matrix = pose.matrix
+            if pose.frame and pose.frame != link.name:
+                matrix = matmul(body.frames.between(pose.frame, link.name), matrix)
+        linear = matrix[:3, :3] * np.array(scale)
+        moved = []
+        for part in parts:
+            self.allowance.take(part.vertices.nbytes + part.faces.nbytes)
+            placed = part.moved(part.name, linear, matrix[:3, 3])
+            moved.append(self.painted(placed, appearance))
+        return moved
+
+    def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
+        """Return a mesh with colour and material of its visual, unless its file has any."""
+        colour = appearance.colour
+        is_plain = mesh.colours is None or appearance.is_retro
+        if self.options.colours and colour is not None and is_plain:
+            mesh = replace(mesh, colours=Colours.plain(colour, len(mesh.faces)))
+        if self.options.materials and mesh.materials is None:
+            mesh = replace(mesh, materials=FaceMaterials.named(appearance.material))
+        return mesh
+
+    def geometry(self, geometry: Element, source: Source) -> list[SceneMesh]:
+        """Return the meshes of a <geometry>; empty for a shape without a size or file."""
+        shapes = [child for child in geometry if ":" not in child.tag]
+        if not shapes:
+            return []
+        shape = shapes[0]
+        if shape.tag == "mesh":
+            self.notes.check_children(shape)
+            return self._mesh(shape, source)
+        if shape.tag == "heightmap":
+            self.notes.check_children(shape)
+            return self._height_map(shape, source)
+        if shape.tag == "polyline":
+            mesh = polyline_mesh(geometry.findall("polyline"))
+        else:
+            try:
+                mesh = shape_mesh(shape)
+            except KeyError:
+                self.notes.unknown[f"geometry/{printable(shape.tag)[:40]}"] = None
+                mesh = None
+        return [] if mesh is None else [mesh]
+
+    def _mesh(self, shape: Element, source: Source) -> list[SceneMesh]:
+        """Return the meshes of a file, or of its <submesh>, scaled."""
+        uri = (shape.findtext("uri") or "").strip()
+        scale = numbers_of(shape, "scale", 3, "1 1 1")
+        meshes = self.file_meshes(uri, source)
+        part = shape.find("submesh")
+        if part is not None:
+            meshes = self._part(meshes, part, uri)
+        if not scale.all():
+            return []
+        return [mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
+
+    def _part(self, meshes: list[SceneMesh], part: Element, uri: str) -> list[SceneMesh]:
+        """Return the meshes of a <submesh>, with the middle at zero if <center> is true."""
+        name = printable(part.findtext("name") or "")
+        if not name or not meshes:
+            return meshes
+        chosen = [mesh for mesh in meshes if mesh.name == name]
+        chosen = chosen or [mesh for mesh in meshes if mesh.name.lower() == name.lower()]
+        if not chosen:
+            names = listed([mesh.name for mesh in meshes], 4)
+            self.notes.unread_files[f"submesh {name!r} of {printable(uri)}"] = f"it has {names}"
+            return []
+        if (part.findtext("center") or "").strip() in ("true", "1"):
+            bounds = np.concatenate([mesh.bounds for mesh in chosen])
+            middle = (bounds.min(axis=0) + bounds.max(axis=0)) / 2
+            return [mesh.moved(mesh.name, np.eye(3), -middle) for mesh in chosen]
+        return chosen
+
+    def _height_map(self, shape: Element, source: Source) -> list[SceneMesh]:
+        """Return the surface of a height map; none if its image is missing or cannot be read."""
+        uri = (shape.findtext("uri") or "").strip()
+        file = self._file(uri, source)
+        if file is None:
+            return []
+        if file.path.suffix.lower() in (".tif", ".tiff", ".dem", ".hgt"):
+            self.notes.unread_files[printable(uri)] = "it is a raster: add it to scene.files"
+            return []
+        self.allowance.add_file(file.path)
+        try:
+            return [height_map_mesh(shape, file.path, self.allowance)]
+        except MaskError as error:
+            self.notes.unread_files[printable(uri)] = str(error)
+            return []
+
+    def file_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
+        """Return the meshes of a file in its axes; empty, with a note, for an unusable file."""
+        return self._read_once(uri, source, self._load)
+
+    def skin_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
+        """Return the skin of an actor at rest; empty, with a note, for an unusable file."""
+        return self._read_once(uri, source, self._load_skin)
+
+    def _read_once(
+        self, uri: str, source: Source, load: Callable[[Source], list[SceneMesh]]
+    ) -> list[SceneMesh]:
+        """Return the meshes of a file, from the cache or by `load`; empty for an unusable file."""
+        file = self._file(uri, source)
+        if file is None:
+            return []
+        key = file.path.resolve(), load.__name__
+        if key not in self._files:
+            self._files[key] = []
+            try:
+                self._files[key] = load(file)
+            except LidarError as error:
+                self.notes.unread_files[printable(uri)] = _without_path(str(error), file.path)
+            self.allowance.add_file(file.path)
+        return self._files[key]
+
+    def _load(self, file: Source) -> list[SceneMesh]:
+        """Return the meshes of a file; LidarError for an unusable file."""
+        if file.path.suffix.lower() not in MESHES:
+            raise LidarError(f"Gazebo reads meshes of {' '.join(MESHES)}.")
+        # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
+        meshes = load_meshes(
+            file.path,
+            up_axis="z",
+            opacity="mask" if self.options.masks else "ignore",
+            colours=self.options.colours,
+            materials=self.options.materials,
+            assets=self._asset_folders(file),
+            tell=lambda line: self.notes.of_meshes.setdefault(_without_path(line, file.path)),
+        )
+        return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
+
+    def _load_skin(self, file: Source) -> list[SceneMesh]:
+        """Return the meshes of a file, with skins at rest."""
+        if file.path.suffix.lower() != ".dae":
+            return self._load(file)
+        options = self.options._replace(
+            folders=(file.path.parent.resolve(), *self._asset_folders(file)), skins_at_rest=True
+        )
+        try:
+            with np.errstate(all="ignore"):
+                content = read_dae(read_input(file.path), file.path, options)
+        except MemoryError:
+            raise
+        except Exception as error:  # readers raise errors of any class
+            raise LidarError(f"{file.path.name} {printable(str(error))}.") from error
+        flat = [item.flat() if isinstance(item, SceneInstance) else item for item in content.meshes]
+        unit = (content.unit_m or 1.0) * np.eye(3)
+        return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
+
+    def _asset_folders(self, file: Source) -> list[Path]:
+        """Return the folders from which a mesh file may take images, the model's textures first."""
+        textures = (folder / "materials" / "textures" for folder in file.path.resolve().parents)
+        within = (folder for folder in textures if folder.is_relative_to(file.root))
+        existing = (folder for folder in within if folder.is_dir())
+        return [*existing, file.root, *self.resources.trusted]
+
+    def _file(self, uri: str, source: Source) -> Source | None:
+        """Return the file of a URI; None, with a note, for a missing file."""
+        try:
+            return self.resources.file(uri, source)
+        except MissingFileError as error:
+            self.notes.missing_files[str(error) or "a mesh without <uri>"] += 1
+            return None
+
+
+def _retro(link: Element, shape: Element) -> float:
+    """Return the <laser_retro> of a shape, or of the first collision shape that has any; else 0."""
+    for candidate in (shape, *link.findall("collision")):
+        value = float(numbers_of(candidate, "laser_retro", 1, "0").item())
+        if value > 0:
+            return value
+    return 0.0
+
+
+def _without_path(line: str, path: Path) -> str:
+    """Return a line on a file with the file's name alone."""
+    return line.replace(str(path), path.name)

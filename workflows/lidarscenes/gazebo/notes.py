@@ -1,0 +1,94 @@
+"""What a world lacks, or has and is not read: collected, to be told in a few lines."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.words import listed, plural, printable
+
+_MAX_NAMES = 12  # that a note lists
+
+# Elements by their parents, of SDFormat 1.0 to 1.12, used or without a meaning for lidars.
+_POSED = ("pose", "frame", "plugin", "origin")
+_KNOWN: dict[str, frozenset[str]] = {
+    tag: frozenset(text.split())
+    for tag, text in {
+        "sdf": "world model actor light",
+        "world": "actor atmosphere audio frame gravity gui include joint light magnetic_field "
+        "model physics plugin road scene spherical_coordinates state wind",
+        "model": "allow_auto_disable enable_wind frame gripper include joint link model plugin "
+        "pose self_collide static",
+        "link": "audio_sink audio_source battery collision damping enable_wind frame gravity "
+        "inertial kinematic light must_be_base_link particle_emitter plugin pose projector "
+        "self_collide sensor velocity_decay visual",
+        "visual": "cast_shadows frame geometry laser_retro material meta plugin pose transparency "
+        "visibility_flags",
+        "collision": "auto_inertia_params density frame geometry laser_retro max_contacts pose "
+        "surface",
+        "include": "name placement_frame plugin pose static uri",
+        "mesh": "scale submesh uri",
+        "heightmap": "blend pos sampling size texture uri use_terrain_paging",
+        "road": "material point width",
+        "actor": "animation joint link plugin pose script skin",
+    }.items()
+}
+
+
+class Notes:
+    """Notes of a world; each thing is told once."""
+
+    def __init__(self) -> None:
+        self.missing_models: Counter[str] = Counter()  # {name: number of uses}
+        self.missing_files: Counter[str] = Counter()
+        self.unread_files: dict[str, str] = {}  # {name: reason}
+        self.unknown: dict[str, None] = {}  # elements, as PARENT/TAG
+        self.without_visuals: dict[str, None] = {}  # links with collision shapes only
+        self.hidden: dict[str, None] = {}  # links with visuals that are transparent altogether
+        self.bright: dict[str, None] = {}  # links whose <laser_retro> is above that of white
+        self.further: dict[str, None] = {}  # clauses
+        self.of_meshes: dict[str, None] = {}  # lines on mesh files
+
+    def check_children(self, element: Element) -> None:
+        """Note the children of an element that SDFormat does not define; prefixes are free."""
+        defined_tags = _KNOWN[element.tag]
+        for child in element:
+            if child.tag not in defined_tags and ":" not in child.tag and child.tag not in _POSED:
+                self.unknown[f"{element.tag}/{printable(child.tag)[:40]}"] = None
+
+    def lines(self) -> Iterator[str]:
+        """Yield clauses that follow the file's name."""
+        yield from _line("lacks", "model", self.missing_models)
+        yield from _line("lacks", "file", self.missing_files)
+        for name, reason in list(self.unread_files.items())[:_MAX_NAMES]:
+            yield f"names {name}, which is left out: {reason}"
+        if self.unknown:
+            yield f"has elements that are not read: {listed([*self.unknown], _MAX_NAMES)}"
+        for links, reason in (
+            (self.without_visuals, "collision shapes and no visuals, and are left out"),
+            (self.hidden, "transparent visuals, which are left out"),
+            (self.bright, "a <laser_retro> above 255, which counts as 255"),
+        ):
+            if links:
+                yield f"has links that have {reason}: {listed([*links])}"
+        yield from self.further
+        yield from _first_lines([*self.of_meshes])
+
+
+def _line(verb: str, noun: str, names: Counter[str]) -> Iterator[str]:
+    """Yield a clause on missing things, if any, with all names up to a limit."""
+    if names:
+        count = plural(len(names), noun)
+        uses = f", in {sum(names.values()):,} places" if names.total() > len(names) else ""
+        pronoun = "which is" if len(names) == 1 else "which are"
+        yield f"{verb} {count}, {pronoun} left out{uses}: {listed([*names], _MAX_NAMES)}"
+
+
+def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
+    """Yield the first lines on meshes, and the number of further lines."""
+    all_lines = [*lines]
+    yield from (f"names a mesh: {line}" for line in all_lines[:max_lines])
+    further = len(all_lines) - max_lines
+    if further > 0:
+        yield f"names meshes with {plural(further, 'further note')}"

@@ -1,0 +1,240 @@
+"""Files of models, meshes and images that worlds of Gazebo name by URIs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import unquote, urlsplit
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import read_input
+from lidarsim.base.words import natural, printable
+
+from .sdf_xml import sdf_root
+
+# Variables with folders of models and resources, of Gazebo Sim, then of Gazebo classic.
+FOLDER_VARIABLES = (
+    "GZ_SIM_RESOURCE_PATH",
+    "IGN_GAZEBO_RESOURCE_PATH",
+    "SDF_PATH",
+    "GAZEBO_MODEL_PATH",
+    "GAZEBO_RESOURCE_PATH",
+)
+CACHE_VARIABLES = ("GZ_FUEL_CACHE_PATH", "IGN_FUEL_CACHE_PATH")
+CACHES = ("~/.gz/fuel", "~/.ignition/fuel")
+_MODELS = "~/.gazebo/models"  # of Gazebo classic
+_MAX_FOLDERS_UP = 5  # folders above a world in which models are looked for
+_CONFIGS = ("model.config", "manifest.xml")
+_WORLD_FOLDERS = ("worlds", "world")
+_SDF_VERSION = (1, 12)  # the newest that is known
+
+
+class MissingFileError(Exception):
+    """A file or model that no folder has; its text is the name to report."""
+
+
+class Source(NamedTuple):
+    """A file of SDFormat, and the folder that must contain the files of its relative names."""
+
+    path: Path
+    root: Path
+
+
+@dataclass(frozen=True)
+class Resources:
+    """Finder of the files that a world names.
+
+    Attributes
+    ----------
+    world
+        The world, and its folder: with a package.xml at most five folders above that one, else the
+        folder above a folder `worlds`.
+    folders
+        Folders in which models are looked for by name, in order.
+    trusted
+        Resolved folders whose files may be read from anywhere.
+    caches
+        Folders of downloads from Fuel.
+    """
+
+    world: Source
+    folders: tuple[Path, ...]
+    trusted: tuple[Path, ...]
+    caches: tuple[Path, ...]
+
+    @classmethod
+    def of_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
+        """Return the resources of a world, which `assets` are searched for first."""
+        folder = path.parent.resolve()
+        above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
+        default = folder.parent if folder.name.lower() in _WORLD_FOLDERS else folder
+        root = next((f for f in above if (f / "package.xml").is_file()), default)
+        named = [*assets, *_folders_of(FOLDER_VARIABLES), *_existing([_MODELS])]
+        nearby = [f / name for f in above for name in ("", "models")]
+        folders = dict.fromkeys([*named, *(f for f in nearby if f.is_dir())])
+        caches = [*_folders_of(CACHE_VARIABLES), *_existing(CACHES)]
+        trusted = [f.resolve() for f in [root, *named, *caches]]
+        return cls(Source(path, root), tuple(folders), tuple(trusted), tuple(caches))
+
+    def model(self, uri: str, source: Source) -> Source:
+        """Return the file of SDFormat of a model, the newest that its model.config names.
+
+        Raises
+        ------
+        MissingFileError
+            If no folder has the model.
+        LidarError
+            If the name leaves the folder of the file that has the name.
+        """
+        for target in self._targets(uri, source):
+            if target.path.is_dir():
+                return Source(_newest_file(target.path), _resolved(target.path))
+            if target.path.is_file():
+                return Source(target.path, target.root)
+        raise MissingFileError(short_name(uri))
+
+    def file(self, uri: str, source: Source) -> Source:
+        """Return a file of a mesh or an image; MissingFileError and LidarError as `model`."""
+        for target in self._targets(uri, source):
+            if target.path.is_file():
+                return target
+        raise MissingFileError(printable(uri))
+
+    def _targets(self, uri: str, source: Source) -> Iterator[Source]:
+        """Yield the existing paths that a URI may name; LidarError if a path must not be read."""
+        for path, root in self._candidates(uri, source):
+            try:
+                if not path.exists():
+                    continue
+                resolved = path.resolve()
+            except (OSError, ValueError, RuntimeError):
+                continue  # no file can have this name
+            roots = (root, *self.trusted)
+            if not any(resolved.is_relative_to(folder) for folder in roots):
+                raise LidarError(
+                    f"{printable(uri)!r} leads out of {root}: put the file there, or name its "
+                    "folder as assets."
+                )
+            yield Source(path, next(f for f in roots if resolved.is_relative_to(f)))
+
+    def _candidates(self, uri: str, source: Source) -> Iterator[tuple[Path, Path]]:
+        """Yield the paths that a URI may mean, and the folder that must contain each."""
+        name = unquote(uri.strip())
+        scheme, mark, location = name.partition("://")
+        if mark and scheme in ("http", "https"):
+            yield from self._downloads(uri)
+        elif mark and scheme in ("model", "package"):
+            yield from self._in_folders(location)
+        elif not mark or scheme == "file":
+            location = location if mark else name.removeprefix("file:")
+            yield source.path.parent / location, source.root
+            if not location.startswith("/"):
+                yield from self._in_folders(location)
+        else:
+            raise MissingFileError(printable(uri))
+
+    def _in_folders(self, location: str) -> Iterator[tuple[Path, Path]]:
+        """Yield the paths NAME/FILE in all folders."""
+        name, _, file = location.lstrip("/").partition("/")
+        file = file.lstrip("/")  # which would else be a path of its own
+        if name in ("", ".", ".."):
+            return
+        for folder in self.folders:
+            model = folder / name
+            if model.is_dir():
+                yield model / file, _resolved(model)
+            elif folder.name == name:  # of the package or model itself
+                yield folder / file, _resolved(folder)
+
+    def _downloads(self, uri: str) -> Iterator[tuple[Path, Path]]:
+        """Yield the paths of a model of Fuel, or of its file: in the caches, then by its name."""
+        parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
+        if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
+            return
+        _, owner, _, name, *options = parts
+        version = options[0] if options and options[0] != "files" else ""
+        file = "/".join(options[options.index("files") + 1 :]) if "files" in options else ""
+        for cache in self.caches:
+            for host in _existing_folders(cache, "*"):
+                folders = [host]
+                for part in (owner, "models", name):
+                    folders = [f for g in folders for f in _existing_folders(g, part)]
+                for model in folders:
+                    versions = sorted(_existing_folders(model, "*"), key=lambda f: natural(f.name))
+                    chosen = [f for f in versions if f.name == version] or versions[-1:]
+                    yield from ((folder / file, _resolved(folder)) for folder in chosen)
+        yield from self._in_folders(f"{name}/{file}")
+
+
+def short_name(uri: str) -> str:
+    """Return the name of a model for messages: without the scheme, of Fuel with its owner."""
+    name = printable(unquote(uri.strip()))
+    parts = [part for part in name.split("/") if part]
+    if name.startswith(("http://", "https://")) and len(parts) >= 6:
+        return f"{parts[3]}/{parts[5]}"
+    return name.removeprefix("model://")
+
+
+def _folders_of(variables: tuple[str, ...]) -> list[Path]:
+    """Return the folders that variables of the environment name, if they exist."""
+    values = (os.environ.get(variable, "") for variable in variables)
+    return _existing([folder for value in values for folder in value.split(os.pathsep) if folder])
+
+
+def _existing(names: list[str] | tuple[str, ...]) -> list[Path]:
+    """Return the folders that exist among names."""
+    folders = [Path(os.path.expanduser(name)) for name in names]  # noqa: PTH111 - never fails
+    return [folder for folder in folders if folder.is_dir()]
+
+
+def _existing_folders(parent: Path, name: str) -> list[Path]:
+    """Return the folders in a folder with a name, in upper or lower case, or with any name."""
+    try:
+        folders = [entry for entry in parent.iterdir() if entry.is_dir()]
+    except OSError:
+        return []
+    return [f for f in folders if name in ("*", f.name) or f.name.lower() == name.lower()]
+
+
+def _resolved(path: Path) -> Path:
+    """Return a path without links."""
+    return path.resolve()
+
+
+def _newest_file(folder: Path) -> Path:
+    """Return the file of the newest version that is known, by a model's configuration.
+
+    Raises
+    ------
+    MissingFileError
+        If the folder has no model.
+    """
+    for name in _CONFIGS:
+        if (folder / name).is_file():
+            files = _configured_files(folder / name)
+            for version in sorted(files, reverse=True):
+                file = folder / files[version]
+                if version <= _SDF_VERSION and file.parent == folder and file.is_file():
+                    return file
+    if (folder / "model.sdf").is_file():
+        return folder / "model.sdf"
+    raise MissingFileError(printable(folder.name))
+
+
+def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
+    """Return the files that a configuration names: {version: name}."""
+    try:
+        root = sdf_root(read_input(path))
+    except (OSError, ValueError, LidarError):
+        return {}
+    return {_version(entry): (entry.text or "").strip() for entry in root.iter("sdf")}
+
+
+def _version(entry: Element) -> tuple[int, ...]:
+    """Return the version of an <sdf>: (1, 6); (0,) without a version."""
+    parts = entry.get("version", "").split(".")
+    return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else (0,)

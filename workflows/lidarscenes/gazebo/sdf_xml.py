@@ -1,0 +1,150 @@
+"""XML of SDFormat, as leniently as Gazebo reads it.
+
+Public worlds have comments with «--» and prefixes without a namespace, which end expat, and with
+expat ElementTree. Entities are refused, except those of XML itself and of characters.
+"""
+
+from __future__ import annotations
+
+import re
+from xml.etree.ElementTree import Element
+
+MAX_ELEMENTS = 1_000_000  # of a file; public worlds have up to 60,000
+_MAX_DEPTH = 200
+
+_TAG = re.compile(
+    r"<(?P<end>/?)(?P<name>[^\s<>/!?\"'=]+)"
+    r"(?P<attributes>(?:\s+[^\s=<>/\"']+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*)\s*(?P<empty>/?)>"
+)
+_ATTRIBUTE = re.compile(r"([^\s=<>/\"']+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+_REFERENCE = re.compile(r"&(#x[0-9a-fA-F]{1,8}|#[0-9]{1,8}|\w{1,40});")
+_CHARACTERS = {"lt": "<", "gt": ">", "amp": "&", "quot": '"', "apos": "'"}
+_SKIPPED = {"<!--": "-->", "<?": "?>"}  # {start of a part without elements: end}
+_CDATA = ("<![CDATA[", "]]>")
+
+
+def sdf_root(data: bytes) -> Element:
+    """Return the root element of a file; prefixes stay in tags, and comments are left out.
+
+    Raises
+    ------
+    ValueError
+        If the file is not XML, declares entities, or has too many elements.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    return _Parser(text).root()
+
+
+class _Parser:
+    """Parser of a text, whose elements are built from start to end."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._open: list[Element] = []  # elements that have not ended
+        self._root: Element | None = None
+        self._count = 0
+
+    def root(self) -> Element:
+        """Return the root element."""
+        text = self._text
+        position = 0
+        while (start := text.find("<", position)) >= 0:
+            self._add_text(text[position:start])
+            position = self._after_markup(start)
+        if self._open:
+            raise ValueError(f"<{self._open[-1].tag[:40]}> has no end")
+        if self._root is None:
+            raise ValueError("it has no elements")
+        return self._root
+
+    def _after_markup(self, start: int) -> int:
+        """Read the markup at a position; return the position after the markup."""
+        text = self._text
+        for first, last in _SKIPPED.items():
+            if text.startswith(first, start):
+                return self._end_of(start, last)
+        first, last = _CDATA
+        if text.startswith(first, start):
+            stop = self._end_of(start, last)
+            self._add_text(text[start + len(first) : stop - len(last)], is_literal=True)
+            return stop
+        if text.startswith("<!", start):
+            return self._after_declaration(start)
+        tag = _TAG.match(text, start)
+        if tag is None:
+            raise ValueError(f"line {self._line(start)} has a tag that is none of XML")
+        if tag["end"]:
+            self._end_element(tag["name"], start)
+        else:
+            self._start_element(tag, start)
+        return tag.end()
+
+    def _end_of(self, start: int, mark: str) -> int:
+        """Return the position after the next mark."""
+        stop = self._text.find(mark, start)
+        if stop < 0:
+            raise ValueError(f"what begins in line {self._line(start)} has no end, {mark}")
+        return stop + len(mark)
+
+    def _after_declaration(self, start: int) -> int:
+        """Return the position after a <!DOCTYPE …>; ValueError for declarations."""
+        stop = self._end_of(start, ">")
+        declaration = self._text[start:stop]
+        if "[" in declaration or not declaration.upper().startswith("<!DOCTYPE"):
+            raise ValueError("it declares XML entities, which may expand to any length")
+        return stop
+
+    def _start_element(self, tag: re.Match[str], start: int) -> None:
+        """Open an element, which is closed if empty."""
+        self._count += 1
+        if self._count > MAX_ELEMENTS:
+            raise ValueError(f"it has more than {MAX_ELEMENTS:,} elements")
+        element = Element(tag["name"])
+        for name, double, single in _ATTRIBUTE.findall(tag["attributes"]):
+            element.attrib.setdefault(name, self._resolved(double or single))
+        if self._open:
+            self._open[-1].append(element)
+        elif self._root is not None:
+            raise ValueError(f"line {self._line(start)} begins a second root")
+        else:
+            self._root = element
+        if not tag["empty"]:
+            self._open.append(element)
+            if len(self._open) > _MAX_DEPTH:
+                raise ValueError(f"its elements are nested deeper than {_MAX_DEPTH}")
+
+    def _end_element(self, name: str, start: int) -> None:
+        """Close the innermost element."""
+        if not self._open or self._open[-1].tag != name:
+            raise ValueError(
+                f"line {self._line(start)} has an end </{name[:40]}> without its start"
+            )
+        self._open.pop()
+
+    def _add_text(self, text: str, *, is_literal: bool = False) -> None:
+        """Add text to the innermost element."""
+        if self._open and not text.isspace() and text:
+            element = self._open[-1]
+            element.text = (element.text or "") + (text if is_literal else self._resolved(text))
+
+    def _resolved(self, text: str) -> str:
+        """Return text with its references to characters resolved."""
+        return _REFERENCE.sub(_character, text) if "&" in text else text
+
+    def _line(self, position: int) -> int:
+        """Return the number of the line of a position, from 1."""
+        return self._text.count("\n", 0, position) + 1
+
+
+def _character(reference: re.Match[str]) -> str:
+    """Return the character of a reference; ValueError for an entity."""
+    name = reference[1]
+    if name in _CHARACTERS:
+        return _CHARACTERS[name]
+    if not name.startswith("#"):
+        raise ValueError(f"it names an XML entity, {name[:20]!r}, which may expand to any length")
+    code = int(name[2:], 16) if name[1] == "x" else int(name[1:])
+    return chr(code) if code < 0x110000 else "\ufffd"

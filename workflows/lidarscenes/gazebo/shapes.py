@@ -1,0 +1,249 @@
+"""Shapes of SDFormat as meshes: boxes to polylines, height maps, roads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.vectors import length, matmul
+from lidarsim.scene.files.polygons import with_holes
+from lidarsim.scene.masks import read_heights
+from lidarsim.scene.scene_mesh import SceneMesh, stacked
+from lidarsim.scene.shapes import capsule, revolve
+
+from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
+from .frames import numbers_in, numbers_of
+
+_PIXEL_BYTES = 72  # of a pixel of a height map: a vertex, and two triangles
+_PARALLEL = 1e-12  # of unit vectors: 1 minus the cosine between them
+
+
+def shape_mesh(shape: Element) -> SceneMesh | None:
+    """Return the mesh of a shape without a file, in its frame; None for a shape of size zero.
+
+    Raises
+    ------
+    LidarError
+        If numbers of the shape are missing or impossible.
+    KeyError
+        If there is no such shape.
+    """
+    return _SHAPES[shape.tag](shape)
+
+
+def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
+    """Return `count` sizes of a shape, which are not negative."""
+    return numbers_of(shape, name, count, default, at_least=0.0)
+
+
+def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
+    """Return a mesh scaled along the axes; None if a factor is zero."""
+    scale = np.asarray(factors, np.float64)
+    return mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
+
+
+def _box(shape: Element) -> SceneMesh | None:
+    return _scaled(UNIT_BOX, _sizes(shape, "size", 3, "1 1 1"))
+
+
+def _sphere(shape: Element) -> SceneMesh | None:
+    return _scaled(UNIT_BALL, np.full(3, _sizes(shape, "radius", 1, "1").item()))
+
+
+def _ellipsoid(shape: Element) -> SceneMesh | None:
+    return _scaled(UNIT_BALL, _sizes(shape, "radii", 3, "1 1 1"))
+
+
+def _cylinder(shape: Element) -> SceneMesh | None:
+    radius = _sizes(shape, "radius", 1, "1").item()
+    return _scaled(UNIT_CYLINDER, [radius, radius, _sizes(shape, "length", 1, "1").item()])
+
+
+def _cone(shape: Element) -> SceneMesh | None:
+    radius = _sizes(shape, "radius", 1, "0.5").item()
+    cone = revolve([(0, -0.5), (1, -0.5), (0, 0.5)], SIDES, "cone")
+    return _scaled(cone, [radius, radius, _sizes(shape, "length", 1, "1").item()])
+
+
+def _capsule(shape: Element) -> SceneMesh | None:
+    radius = _sizes(shape, "radius", 1, "0.5").item()
+    height = _sizes(shape, "length", 1, "1").item()
+    return capsule(radius, height, SIDES, "capsule") if radius else None
+
+
+def _plane(shape: Element) -> SceneMesh | None:
+    """Return a rectangle across a normal."""
+    normal = numbers_of(shape, "normal", 3, "0 0 1")
+    size = length(normal)
+    if not size > 0:
+        raise LidarError("<normal> of a <plane> has no direction.")
+    x, y = (_sizes(shape, "size", 2, "1 1") / 2).tolist()
+    if not x or not y:
+        return None
+    corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
+    rotation = _from_z(normal / size)
+    return SceneMesh("plane", matmul(corners, rotation.T), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _from_z(normal: Floats) -> Floats:
+    """Return the shortest rotation (3, 3) from z to a unit vector (3,)."""
+    x, y, z = normal.tolist()
+    if 1 + z < _PARALLEL:  # half a turn, about x
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
+    return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + z))
+
+
+def _no_shape(shape: Element) -> SceneMesh | None:
+    return None
+
+
+_SHAPES: dict[str, Callable[[Element], SceneMesh | None]] = {
+    "box": _box,
+    "capsule": _capsule,
+    "cone": _cone,
+    "cylinder": _cylinder,
+    "ellipsoid": _ellipsoid,
+    "empty": _no_shape,
+    "plane": _plane,
+    "sphere": _sphere,
+}
+
+
+def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
+    """Return outlines extruded along z to the height of the first; None without an area.
+
+    Further outlines within the first are its holes, others are outlines beside it.
+    """
+    rings = [_ring(polyline) for polyline in polylines]
+    rings = [ring for ring in rings if len(ring) > 2]
+    height = _sizes(polylines[0], "height", 1, "1").item()
+    if not rings or not height:
+        return None
+    parts = []
+    for outline, holes in _grouped(rings):
+        members = [outline, *holes]
+        starts = np.cumsum([0, *map(len, members)])
+        flat = np.concatenate([np.pad(ring, ((0, 0), (0, 1))) for ring in members])
+        rows = [np.arange(a, b) for a, b in pairwise(starts.tolist())]
+        bottom = with_holes(flat, rows)[:, ::-1]  # outlines run anticlockwise
+        top = bottom[:, ::-1] + len(flat)
+        walls = [_wall(ring, len(flat)) for ring in rows]
+        vertices = np.concatenate([flat, flat + np.array([0, 0, height])])
+        parts.append((vertices, np.concatenate([bottom, top, *walls])))
+    vertices, faces = stacked(parts)
+    return SceneMesh("polyline", vertices, faces) if len(faces) else None
+
+
+def _ring(polyline: Element) -> Floats:
+    """Return the points (n, 2) of a polyline, each once."""
+    texts = [point.text or "" for point in polyline.findall("point")]
+    points = np.array([numbers_in(text, "<point>", 2) for text in texts]).reshape(-1, 2)
+    follows = np.ones(len(points), np.bool_)
+    follows[1:] = (points[1:] != points[:-1]).any(axis=1)
+    points = points[follows]
+    return points[:-1] if len(points) > 1 and (points[0] == points[-1]).all() else points
+
+
+def _area(ring: Floats) -> float:
+    """Return the area of a ring (n, 2), positive for an anticlockwise ring."""
+    x, y = (ring - ring[0]).T
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
+
+
+def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
+    """Return outlines, anticlockwise, and their holes, clockwise, the largest outline first."""
+    by_size = sorted(rings, key=lambda ring: -abs(_area(ring)))
+    groups: list[tuple[Floats, list[Floats]]] = []
+    for ring in by_size:
+        upright = ring if _area(ring) > 0 else ring[::-1]
+        holes = next((holes for outline, holes in groups if _contains(outline, ring[0])), None)
+        if holes is None:
+            groups.append((upright, []))
+        else:
+            holes.append(upright[::-1])
+    return groups
+
+
+def _contains(ring: Floats, point: Floats) -> bool:
+    """Return True if a point (2,) is within a ring (n, 2)."""
+    a = ring - point
+    b = np.roll(a, -1, axis=0)
+    crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
+    side = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    return bool((crosses & ((side > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
+
+
+def _wall(ring: Ints, above: int) -> Ints:
+    """Return the faces (2n, 3) between a ring (n,) of vertices and the ring `above` further on."""
+    following = np.roll(ring, -1)
+    lower = np.stack([ring, following, following + above], axis=1)
+    upper = np.stack([ring, following + above, ring + above], axis=1)
+    return np.concatenate([lower, upper])
+
+
+def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneMesh:
+    """Return the surface of a height map, whose brightest pixel is as high as its size says.
+
+    The first row of the image is at the greatest y.
+
+    Raises
+    ------
+    LidarError
+        If numbers are wrong, or the map has too many pixels.
+    lidarsim.scene.masks.MaskError
+        If the image cannot be read.
+    """
+    size = _sizes(shape, "size", 3, "1 1 1")
+    offset = numbers_of(shape, "pos", 3, "0 0 0")
+    values = read_heights(image, allowance, _PIXEL_BYTES)
+    rows, columns = values.shape
+    if min(rows, columns) < 2 or not size[:2].all():
+        raise LidarError("a <heightmap> has no area.")
+    shares = values / max(float(values.max()), 1e-9)
+    x = np.linspace(-size[0] / 2, size[0] / 2, columns)
+    y = np.linspace(size[1] / 2, -size[1] / 2, rows)
+    grid = np.stack([*np.meshgrid(x, y), shares * size[2]], axis=-1).reshape(-1, 3)
+    numbers = np.arange(rows * columns).reshape(rows, columns)
+    upper_left = numbers[:-1, :-1].ravel()
+    lower_left = numbers[1:, :-1].ravel()
+    faces = np.concatenate(
+        [
+            np.stack([lower_left, lower_left + 1, upper_left], axis=1),
+            np.stack([lower_left + 1, upper_left + 1, upper_left], axis=1),
+        ]
+    )
+    return SceneMesh("heightmap", grid + offset, faces)
+
+
+def road_mesh(road: Element) -> SceneMesh | None:
+    """Return a strip of a road's width along its points; None without two points."""
+    width = _sizes(road, "width", 1, "1").item()
+    texts = [point.text or "" for point in road.findall("point")]
+    points = np.array([numbers_in(text, "<point>", 3) for text in texts]).reshape(-1, 3)
+    follows = np.ones(len(points), np.bool_)
+    follows[1:] = (points[1:, :2] != points[:-1, :2]).any(axis=1)
+    points = points[follows]
+    if len(points) < 2 or not width:
+        return None
+    steps = np.gradient(points[:, :2], axis=0)
+    lengths = length(steps)[:, None]
+    directions = np.where(lengths > 0, steps / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
+    across = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))])
+    across *= width / 2
+    left_rim = np.arange(len(points))
+    right_rim = left_rim + len(points)
+    faces = np.concatenate(
+        [
+            np.stack([right_rim[:-1], right_rim[1:], left_rim[:-1]], axis=1),
+            np.stack([right_rim[1:], left_rim[1:], left_rim[:-1]], axis=1),
+        ]
+    )
+    return SceneMesh("road", np.concatenate([points + across, points - across]), faces)

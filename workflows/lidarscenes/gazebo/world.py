@@ -1,0 +1,186 @@
+"""Worlds and models of Gazebo, .sdf and .world, as scenes.
+
+After the specification of SDFormat 1.12 (http://sdformat.org/spec) and what Gazebo does where the
+specification leaves questions open. No package of the index reads SDFormat: libsdformat comes with
+Gazebo alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import prefixed
+from lidarsim.base.vectors import matmul
+from lidarsim.base.words import listed, printable
+from lidarsim.scene.files.scene_graph import (
+    Content,
+    MeshFileError,
+    PlacedNode,
+    ReadOptions,
+    placed_content,
+)
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from .actors import actors_of
+from .appearance import appearance_of
+from .bodies import Body, BodyReader, Instance, Link, scoped
+from .link_meshes import LinkMeshes
+from .notes import Notes
+from .resources import Resources, Source
+from .sdf_xml import sdf_root
+from .shapes import road_mesh
+from .state import NO_SCALE, State, state_of
+
+_ADVICE = "simplify its meshes, or export them in parts"
+_OLD_ROOT = "gazebo"  # of Gazebo before 1.9
+
+
+class PlacedLink(NamedTuple):
+    """A link in the world."""
+
+    path: tuple[str, ...]  # names of the models that contain it, and its own
+    body: Body
+    link: Link
+    matrix: Floats  # (4, 4), to the world
+    model: Floats  # (4, 4), of the outermost model
+    scale: tuple[float, ...]
+
+
+@dataclass(eq=False)
+class World:
+    """A world, or a file of models, with the links of all models."""
+
+    element: Element
+    source: Source
+    body: Body
+    state: State
+    resources: Resources
+    notes: Notes
+    allowance: Allowance
+
+    @cached_property
+    def links(self) -> list[PlacedLink]:
+        """All links."""
+        return [*self._placed_links()]
+
+    def _placed_links(self) -> Iterator[PlacedLink]:
+        """Yield the links of all models, the state's poses first."""
+        state = self.state
+        # Instances with the names of the models around them, and the matrix of these models.
+        stack: list[tuple[Instance, tuple[str, ...], Floats | None, Floats | None]] = [
+            (child, (), None, None)
+            for child in reversed(self.body.children)
+            if child.name not in state.deleted
+        ]
+        while stack:
+            instance, outer, outer_matrix, outermost = stack.pop()
+            path = (*outer, instance.name)
+            matrix = instance.matrix
+            if outer_matrix is not None:
+                matrix = matmul(outer_matrix, matrix)
+            matrix = state.poses.get(scoped(path), matrix)
+            outermost = matrix if outermost is None else outermost
+            scale = state.scales.get(path[0], NO_SCALE)
+            for link in instance.body.links:
+                with prefixed(f"model {scoped(path)[:80]!r}, link {link.name!r}"):
+                    in_model = instance.body.frames.matrix(link.name)
+                placed = matmul(matrix, in_model)
+                link_path = (*path, link.name)
+                placed = state.poses.get(scoped(link_path), placed)
+                yield PlacedLink(link_path, instance.body, link, placed, outermost, scale)
+            stack += [
+                (child, path, matrix, outermost) for child in reversed(instance.body.children)
+            ]
+
+
+def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the visuals, or the collision shapes, of all links; actors move."""
+    world = load_world(data, path, options.folders)
+    meshes = LinkMeshes(world.resources, options, world.notes, world.allowance)
+    placed = []
+    for link in world.links:
+        mesh = meshes.mesh_of(link.body, link.link, scoped(link.path), link.scale)
+        if mesh is not None:
+            placed.append(PlacedNode(mesh, link.matrix, "/".join(link.path)))
+    actors = actors_of(world.element, world.source, meshes, world.notes)
+    content = placed_content([*placed, *_roads(world, meshes), *actors.standing])
+    content.moving = actors.moving
+    content.unit_m = 1.0
+    content.up_axis = "z"
+    content.notes = [*world.notes.lines()]
+    if not content.meshes and not content.moving:
+        missing = [*world.notes.missing_models, *world.notes.missing_files]
+        reason = f": it lacks {listed(missing, 12)}" if missing else ""
+        if world.notes.without_visuals:
+            reason += "; give geometry: collision, since links have collision shapes"
+        raise MeshFileError(f"has nothing that a lidar sees{reason}")
+    return content
+
+
+def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
+    """Read a file of SDFormat, and the included models.
+
+    Parameters
+    ----------
+    data
+        Content of the file.
+    path
+        The file.
+    folders
+        The file's folder, and further folders in which models are looked for.
+
+    Raises
+    ------
+    LidarError, ValueError, lidarsim.scene.files.scene_graph.MeshFileError
+        If the file is broken, or none of Gazebo.
+    """
+    root = sdf_root(data)
+    if root.tag == _OLD_ROOT:
+        raise MeshFileError("is of Gazebo before 1.9: convert it, gz sdf -k, with a Gazebo of then")
+    if root.tag not in ("sdf", "model", "world"):
+        raise MeshFileError(f"is XML, but no SDFormat: it begins with <{root.tag[:40]}>")
+    notes = Notes()
+    allowance = Allowance(len(data), _ADVICE)
+    resources = Resources.of_world(path, folders[1:])
+    element = _world_element(root, notes)
+    state = state_of(element)
+    for model in state.inserted:
+        element.append(model)
+    body = BodyReader(resources, notes, allowance).world(element, resources.world)
+    return World(element, resources.world, body, state, resources, notes, allowance)
+
+
+def _world_element(root: Element, notes: Notes) -> Element:
+    """Return the <world> of a file, or a <world> with its models."""
+    if root.tag == "world":
+        return root
+    if root.tag == "sdf":
+        notes.check_children(root)
+        worlds = root.findall("world")
+        if worlds:
+            if len(worlds) > 1:
+                notes.further["has several worlds, of which the first is read"] = None
+            return worlds[0]
+    element = Element("world", {"name": "default"})
+    element.extend([root] if root.tag == "model" else [*root])
+    return element
+
+
+def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
+    """Yield the roads of a world."""
+    for road in world.element.findall("road"):
+        world.notes.check_children(road)
+        name = printable(road.get("name", "")) or "road"
+        with prefixed(f"road {name!r}"):
+            mesh: SceneMesh | None = road_mesh(road)
+            if mesh is not None:
+                mesh = meshes.painted(mesh, appearance_of(road, 0.0))
+                matrix = world.body.frames.matrix(world.body.frames.root)
+                yield PlacedNode(replace(mesh, name=name), matrix, name)
