@@ -587,6 +587,8 @@ class View:
         hit_points = np.zeros((0, 3), np.float32)
         if colour == "hits":
             hit_counts = hit_counts if self.hits is None else self.hits()
+            if not len(hit_counts):  # before a run
+                hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
             rows, _ = self._finder.find(_HITS_SAMPLE)
             if "object" in self.columns:  # points on static objects only
