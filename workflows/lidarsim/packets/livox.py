@@ -1,0 +1,231 @@
+"""Packets of Livox, in the format of SDK2: Mid-360 and HAP, points and samples of the IMU.
+
+Sources: Livox's communication protocol of the Mid-360, 1.4.11, and of the HAP, 1.4.8; Livox-SDK2
+1.4.3, livox_lidar_def.h and define.h; livox_ros_driver2, pub_handler.cpp. All numbers are
+little-endian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
+from ..base.vectors import applied, inverse, matmul
+from ..sensor.trajectory import matrices
+from .encoders import Datagrams, PacketEncoder, PacketSource
+from .imu_samples import ImuBatch, ImuSamples
+from .shots import CarryOver, Shots
+
+DOTS = 96  # of a packet
+IMU_DATA = 0  # type of data
+_CHECKED_FROM = 28  # byte of a packet from which its checksum counts
+_MODES = ("strongest", "first", "last")
+_STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
+_UNSYNCHRONIZED = 0  # sources of the time
+_PTP = 1
+
+
+@dataclass(frozen=True)
+class Ports:
+    """UDP ports of a kind of device: of the sensor, and by default of the receiver."""
+
+    points: int
+    imu: int
+    host_points: int
+    host_imu: int
+
+
+# {type of device: its ports}
+PORTS = {
+    9: Ports(56_300, 56_400, 56_301, 56_401),  # Mid-360
+    10: Ports(57_000, 58_000, 57_000, 58_000),  # HAP
+}
+
+
+@dataclass(frozen=True)
+class Cartesian:
+    """Type of data with Cartesian coordinates."""
+
+    number: str  # type of a coordinate
+    unit_m: float
+
+    @property
+    def dots(self) -> np.dtype[np.void]:
+        """Type of a point."""
+        return np.dtype([("position", self.number, (3,)), ("reflectivity", "u1"), ("tag", "u1")])
+
+
+# {pcl_data_type of the sensor's parameters: points of that type}
+CARTESIAN = {1: Cartesian("<i4", 0.001), 2: Cartesian("<i2", 0.01)}
+
+_IMU_SAMPLE = np.dtype([("rate", "<f4", (3,)), ("acceleration", "<f4", (3,))])  # rad/s, g
+
+
+def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
+    """Return the type of a packet with a number of points or samples."""
+    return np.dtype(
+        [
+            ("version", "u1"),
+            ("length", "<u2"),
+            ("interval", "<u2"),  # from the first to the last point, 0.1 µs
+            ("count", "<u2"),
+            ("number", "<u2"),  # of the packet in its frame
+            ("frame", "u1"),
+            ("data_type", "u1"),
+            ("time_type", "u1"),
+            ("reserved", "u1", (12,)),
+            ("checksum", "<u4"),
+            ("stamp_ns", "<u8"),
+            ("data", data, (count,)),
+        ]
+    )
+
+
+class LivoxEncoder(PacketEncoder):
+    """Packets of 96 points, and packets of samples where the carrier has an IMU.
+
+    Points are positions in the sensor frame, at the time of each: a moving carrier's motion is not
+    removed. A pulse without a return is a point of zeros. Lines take turns: the point n is of line
+    n modulo the number of lines. The identifier `data_type` selects coordinates of 1 mm and 32 bits
+    (1, the default) or of 10 mm and 16 bits (2). Samples of the IMU are rotated to the sensor's
+    axes, as the sensor's IMU has them.
+    """
+
+    identifiers = ("device_type",)
+    optional_identifiers = ("data_type",)
+    address = "192.168.1.100"
+    destination = "192.168.1.5"
+
+    def __init__(self, source: PacketSource) -> None:
+        super().__init__(source)
+        self.device_type = self.number("device_type")
+        if self.device_type not in PORTS:
+            types = ", ".join(map(str, PORTS))
+            raise self.unusable(f"have the device types {types}, not {self.device_type}")
+        self.data_type = source.settings.identifiers.get("data_type", 1)
+        if self.data_type not in CARTESIAN:
+            types = ", ".join(map(str, CARTESIAN))
+            raise self.unusable(f"have the data types {types}, not {self.data_type}")
+        if source.mode not in _MODES:
+            modes = ", ".join(_MODES)
+            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+        lines = source.sensor.channels
+        if DOTS % lines:
+            raise self.unusable(f"hold lines whose number divides {DOTS}, not {lines}")
+        self._firings = DOTS // lines
+        self._interval_ns = self.firing_interval_ns * (DOTS - 1) / DOTS * self._firings
+        self._carry = CarryOver(self._firings)
+        self._frame = 0
+        self._packets_of_frame = 0
+        self._samples = ImuSamples(source)
+        self._to_sensor = _imu_axes(source)
+
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the packets that the shots of a sweep fill, and samples of the IMU until then."""
+        if not len(shots):
+            return []
+        imu = self._imu(self._samples.during(shots))
+        whole = self._carry.whole_packets(shots)
+        if not len(whole):
+            return imu
+        dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
+        return [self._points(whole).without(np.asarray(dropped)), *imu]
+
+    def finish(self) -> list[Datagrams]:
+        """Return the last samples of the IMU; points that fill no packet are not sent."""
+        return self._imu(self._samples.rest())
+
+    def _points(self, shots: Shots) -> Datagrams:
+        """Return the packets of points of shots that fill packets."""
+        kind = CARTESIAN[int(self.data_type)]
+        firings = np.arange(len(shots)).reshape(-1, self._firings)
+        packets = np.zeros(len(firings), packet_type(kind.dots, DOTS))
+        packets["interval"] = round(self._interval_ns / 100)
+        first_ns = shots.starts_ns[firings[:, 0]]
+        packets["number"], packets["frame"] = self._numbers(first_ns)
+        packets["data_type"] = self.data_type
+        self._write_header(packets, shots.stamps_ns[firings[:, 0]])
+        self._fill_points(packets["data"], shots, kind)
+        due_ns = shots.starts_ns[firings[:, -1]] + self.firing_interval_ns
+        ports = PORTS[self.device_type]
+        port = self.port("points", ports.host_points)
+        return Datagrams(_with_checksums(packets), due_ns, port, ports.points)
+
+    def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
+        """Write positions and reflectivities of shots to `points` (n, 96)."""
+        sensor = self.source.sensor
+        channels = self.source.settings.channels
+        range_m = shots.range_m[0]
+        vectors = sensor.directions(shots.firings)[:, channels] * range_m[:, :, None]
+        origins = sensor.origins(shots.firings)
+        if origins is not None:
+            vectors += origins[:, channels]
+        units = np.rint(vectors / kind.unit_m)
+        limit = np.iinfo(np.dtype(kind.number)).max
+        fits = (np.abs(units) <= limit).all(axis=2)  # not NaN, without a return
+        numbers = np.where(fits[:, :, None], units, 0).astype(kind.number)
+        points["position"] = numbers.reshape(points["position"].shape)
+        reflectivities = shots.columns["reflectivity"][0] * fits
+        points["reflectivity"] = reflectivities.reshape(points.shape)
+
+    def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
+        """Return the numbers in their frame, and the frames, of packets that start at times (n,).
+
+        Frames last as long as those of the sensor; numbers continue from call to call.
+        """
+        frame_ns = 1e9 / self.source.sensor.head.rate_hz  # type: ignore[attr-defined]
+        frames = np.floor(first_ns / frame_ns + 1e-6).astype(np.int64)
+        count = np.arange(len(frames))
+        is_first = np.diff(frames, prepend=frames[0] - 1) != 0
+        numbers = count - np.maximum.accumulate(np.where(is_first, count, 0))
+        if frames[0] == self._frame:
+            numbers[frames == frames[0]] += self._packets_of_frame
+        self._frame = int(frames[-1])
+        self._packets_of_frame = int(numbers[-1]) + 1
+        return numbers, frames % 256
+
+    def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
+        """Return a packet for each sample of the IMU; none for None."""
+        if batch is None:
+            return []
+        packets = np.zeros(len(batch.times_ns), packet_type(_IMU_SAMPLE, 1))
+        packets["number"] = 0
+        packets["data_type"] = IMU_DATA
+        self._write_header(packets, batch.stamps_ns)
+        samples = packets["data"]
+        samples["rate"] = applied(self._to_sensor, batch.rates)[:, None]
+        samples["acceleration"] = (applied(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
+            :, None
+        ]
+        ports = PORTS[self.device_type]
+        port = self.port("imu", ports.host_imu)
+        return [Datagrams(_with_checksums(packets), batch.times_ns, port, ports.imu)]
+
+    def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
+        """Write what all packets (n,) have in common; `stamps_ns` (n,) since the survey's start.
+
+        A sensor that no clock has told the time counts from its start.
+        """
+        packets["length"] = packets.dtype.itemsize
+        packets["count"] = packets["data"].shape[1]
+        packets["time_type"] = _PTP if self.source.dated else _UNSYNCHRONIZED
+        start_ns = self.source.start_ns if self.source.dated else 0
+        packets["stamp_ns"] = np.maximum(stamps_ns + start_ns, 0)
+
+
+def _imu_axes(source: PacketSource) -> Floats:
+    """Return the rotation (3, 3) from the axes of the carrier's IMU to those of the sensor."""
+    if source.instruments is None or source.instruments.imu is None:
+        return np.eye(3)
+    on_carrier = matrices(np.array([source.instruments.imu.quaternion]))[0]
+    return matmul(inverse(source.mount[:3, :3]), on_carrier)
+
+
+def _with_checksums(packets: Records) -> Bytes:
+    """Return packets (n,) as bytes (n, size), with their CRC-32."""
+    payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
+    packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
+    return payloads
