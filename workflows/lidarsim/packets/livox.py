@@ -116,7 +116,8 @@ class LivoxEncoder(PacketEncoder):
         if DOTS % lines:
             raise self.unusable(f"hold lines whose number divides {DOTS}, not {lines}")
         self._firings = DOTS // lines
-        self._interval_ns = self.firing_interval_ns * (DOTS - 1) / DOTS * self._firings
+        firing_ns = float(np.diff(source.sensor.begins_ns(np.arange(2)))[0])
+        self._interval_ns = firing_ns / lines * (DOTS - 1)
         self._carry = CarryOver(self._firings)
         self._frame = 0
         self._packets_of_frame = 0
@@ -192,7 +193,6 @@ class LivoxEncoder(PacketEncoder):
         if batch is None:
             return []
         packets = np.zeros(len(batch.times_ns), packet_type(_IMU_SAMPLE, 1))
-        packets["number"] = 0
         packets["data_type"] = IMU_DATA
         self._write_header(packets, batch.stamps_ns)
         samples = packets["data"]
