@@ -116,8 +116,8 @@ class LivoxEncoder(PacketEncoder):
         if DOTS % lines:
             raise self.unusable(f"hold lines whose number divides {DOTS}, not {lines}")
         self._firings = DOTS // lines
-        firing_ns = float(np.diff(source.sensor.begins_ns(np.arange(2)))[0])
-        self._interval_ns = firing_ns / lines * (DOTS - 1)
+        # Time from the first to the last line of a firing, as readers space points evenly.
+        self._lines_ns = self.firing_interval_ns * (lines - 1) / lines
         self._carry = CarryOver(self._firings)
         self._frame = 0
         self._packets_of_frame = 0
@@ -144,13 +144,14 @@ class LivoxEncoder(PacketEncoder):
         kind = CARTESIAN[int(self.data_type)]
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), packet_type(kind.dots, DOTS))
-        packets["interval"] = round(self._interval_ns / 100)
         first_ns = shots.starts_ns[firings[:, 0]]
+        last_ns = shots.starts_ns[firings[:, -1]]
+        packets["interval"] = np.rint((last_ns - first_ns + self._lines_ns) / 100)
         packets["number"], packets["frame"] = self._numbers(first_ns)
         packets["data_type"] = self.data_type
         self._write_header(packets, shots.stamps_ns[firings[:, 0]])
         self._fill_points(packets["data"], shots, kind)
-        due_ns = shots.starts_ns[firings[:, -1]] + self.firing_interval_ns
+        due_ns = last_ns + self.firing_interval_ns
         ports = PORTS[self.device_type]
         port = self.port("points", ports.host_points)
         return Datagrams(_with_checksums(packets), due_ns, port, ports.points)

@@ -109,7 +109,10 @@ MODELS = {
         header=bytes.fromhex("55aa050a5aa550a0"),
         modes={"strongest": 1, "last": 2, "dual": 0},
         msop=_msop_packet(np.dtype(_DATE), {"id": (0, ("u1", 8)), "type_code": (30, "u1")}),
-        difop=_difop_packet({"time": (303, np.dtype(_DATE)), "elevations": (1165, ("u1", (16, 3)))}),
+        difop=_difop_packet({
+            "time": (303, np.dtype(_DATE)),
+            "elevations": (1165, ("u1", (16, 3))),  # without signs, in 0.0001 degrees
+        }),
     ),
     "RSHELIOS": Model(
         lasers=32,
