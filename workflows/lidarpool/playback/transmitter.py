@@ -29,6 +29,7 @@ class Stream:
     kinds: Mapping[str, int]  # {kind of datagrams: port}, that of the returns first
     make_service: MakeService
     told_apart: bool = False  # see `PacketEncoder`
+    has_own_address: bool = False
     destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
     address: Address = field(default_factory=lambda: Address(LOOPBACK))  # of the interface
     api_given: bool = False  # whether a user gives the address of the interface
@@ -78,6 +79,7 @@ def sensor_streams(
             encoder.ports,
             encoder.service,
             encoder.told_apart,
+            encoder.has_own_address,
         )
         for encoder in encoders
     ]
@@ -87,7 +89,8 @@ def sensor_streams(
 def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
     """Return streams to the addresses that a user gives, as [NAME=]HOST[:PORT].
 
-    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default.
+    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default, those that need an address of
+    their own from 127.0.0.2 on.
 
     LidarError if an address cannot be used, or receivers could not tell two sensors apart.
     """
@@ -99,13 +102,18 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
         name = stream.name
         moved = replace(
             stream.to(receivers.get(name, Address(LOOPBACK))),
-            address=interfaces.get(name, Address(f"127.0.0.{number + 1}")),
+            address=interfaces.get(name, _loopback_address(number, stream.has_own_address)),
             api_given=name in interfaces,
         )
         for other in placed:
             _check_apart(other, moved)
         placed.append(moved)
     return placed
+
+
+def _loopback_address(number: int, has_own_address: bool) -> Address:
+    """Return the default address of the interface of a sensor, by its number."""
+    return Address(f"127.0.0.{number + (2 if has_own_address else 1)}")
 
 
 def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[str, Address]:

@@ -29,12 +29,12 @@ START_NS = 1_000_000_000_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Datagrams:
-    """UDP datagrams of the same size to a port, from the same port or another."""
+    """UDP datagrams of the same size to a port."""
 
     payloads: Bytes  # (n, size)
     due_ns: Ints  # (n,): when the sensor sends them, nanoseconds since the survey's start
     port: int
-    source_port: int = 0  # of the sensor; 0 for the same port
+    source_port: int = 0  # of the sensor; 0 for any: in files the same port
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -102,6 +102,8 @@ class PacketEncoder(ABC):
     default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
     # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
     told_apart: ClassVar[bool] = False
+    # Whether the maker's software ignores datagrams from the receiver's address.
+    has_own_address: ClassVar[bool] = False
 
     def __init__(self, source: PacketSource) -> None:
         self.source = source

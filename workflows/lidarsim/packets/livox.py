@@ -7,6 +7,7 @@ little-endian.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -17,6 +18,7 @@ from ..base.vectors import applied, inverse, matmul
 from ..sensor.trajectory import matrices
 from .encoders import Datagrams, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
+from .service import Destination, Service
 from .shots import CarryOver, Shots
 
 DOTS = 96  # of a packet
@@ -30,18 +32,21 @@ _PTP = 1
 
 @dataclass(frozen=True)
 class Ports:
-    """UDP ports of a kind of device: of the sensor, and by default of the receiver."""
+    """UDP ports of a kind of device: of the sensor, and by default of the host."""
 
     points: int
     imu: int
     host_points: int
     host_imu: int
+    command: int
+    state: int  # of state messages; 0: none are sent
+    host_state: int
 
 
 # {type of device: its ports}
 PORTS = {
-    9: Ports(56_300, 56_400, 56_301, 56_401),  # Mid-360
-    10: Ports(57_000, 58_000, 57_000, 58_000),  # HAP
+    9: Ports(56_300, 56_400, 56_301, 56_401, 56_100, 56_200, 56_201),  # Mid-360
+    10: Ports(57_000, 58_000, 57_000, 58_000, 56_000, 0, 0),  # HAP
 }
 
 
@@ -98,6 +103,8 @@ class LivoxEncoder(PacketEncoder):
     optional_identifiers = ("data_type",)
     address = "192.168.1.100"
     destination = "192.168.1.5"
+    told_apart = True
+    has_own_address = True
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -139,22 +146,54 @@ class LivoxEncoder(PacketEncoder):
         """Return the last samples of the IMU; points that fill no packet are not sent."""
         return self._imu(self._samples.rest())
 
+    @property
+    def ports(self) -> Mapping[str, int]:
+        """Ports of the host: {kind: port}."""
+        ports = PORTS[self.device_type]
+        defaults = {"points": ports.host_points, "imu": ports.host_imu}
+        return {**defaults, **self.source.settings.ports}
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service:
+        """Return the sensor's command interface, see `PacketEncoder.service`."""
+        from .livox_service import LivoxService, LivoxState
+
+        ports = PORTS[self.device_type]
+        state = LivoxState(
+            device_type=self.device_type,
+            product=self.source.sensor.model,
+            serial=f"LIDARPOOL{crc32(self.source.name.encode()) % 1_000_000:06d}",
+            command_port=ports.command,
+            state_ports=(ports.state, ports.host_state),
+            points_ports=(ports.points, self.ports["points"]),
+            imu_ports=(ports.imu, self.ports["imu"]),
+            data_type=int(self.data_type),
+            data_types=tuple(CARTESIAN),
+            is_synchronized=self.source.dated,
+        )
+        return LivoxService(address, destination, send_to, state, self.set_data_type)
+
+    def set_data_type(self, data_type: int) -> None:
+        """Change the type of the data of later packets, of `CARTESIAN`."""
+        self.data_type = data_type
+
     def _points(self, shots: Shots) -> Datagrams:
         """Return the packets of points of shots that fill packets."""
-        kind = CARTESIAN[int(self.data_type)]
+        data_type = int(self.data_type)  # which a service may change meanwhile
+        kind = CARTESIAN[data_type]
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), packet_type(kind.dots, DOTS))
         first_ns = shots.starts_ns[firings[:, 0]]
         last_ns = shots.starts_ns[firings[:, -1]]
         packets["interval"] = np.rint((last_ns - first_ns + self._lines_ns) / 100)
         packets["number"], packets["frame"] = self._numbers(first_ns)
-        packets["data_type"] = self.data_type
+        packets["data_type"] = data_type
         self._write_header(packets, shots.stamps_ns[firings[:, 0]])
         self._fill_points(packets["data"], shots, kind)
         due_ns = last_ns + self.firing_interval_ns
-        ports = PORTS[self.device_type]
-        port = self.port("points", ports.host_points)
-        return Datagrams(_with_checksums(packets), due_ns, port, ports.points)
+        source_port = PORTS[self.device_type].points
+        return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
         """Write positions and reflectivities of shots to `points` (n, 96)."""
@@ -201,9 +240,9 @@ class LivoxEncoder(PacketEncoder):
         samples["acceleration"] = (applied(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
             :, None
         ]
-        ports = PORTS[self.device_type]
-        port = self.port("imu", ports.host_imu)
-        return [Datagrams(_with_checksums(packets), batch.times_ns, port, ports.imu)]
+        payloads = _with_checksums(packets)
+        source_port = PORTS[self.device_type].imu
+        return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
         """Write what all packets (n,) have in common; `stamps_ns` (n,) since the survey's start.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address
+from typing import ClassVar
 from zlib import crc32
 
 import numpy as np
@@ -147,6 +148,7 @@ class RobosenseEncoder(PacketEncoder):
     identifiers = ("model",)
     address = "192.168.1.200"
     destination = "192.168.1.102"
+    default_ports: ClassVar[Mapping[str, int]] = {"msop": MSOP_PORT, "difop": DIFOP_PORT}
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -208,7 +210,7 @@ class RobosenseEncoder(PacketEncoder):
         _write_times(packets["time"], shots.stamps_ns[firings[:, 0]] + self.source.start_ns)
         self._fill_blocks(packets["blocks"], shots)
         due_ns = shots.starts_ns[firings[:, -1]] + self.firing_interval_ns
-        return Datagrams(_as_bytes(packets), due_ns, self.port("msop", MSOP_PORT))
+        return Datagrams(_as_bytes(packets), due_ns, self.ports["msop"])
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
         """Write azimuths and returns of shots into blocks (n, 12) of `_BLOCK`."""
@@ -246,7 +248,7 @@ class RobosenseEncoder(PacketEncoder):
         firing = np.maximum(np.searchsorted(shots.starts_ns, due_ns, "right") - 1, 0)
         jumps_ns = (shots.stamps_ns - shots.starts_ns)[firing]
         _write_times(packets["time"], due_ns + jumps_ns + self.source.start_ns)
-        return Datagrams(_as_bytes(packets), due_ns, self.port("difop", DIFOP_PORT))
+        return Datagrams(_as_bytes(packets), due_ns, self.ports["difop"])
 
     def _device_data(self) -> Records:
         """Return the device data of the sensor without a time: (1,)."""
@@ -256,8 +258,8 @@ class RobosenseEncoder(PacketEncoder):
         packets["address"] = np.frombuffer(IPv4Address(self.address).packed, np.uint8)
         packets["destination"] = np.frombuffer(IPv4Address(self.destination).packed, np.uint8)
         packets["mac"] = np.frombuffer(_MAC, np.uint8)
-        msop_port = self.port("msop", MSOP_PORT)
-        difop_port = self.port("difop", DIFOP_PORT)
+        msop_port = self.ports["msop"]
+        difop_port = self.ports["difop"]
         packets["ports"] = msop_port, msop_port, difop_port, difop_port
         packets["field_of_view"] = 0, _AZIMUTHS
         packets["return_mode"] = self._model.modes[self.source.mode]
