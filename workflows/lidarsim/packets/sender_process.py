@@ -6,9 +6,9 @@ milliseconds, and shares no lock with the process that casts: a thread beside th
 
 Each record begins with `HEADER`: its kind, the number of the sensor, the port, the port that it
 comes from (0 for any), the size of the content, and a time. A record DATAGRAM is sent at its time
-by the clock of `time.monotonic_ns`; its content is the payload. A record ROUTE says where later datagrams of a sensor go, as JSON. After the
-record END the process sends what is left; without END, the end of stdin ends the process at once,
-as the process that casts is gone.
+by the clock of `time.monotonic_ns`; its content is the payload. A record ROUTE says where later
+datagrams of a sensor go, as JSON. After the record END the process sends what is left; without END,
+the end of stdin ends the process at once, as the process that casts is gone.
 """
 
 from __future__ import annotations
