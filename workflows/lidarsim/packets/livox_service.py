@@ -180,9 +180,8 @@ class LivoxService(Service):
                     continue
                 for key, _ in selector.select(_LOOKS_S):
                     requests += 1
-                    opened = key.fileobj
-                    assert isinstance(opened, socket.socket)
-                    self._serve(opened)
+                    assert isinstance(key.fileobj, socket.socket)
+                    self._serve(key.fileobj)
 
     def _serve(self, opened: socket.socket) -> None:
         """Answer the next request of a socket; datagrams that are no requests are ignored."""

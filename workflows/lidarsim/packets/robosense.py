@@ -205,7 +205,7 @@ class RobosenseEncoder(PacketEncoder):
         packets["type_code"] = self._model.type_code
         packets["temperature"] = _TEMPERATURE
         packets["tail"] = _MSOP_TAIL
-        if "protocol" in self._model.msop.names:
+        if self._model is MODELS["RSHELIOS"]:
             packets["protocol"] = _HELIOS_PROTOCOL
         _write_times(packets["time"], shots.stamps_ns[firings[:, 0]] + self.source.start_ns)
         self._fill_blocks(packets["blocks"], shots)
@@ -298,7 +298,7 @@ def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
     """Write times (n,), nanoseconds since 1970, as records of `_DATE` or `_SECONDS`."""
     micros = np.maximum(since_1970_ns + 500, 0) // 1000
     seconds, microseconds = np.divmod(micros, 1_000_000)
-    if "high_second" in times.dtype.names:
+    if times.dtype == np.dtype(_SECONDS):
         times["high_second"] = seconds >> 32
         times["second"] = seconds & 0xFFFF_FFFF
         times["microsecond"] = microseconds
