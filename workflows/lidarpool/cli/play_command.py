@@ -16,6 +16,7 @@ from lidarsim.base.storage import Storage
 from . import shared_options as options
 
 _PACKETS = "packets"
+_NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: time to prepare
 
 
 @click.command()
@@ -91,14 +92,15 @@ def play(
         with terminal.status("reading the source", logged=False):
             played = stack.enter_context(open_source(source, kind.format))
         sweeps = played.sweeps
+        start_at_ns = 0
         if now:
-            first_ns = round(float(sweeps.begins_ns.min()))
-            sweeps = replace(sweeps, start_ns=time.time_ns() - first_ns)
+            start_at_ns = time.time_ns() + _NOW_NS
+            sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, given)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
         with _summarized(lambda: bridge.summary), bridge:
             click.echo(f"ready: {bridge.description}; Ctrl-C stops")
-            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop)
+            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
 
 
 def _play_recording(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from itertools import chain, count, islice
 
@@ -31,11 +32,13 @@ def play_sweeps(
     note: Callable[[str], None],
     *,
     loop: bool = False,
+    start_at_ns: int = 0,
 ) -> None:
     """Send each sweep through a bridge when it is due; the schedule starts with the first sweeps.
 
     With `loop`, all sweeps are sent again and again, with times that go on. A sweep that is not
-    cast in time is sent late, and the user is told once.
+    cast in time is sent late, and the user is told once. The schedule does not start before
+    `start_at_ns` by `time.time_ns`.
     """
     late_sweeps = 0
     sensors = len(played.sweeps.sensors)
@@ -44,7 +47,8 @@ def play_sweeps(
         first = list(islice(sweeps, sensors))
         for sweep, points, _ in first:
             bridge.prepare(sweep, points)
-        schedule.start(min(bridge.due_ns(sweep) for sweep, _, _ in first), _START_NS)
+        delay_ns = max(_START_NS, start_at_ns - time.time_ns())
+        schedule.start(min(bridge.due_ns(sweep) for sweep, _, _ in first), delay_ns)
         for sweep, points, shift_ns in chain(first, sweeps):
             due_ns = bridge.due_ns(sweep) + shift_ns
             schedule.wait_until(due_ns - bridge.lead_ns)
