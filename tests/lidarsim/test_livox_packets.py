@@ -108,11 +108,12 @@ def plain_rows(payloads, model: str, kind: int) -> list[Row]:
         assert (header.data_type, header.count, len(data)) == (kind, 96, 36 + 96 * size)
         for n in range(96):
             x, y, z, reflectivity, tag = struct.unpack_from(numbers, data, 36 + size * n)
-            assert tag == 0
+            position = [UNITS_MM[kind] * value for value in (x, y, z)]
+            is_first = model == "hap" and np.linalg.norm(position) > 1500  # of the returns
+            assert tag == (0x10 if is_first else 0)
             if x == y == z == 0:
                 assert reflectivity == 0
                 continue
-            position = [UNITS_MM[kind] * value for value in (x, y, z)]
             firing, line = divmod(n, lines)
             time_us = header.stamp_ns / 1000 + header.interval / 10 * n / 95
             rows.append(Row(packet * 96 // lines + firing, line, *position, reflectivity, time_us))
@@ -287,8 +288,8 @@ def synthetic_shots(model, kind=1):
 RECORDED = {
     ("mid360", 1): (152, 14356, 228, -741857, -1243000, 1714207, "577f4a59a66befb3"),
     ("mid360", 2): (152, 14356, 228, -741880, -1243060, 1714130, "b3a876832028afe8"),
-    ("hap", 1): (228, 26083, 570, 1965837, -2714333, -97912, "68a553e428185ed3"),
-    ("hap", 2): (228, 26083, 570, 1965860, -2714380, -97920, "76dea31cbd896546"),
+    ("hap", 1): (228, 26083, 570, 1965837, -2714333, -97912, "62513abd2b592ef2"),
+    ("hap", 2): (228, 26083, 570, 1965860, -2714380, -97920, "89b31047fd6a1a6e"),
 }
 
 

@@ -1,8 +1,8 @@
 """Packets of Livox, in the format of SDK2: Mid-360 and HAP, points and samples of the IMU.
 
-Sources: Livox's communication protocol of the Mid-360, 1.4.11, and of the HAP, 1.4.8; Livox-SDK2
-1.4.3, livox_lidar_def.h and define.h; livox_ros_driver2, pub_handler.cpp. All numbers are
-little-endian.
+Sources: Livox's communication protocol of the Mid-360, 1.4.11, and of the HAP, 1.4.8; user manual
+of the HAP, page 15 (tags); Livox-SDK2 1.4.3, livox_lidar_def.h and define.h; livox_ros_driver2,
+pub_handler.cpp. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -43,11 +43,16 @@ class Ports:
     host_state: int
 
 
-# {type of device: its ports}
+_MID360 = 9  # types of devices
+_HAP = 10
 PORTS = {
-    9: Ports(56_300, 56_400, 56_301, 56_401, 56_100, 56_200, 56_201),  # Mid-360
-    10: Ports(57_000, 58_000, 57_000, 58_000, 56_000, 0, 0),  # HAP
+    _MID360: Ports(56_300, 56_400, 56_301, 56_401, 56_100, 56_200, 56_201),
+    _HAP: Ports(57_000, 58_000, 57_000, 58_000, 56_000, 0, 0),
 }
+# Tag of the HAP for the first return. The light that the sensor itself returns is return 0, with
+# which returns nearer than 1.5 m are merged. Other tags, of noise, are 0: high confidence.
+_HAP_FIRST_RETURN = 0x10
+_HAP_MERGED_M = 1.5
 
 
 @dataclass(frozen=True)
@@ -211,6 +216,9 @@ class LivoxEncoder(PacketEncoder):
         points["position"] = numbers.reshape(points["position"].shape)
         reflectivities = shots.columns["reflectivity"][0] * fits
         points["reflectivity"] = reflectivities.reshape(points.shape)
+        if self.device_type == _HAP:
+            is_first = fits & (range_m > _HAP_MERGED_M)
+            points["tag"] = _HAP_FIRST_RETURN * is_first.reshape(points.shape)
 
     def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
         """Return the numbers in their frame, and the frames, of packets that start at times (n,).
