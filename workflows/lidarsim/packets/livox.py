@@ -205,15 +205,17 @@ class LivoxEncoder(PacketEncoder):
         sensor = self.source.sensor
         channels = self.source.settings.channels
         range_m = shots.range_m[0]
-        vectors = sensor.directions(shots.firings)[:, channels] * range_m[:, :, None]
+        vectors = sensor.directions(shots.firings)[:, channels]
+        vectors *= range_m[:, :, None]
         origins = sensor.origins(shots.firings)
         if origins is not None:
             vectors += origins[:, channels]
-        units = np.rint(vectors / kind.unit_m)
+        vectors /= kind.unit_m
+        units = np.rint(vectors, out=vectors)
         limit = np.iinfo(np.dtype(kind.number)).max
         fits = (np.abs(units) <= limit).all(axis=2)  # not NaN, without a return
-        numbers = np.where(fits[:, :, None], units, 0).astype(kind.number)
-        points["position"] = numbers.reshape(points["position"].shape)
+        units[~fits] = 0
+        points["position"] = units.reshape(points["position"].shape)
         reflectivities = shots.columns["reflectivity"][0] * fits
         points["reflectivity"] = reflectivities.reshape(points.shape)
         if self.device_type == _HAP:
