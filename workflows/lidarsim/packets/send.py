@@ -27,7 +27,7 @@ LOOPBACK = "127.0.0.1"
 _RECORD = np.dtype(
     [("kind", "<u2"), ("sensor", "<u2"), ("port", "<u4"), ("size", "<u4"), ("due_ns", "<i8")]
 )
-_ENDS_WITHIN_S = 10.0  # of the process after SIGTERM
+_ENDS_WITHIN_S = 2.0  # of the process after SIGTERM
 
 
 @dataclass(frozen=True)
