@@ -57,8 +57,8 @@ class Lateness:
         }
 
     def __str__(self) -> str:
-        if not self.sent and not self.failures:
-            return "no packets were sent"
+        if not self.limits_ms:
+            return "the process that sends was ended before it said what it had sent"
         words = f"{self.sent:,} packets sent"
         if self.sent:
             words += (
