@@ -10,17 +10,11 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 
 from .bridge import Bridge
-from .schedule import MadeAhead, Schedule
+from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
 from .sources import Played
 
 # Sweeps that are cast before they are due, for each sensor.
 AHEAD = 4
-# How late a sweep may be before the user reads that casting falls behind, seconds.
-_BEHIND_S = 0.005
-BEHIND = (
-    "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
-    "(--rate)."
-)
 # From the start of the schedule to the first sweep, for what the bridge does before.
 _START_NS = 100e6
 
@@ -52,7 +46,7 @@ def play_sweeps(
         for sweep, points, shift_ns in chain(first, sweeps):
             due_ns = bridge.due_ns(sweep) + shift_ns
             schedule.wait_until(due_ns - bridge.lead_ns)
-            if schedule.late_s(due_ns) > _BEHIND_S:
+            if schedule.late_s(due_ns) > BEHIND_S:
                 if not late_sweeps:
                     note(BEHIND)
                 late_sweeps += 1

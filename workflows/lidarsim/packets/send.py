@@ -34,7 +34,7 @@ _RECORD = np.dtype(
         ("due_ns", "<i8"),
     ]
 )
-_ENDS_WITHIN_S = 10.0  # of the process after SIGTERM
+_ENDS_WITHIN_S = 2.0  # of the process after SIGTERM
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Lateness:
         }
 
     def __str__(self) -> str:
-        if not self.sent and not self.failures:
-            return "no packets were sent"
+        if not self.limits_ms:
+            return "the process that sends was ended before it said what it had sent"
         words = f"{self.sent:,} packets sent"
         if self.sent:
             words += (
