@@ -13,6 +13,7 @@ import pytest
 from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_shots
 
 from lidarpool import LidarError, load_sensor
+from lidarpool.playback.transmitter import sensor_streams
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.send import Sender
 from lidarsim.packets.service import Destination
@@ -275,6 +276,15 @@ def test_addresses_that_cannot_be_had_are_refused():
     service = sensor.encoder.service(f"{SENSOR}:8080", Destination("127.0.0.1"), print)
     with pytest.raises(LidarError, match="ports are fixed"), service:
         pass
+
+
+def test_sensors_have_addresses_that_are_not_the_hosts():
+    """The SDK ignores datagrams from its own address, 127.0.0.1."""
+    names = ("livox/mid360", "velodyne/vlp16", "livox/hap")
+    encoders = [encoder_of(PacketSource(load_sensor(name), "strongest", name)) for name in names]
+    streams = sensor_streams(encoders, (), ())
+    assert [str(stream.address) for stream in streams] == ["127.0.0.2", "127.0.0.2", "127.0.0.4"]
+    assert [stream.ports for stream in streams[::2]] == [[56_301, 56_401], [57_000, 58_000]]
 
 
 def test_the_port_of_the_points_is_the_sensors():
