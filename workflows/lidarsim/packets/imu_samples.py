@@ -37,8 +37,8 @@ class ImuSamples:
         self._jumps_ns = shots.stamps_ns - shots.starts_ns
         return self._until(int(shots.starts_ns[-1]))
 
-    def rest(self) -> ImuBatch | None:
-        """Return all further samples; None if there are no samples."""
+    def remaining(self) -> ImuBatch | None:
+        """Return the samples after the last shots; None if there are no samples."""
         return self._until(None)
 
     def _until(self, until_ns: int | None) -> ImuBatch | None:

@@ -141,15 +141,15 @@ class LivoxEncoder(PacketEncoder):
         if not len(shots):
             return []
         imu = self._imu(self._samples.during(shots))
-        whole = self._carry.whole_packets(shots)
-        if not len(whole):
+        filling = self._carry.whole_packets(shots)
+        if not len(filling):
             return imu
-        dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
-        return [self._points(whole).without(np.asarray(dropped)), *imu]
+        dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
+        return [self._points(filling).without(np.asarray(dropped)), *imu]
 
     def finish(self) -> list[Datagrams]:
         """Return the last samples of the IMU; points that fill no packet are not sent."""
-        return self._imu(self._samples.rest())
+        return self._imu(self._samples.remaining())
 
     @property
     def ports(self) -> Mapping[str, int]:
@@ -225,7 +225,7 @@ class LivoxEncoder(PacketEncoder):
     def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
         """Return the numbers in their frame, and the frames, of packets that start at times (n,).
 
-        Frames last as long as those of the sensor; numbers continue from call to call.
+        A frame lasts as long as a frame of the sensor; numbers continue from call to call.
         """
         frame_ns = 1e9 / self.source.sensor.head.rate_hz  # type: ignore[attr-defined]
         frames = np.floor(first_ns / frame_ns + 1e-6).astype(np.int64)
@@ -255,7 +255,7 @@ class LivoxEncoder(PacketEncoder):
         return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
-        """Write what all packets (n,) have in common; `stamps_ns` (n,) since the survey's start.
+        """Write the common fields of packets (n,); `stamps_ns` (n,) are since the survey's start.
 
         A sensor that no clock has told the time counts from its start.
         """
@@ -267,7 +267,7 @@ class LivoxEncoder(PacketEncoder):
 
 
 def _imu_axes(source: PacketSource) -> Floats:
-    """Return the rotation (3, 3) from the axes of the carrier's IMU to those of the sensor."""
+    """Return the rotation (3, 3) from the axes of the carrier's IMU to the sensor's axes."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
     on_carrier = matrices(np.array([source.instruments.imu.quaternion]))[0]

@@ -99,7 +99,7 @@ class RefusedError(Exception):
 
 
 def parse_request(content: bytes) -> Frame | None:
-    """Return the request in a datagram; None for what is not a request with right checksums."""
+    """Return the request in a datagram; None without a request with right checksums."""
     if len(content) < _HEAD_BYTES:
         return None
     start, version, length, number, command, kind, _, _ = _HEAD.unpack_from(content)
@@ -135,7 +135,7 @@ def _checksum(data: bytes) -> int:
 
 
 def parse_values(data: bytes) -> dict[int, bytes]:
-    """Return the parameters of a request that sets them; RefusedError if they are cut off."""
+    """Return the parameters of a request to set; RefusedError if parameters are cut off."""
     values = {}
     offset = _COUNT.size
     for _ in range(_key_count(data)):
@@ -150,7 +150,7 @@ def parse_values(data: bytes) -> dict[int, bytes]:
 
 
 def parse_keys(data: bytes) -> Sequence[int]:
-    """Return the parameters that a request asks for; RefusedError if they are cut off."""
+    """Return the keys of a request to get; RefusedError if keys are cut off."""
     count = _key_count(data)
     if _COUNT.size + count * _KEY.size > len(data):
         raise RefusedError(Code.WRONG_KEY_NUMBER)
@@ -170,5 +170,5 @@ def packed_values(values: Mapping[int, bytes]) -> bytes:
 
 
 def packed_count(values: Mapping[int, bytes]) -> bytes:
-    """Return what stands before the parameters that a sensor sends by itself."""
+    """Return the head of parameters that a sensor sends by itself."""
     return _COUNT.pack(len(values), 0)

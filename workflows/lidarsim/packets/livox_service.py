@@ -194,9 +194,9 @@ class LivoxService(Service):
 
     def _announce(self) -> None:
         """Tell the host that the sensor is there, and its state."""
-        found = answer_frame(Command.SEARCH, 0, self._search_answer())
+        announcement = answer_frame(Command.SEARCH, 0, self._search_answer())
         with suppress(OSError):
-            self._sockets[SEARCH_PORT].sendto(found, (self.destination.host, SEARCH_PORT))
+            self._sockets[SEARCH_PORT].sendto(announcement, (self.destination.host, SEARCH_PORT))
         address, port, _ = _HOST.unpack(self._values[Key.STATE_HOST])
         if not port or self._state.state_ports[0] not in self._sockets:
             return
@@ -217,8 +217,8 @@ class LivoxService(Service):
             return self._get(request.data)
         if request.command == Command.SET:
             return self._set(request.data)
-        known = request.command in (Command.REBOOT, Command.RESET, Command.SET_GPS_TIME)
-        return bytes([Code.SUCCESS if known else Code.NOT_SUPPORTED])
+        is_accepted = request.command in (Command.REBOOT, Command.RESET, Command.SET_GPS_TIME)
+        return bytes([Code.SUCCESS if is_accepted else Code.NOT_SUPPORTED])
 
     def _search_answer(self) -> bytes:
         return _SEARCH_ANSWER.pack(
@@ -230,17 +230,17 @@ class LivoxService(Service):
         )
 
     def _get(self, data: bytes) -> bytes:
-        """Return the parameters that a request asks for, without those that the sensor lacks."""
+        """Return the parameters of a request to get, except parameters that the sensor lacks."""
         try:
             keys = parse_keys(data)
         except RefusedError as error:
             return _GET_ANSWER.pack(error.code, 0)
-        known = self._all_values()
-        values = {key: known[key] for key in keys if key in known}
+        parameters = self._all_values()
+        values = {key: parameters[key] for key in keys if key in parameters}
         return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
 
     def _set(self, data: bytes) -> bytes:
-        """Set parameters, or none of them if one is wrong; return the return code."""
+        """Set all parameters of a request, or none if a value is wrong; return the answer."""
         try:
             values = parse_values(data)
             for key, value in values.items():
@@ -282,7 +282,7 @@ class LivoxService(Service):
     # -- parameters ------------------------------------------------------------------------------
 
     def _first_values(self) -> dict[int, bytes]:
-        """Return the parameters that can be set, as the sensor has them at its start."""
+        """Return the parameters that can be set, with their values at the sensor's start."""
         state = self._state
         values = {key: bytes(length) for key, length in _LENGTHS.items()}
         values[Key.DATA_TYPE] = bytes([state.data_type])
@@ -298,7 +298,7 @@ class LivoxService(Service):
         return values
 
     def _all_values(self) -> dict[int, bytes]:
-        """Return all parameters, with those that cannot be set."""
+        """Return all parameters, also read-only parameters."""
         state = self._state
         work_mode = self._values[Key.WORK_MODE]
         local_ns = time.monotonic_ns() - self._started_ns
@@ -324,7 +324,7 @@ class LivoxService(Service):
 
 
 def _check_host(key: int, value: bytes) -> None:
-    """Raise RefusedError unless a value is the address of one receiver, or none."""
+    """Raise RefusedError unless a value is the address of a single receiver."""
     try:
         address = IPv4Address(value[:4])
     except AddressValueError as error:

@@ -320,7 +320,7 @@ class OusterEncoder(PacketEncoder):
 
     def finish(self) -> list[Datagrams]:
         """Return the packet of the last columns, and the IMU packets after them."""
-        return [*self._rest_of_packets(), *self._imu(self._samples.rest())]
+        return [*self._rest_of_packets(), *self._imu(self._samples.remaining())]
 
     def files(self) -> Mapping[str, bytes]:
         """Return the metadata of the sensor as JSON, in the layout of its HTTP interface."""

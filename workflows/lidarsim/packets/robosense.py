@@ -53,7 +53,7 @@ _SIGNED_ANGLE = [("negative", "u1"), ("centidegrees", ">u2")]
 
 
 def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return a type of `size` bytes with fields {name: (offset, type)}; others are zeros."""
+    """Return a type of `size` bytes with fields {name: (offset, type)}; further bytes are 0."""
     offsets, formats = zip(*fields.values(), strict=True)
     return np.dtype(
         {"names": list(fields), "offsets": offsets, "formats": formats, "itemsize": size}
@@ -90,7 +90,7 @@ def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.vo
 
 @dataclass(frozen=True)
 class Model:
-    """Layout of a model's packets, and what readers of the model assume."""
+    """Layout of a model's packets, with the figures that readers assume."""
 
     lasers: int
     unit_m: float
@@ -186,12 +186,12 @@ class RobosenseEncoder(PacketEncoder):
 
     def encode(self, shots: Shots) -> list[Datagrams]:
         """Return the packets that the shots of a sweep fill, and device data until then."""
-        whole = self._carry.whole_packets(shots)
-        if not len(whole):
+        filling = self._carry.whole_packets(shots)
+        if not len(filling):
             return []
-        msop = self._msop(whole)
-        dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
-        return [self._difop(whole, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
+        msop = self._msop(filling)
+        dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
+        return [self._difop(filling, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor sends no packet before its blocks are full."""
