@@ -41,6 +41,7 @@ def test_scales_are_inverted_exactly(maker):
         ("velodyne", [0, 10, 50, 100]),
         ("ouster", [0, 10, 50, 100]),
         ("vls128", [0, 11, 55, 110]),
+        ("livox", [0, 15, 75, 150]),
         ("hesai", [0, 10, 50, 100]),
     ],
 )
@@ -93,8 +94,8 @@ def test_models_have_the_scales_of_their_makers():
 
 def test_a_scale_that_is_not_known_is_named(tmp_path):
     with pytest.raises(LidarError, match=r"reflectivity.*velodyne.*ouster.*hesai"):
-        replace(beam_along_x().optics, reflectivity="livox")
+        replace(beam_along_x().optics, reflectivity="acme")
     model = tmp_path / "mine.yaml"
-    model.write_text("{name: Mine, firings_per_turn: 360, optics: {reflectivity: livox}}")
+    model.write_text("{name: Mine, firings_per_turn: 360, optics: {reflectivity: acme}}")
     with pytest.raises(LidarError, match=r"mine\.yaml.*optics\.reflectivity.*'ouster'"):
         read_model(model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import ClassVar
 
@@ -34,6 +34,7 @@ class Datagrams:
     payloads: Bytes  # (n, size)
     due_ns: Ints  # (n,): when the sensor sends them, nanoseconds since the survey's start
     port: int
+    source_port: int = 0  # of the sensor; 0 for any: in files the same port
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -42,7 +43,7 @@ class Datagrams:
         """Return the datagrams without those that are lost: `dropped` (n,)."""
         if not dropped.any():
             return self
-        return Datagrams(self.payloads[~dropped], self.due_ns[~dropped], self.port)
+        return replace(self, payloads=self.payloads[~dropped], due_ns=self.due_ns[~dropped])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class PacketEncoder(ABC):
     that fill no packet for the next sweep (`CarryOver`).
     """
 
-    columns: ClassVar[tuple[str, ...]] = ("reflectivity",)  # of the cloud, beside ray and range
+    columns: tuple[str, ...] = ("reflectivity",)  # of the cloud, beside ray and range
     identifiers: ClassVar[tuple[str, ...]] = ()  # that the data file must state
     optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
     address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
@@ -101,6 +102,8 @@ class PacketEncoder(ABC):
     default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
     # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
     told_apart: ClassVar[bool] = False
+    # Whether the maker's software ignores datagrams from the receiver's address.
+    has_own_address: ClassVar[bool] = False
 
     def __init__(self, source: PacketSource) -> None:
         self.source = source
@@ -175,7 +178,9 @@ class PacketEncoder(ABC):
 # {format of packets: module and class of its encoder}
 ENCODERS = {
     "hesai": "lidarsim.packets.hesai:HesaiEncoder",
+    "livox": "lidarsim.packets.livox:LivoxEncoder",
     "ouster": "lidarsim.packets.ouster:OusterEncoder",
+    "robosense": "lidarsim.packets.robosense:RobosenseEncoder",
     "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
 }
 

@@ -22,8 +22,8 @@ from ..base.vectors import applied, inverse, matmul
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from ..sensor.trajectory import matrices
-from ..sweeps.instruments import IMU_FILE
 from .encoders import Datagrams, PacketEncoder, PacketSource
+from .imu_samples import ImuBatch, ImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
 from .service import Destination, Service
 from .shots import Shots
@@ -261,10 +261,7 @@ class OusterEncoder(PacketEncoder):
         self._rest: Shots | None = None  # shots that fill no packet yet
         self._next_firing = 0
         self._repeated_frames = 0  # frames sent less revolutions made
-        self._clock_jumps: tuple[Ints, Ints] = (np.zeros(1, np.int64), np.zeros(1, np.int64))
-        instruments = source.instruments
-        self._imu_rows = iter(()) if instruments is None else instruments.rows(IMU_FILE)
-        self._next_imu_row: list[str] | None = next(self._imu_rows, None)
+        self._samples = ImuSamples(source)
 
     def _profile_of_mode(self) -> Profile:
         """Return the profile that the identifiers or the mode state; LidarError if both differ."""
@@ -314,17 +311,16 @@ class OusterEncoder(PacketEncoder):
             next_frame = -(-self._next_firing // self._columns) + self._repeated_frames
             self._repeated_frames = next_frame - first // self._columns
         self._next_firing = int(shots.firings[-1]) + 1
-        self._clock_jumps = (shots.starts_ns, shots.stamps_ns - shots.starts_ns)
         joined = shots if self._rest is None else Shots.joined([self._rest, shots])
         count = self._next_firing // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
         count = max(count - int(joined.firings[0]), 0)
         self._rest = joined[count:] if count < len(joined) else None
         groups += self._lidar(joined[:count])
-        return [*groups, *self._imu(int(shots.starts_ns[-1]))]
+        return [*groups, *self._imu(self._samples.during(shots))]
 
     def finish(self) -> list[Datagrams]:
         """Return the packet of the last columns, and the IMU packets after them."""
-        return [*self._rest_of_packets(), *self._imu(None)]
+        return [*self._rest_of_packets(), *self._imu(self._samples.remaining())]
 
     def files(self) -> Mapping[str, bytes]:
         """Return the metadata of the sensor as JSON, in the layout of its HTTP interface."""
@@ -383,23 +379,12 @@ class OusterEncoder(PacketEncoder):
             ReturnImages(*images),
         )
 
-    def _imu(self, until_ns: int | None) -> list[Datagrams]:
-        """Return the packets of the IMU's samples up to a time; of all further samples for None."""
-        rows = []
-        while self._next_imu_row is not None:
-            if until_ns is not None and int(self._next_imu_row[0]) > until_ns:
-                break
-            rows.append(self._next_imu_row)
-            self._next_imu_row = next(self._imu_rows, None)
-        if not rows:
+    def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
+        """Return a packet for each sample of the IMU; none for None."""
+        if batch is None:
             return []
-        times_ns = np.array([int(row[0]) for row in rows])
-        samples = np.array([row[1:] for row in rows], np.float64)
-        starts_ns, jumps_ns = self._clock_jumps
-        firing = np.maximum(np.searchsorted(starts_ns, times_ns, "right") - 1, 0)
-        stamps_ns = times_ns + jumps_ns[firing] + self.source.start_ns
-        payloads = imu_packets(stamps_ns, samples[:, :3], samples[:, 3:])
-        return [Datagrams(payloads, times_ns, self.port("imu", IMU_PORT))]
+        payloads = imu_packets(batch.stamps_ns + self.source.start_ns, batch.rates, batch.forces)
+        return [Datagrams(payloads, batch.times_ns, self.port("imu", IMU_PORT))]
 
     def metadata(self) -> dict[str, Any]:
         """Return the metadata of the sensor, in the layout of firmware 3.1."""

@@ -30,9 +30,8 @@ _BROADCAST_MAC = b"\xff" * 6
 class PcapWriter:
     """Writes frames of datagrams into a binary file, in the order of their times in each call.
 
-    `address` is that of the sensor, `destination` of the receiver; each port is also the source
-    port. `start_ns` is the time 0 of the datagrams, nanoseconds since 1970. Equal datagrams give
-    equal bytes.
+    `address` is that of the sensor, `destination` of the receiver. `start_ns` is the time 0 of the
+    datagrams, nanoseconds since 1970. Equal datagrams give equal bytes.
     """
 
     def __init__(
@@ -87,7 +86,7 @@ class PcapWriter:
 
     def _udp_header(self, group: Datagrams, size: int) -> bytes:
         """Return the UDP header of a datagram, without its checksum."""
-        return pack(">HHHH", group.port, group.port, 8 + size, 0)
+        return pack(">HHHH", group.source_port or group.port, group.port, 8 + size, 0)
 
     def _udp_checksums(self, segments: Bytes) -> Bytes:
         """Return the checksums of UDP segments (n, bytes), as big-endian bytes (n, 2)."""

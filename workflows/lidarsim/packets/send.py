@@ -25,9 +25,16 @@ from .service import Destination
 
 LOOPBACK = "127.0.0.1"
 _RECORD = np.dtype(
-    [("kind", "<u2"), ("sensor", "<u2"), ("port", "<u4"), ("size", "<u4"), ("due_ns", "<i8")]
+    [
+        ("kind", "<u2"),
+        ("sensor", "<u2"),
+        ("port", "<u2"),
+        ("source_port", "<u2"),
+        ("size", "<u4"),
+        ("due_ns", "<i8"),
+    ]
 )
-_ENDS_WITHIN_S = 10.0  # of the process after SIGTERM
+_ENDS_WITHIN_S = 2.0  # of the process after SIGTERM
 
 
 @dataclass(frozen=True)
@@ -57,8 +64,8 @@ class Lateness:
         }
 
     def __str__(self) -> str:
-        if not self.sent and not self.failures:
-            return "no packets were sent"
+        if not self.limits_ms:
+            return "the process that sends was ended before it said what it had sent"
         words = f"{self.sent:,} packets sent"
         if self.sent:
             words += (
@@ -115,7 +122,7 @@ class Sender:
         """
         values = {"host": destination.host, "ports": destination.ports, "source": source}
         body = json.dumps(values).encode()
-        self._write(HEADER.pack(ROUTE, sensor, 0, len(body), 0) + body)
+        self._write(HEADER.pack(ROUTE, sensor, 0, 0, len(body), 0) + body)
 
     def send(
         self, sensor: int, groups: Sequence[Datagrams], deadlines_ns: Callable[[Ints], Ints]
@@ -136,7 +143,7 @@ class Sender:
 
     def finish(self) -> Lateness:
         """Wait until all datagrams are sent; return how late they were."""
-        self._write(HEADER.pack(END, 0, 0, 0, 0))
+        self._write(HEADER.pack(END, 0, 0, 0, 0, 0))
         self._wait(None)
         return self._lateness
 
@@ -215,6 +222,7 @@ def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
     headers["kind"] = DATAGRAM
     headers["sensor"] = sensor
     headers["port"] = group.port
+    headers["source_port"] = group.source_port
     headers["size"] = size
     headers["due_ns"] = due_ns
     return np.concatenate([headers.view(np.uint8).reshape(count, -1), group.payloads], axis=1)

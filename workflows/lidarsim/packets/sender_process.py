@@ -4,11 +4,11 @@ Run as a script by `send.Sender`. It imports nothing but the standard library, s
 milliseconds, and shares no lock with the process that casts: a thread beside the casting was 8 to
 300 ms late.
 
-Each record begins with `HEADER`: its kind, the number of the sensor, the port, the size of the
-content, and a time. A record DATAGRAM is sent at its time by the clock of `time.monotonic_ns`; its
-content is the payload. A record ROUTE says where later datagrams of a sensor go, as JSON. After the
-record END the process sends what is left; without END, the end of stdin ends the process at once,
-as the process that casts is gone.
+Each record begins with `HEADER`: its kind, the number of the sensor, the port, the port that it
+comes from (0 for any), the size of the content, and a time. A record DATAGRAM is sent at its time
+by the clock of `time.monotonic_ns`; its content is the payload. A record ROUTE says where later
+datagrams of a sensor go, as JSON. After the record END the process sends what is left; without END,
+the end of stdin ends the process at once, as the process that casts is gone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from contextlib import suppress
 from struct import Struct
 from typing import Any, NoReturn
 
-HEADER = Struct("<HHIIq")  # kind, sensor, port, size, time
+HEADER = Struct("<HHHHIq")  # kind, sensor, port, source port, size, time
 DATAGRAM, ROUTE, END = range(3)
 # Upper limits of lateness, milliseconds; later datagrams are in a last bin.
 BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -35,7 +35,7 @@ BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _CATCH_UP = 2
 _READ_BYTES = 1 << 16  # at a time, between datagrams
 _MAX_WAITING_BYTES = 256 << 20
-_PRIORITY = -10  # of the process, where it may have one
+_NICENESS = -10
 
 
 class Stop(Exception):  # noqa: N818 - not an error
@@ -49,7 +49,7 @@ class Route:
         self.host = ""
         self.ports: dict[int, int] = {}  # {port of a datagram: port of the host}; 0: not sent
         self._source = ""  # address that datagrams come from; empty for any
-        self.socket = _open_socket("")
+        self._sockets: dict[int, socket.socket] = {}  # {source port: socket}
         self._due_ns = 0
         self._sent_ns = 0
 
@@ -58,9 +58,16 @@ class Route:
         self.host = values["host"]
         self.ports = {int(port): number for port, number in values["ports"].items()}
         if values["source"] != self._source:
-            self.socket.close()
-            self.socket = _open_socket(values["source"])
+            for opened in self._sockets.values():
+                opened.close()
+            self._sockets = {}
             self._source = values["source"]
+
+    def open_from(self, port: int) -> socket.socket:
+        """Return the socket that sends from a port, 0 for any; open it before its first use."""
+        if port not in self._sockets:
+            self._sockets[port] = _open_socket(self._source, port)
+        return self._sockets[port]
 
     def earliest_ns(self, due_ns: int) -> int:
         """Return when a datagram may be sent: at its time, or later if the last was late."""
@@ -73,13 +80,14 @@ class Route:
         return self._sent_ns - due_ns
 
 
-def _open_socket(source: str) -> socket.socket:
-    """Return a socket that sends from an address, or from any if the address is not here."""
+def _open_socket(source: str, port: int) -> socket.socket:
+    """Return a socket that sends from an address and port, or from any if they cannot be had."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-    if source:
+    for number in (port, 0) if source else (port,):
         with suppress(OSError):
-            opened.bind((source, 0))
+            opened.bind((source, number))
+            break
     return opened
 
 
@@ -87,7 +95,7 @@ class Outbox:
     """Datagrams that wait for their times, and the record of what was sent."""
 
     def __init__(self) -> None:
-        self.waiting: list[tuple[int, int, int, int, bytes]] = []  # a heap by time and order
+        self.waiting: list[tuple[int, int, int, int, int, bytes]] = []  # a heap by time and order
         self.waiting_bytes = 0
         self.routes: dict[int, Route] = {}
         self.ended = False
@@ -103,7 +111,7 @@ class Outbox:
         content = self._rest + content
         start = 0
         while len(content) - start >= HEADER.size:
-            kind, sensor, port, size, due_ns = HEADER.unpack_from(content, start)
+            kind, sensor, port, source_port, size, due_ns = HEADER.unpack_from(content, start)
             stop = start + HEADER.size + size
             if stop > len(content):
                 break
@@ -111,7 +119,8 @@ class Outbox:
             start = stop
             if kind == DATAGRAM:
                 self._count += 1
-                heapq.heappush(self.waiting, (due_ns, self._count, sensor, port, body))
+                record = due_ns, self._count, sensor, port, source_port, body
+                heapq.heappush(self.waiting, record)
                 self.waiting_bytes += size
             elif kind == ROUTE:
                 self.routes.setdefault(sensor, Route()).change(json.loads(body))
@@ -123,12 +132,12 @@ class Outbox:
         """Return when the next datagram is sent; None if none waits."""
         if not self.waiting:
             return None
-        due_ns, _, sensor, _, _ = self.waiting[0]
+        due_ns, _, sensor, *_ = self.waiting[0]
         return self.routes[sensor].earliest_ns(due_ns)
 
     def send_next(self) -> None:
         """Send the next datagram."""
-        due_ns, _, sensor, port, body = heapq.heappop(self.waiting)
+        due_ns, _, sensor, port, source_port, body = heapq.heappop(self.waiting)
         self.waiting_bytes -= len(body)
         route = self.routes[sensor]
         late_ns = route.mark_sent(due_ns)
@@ -136,7 +145,7 @@ class Outbox:
         if not to_port:
             return
         try:
-            route.socket.sendto(body, (route.host, to_port))
+            route.open_from(source_port).sendto(body, (route.host, to_port))
         except OSError as error:
             reason = os.strerror(error.errno or 0)
             if reason not in self._failures:
@@ -165,6 +174,19 @@ def report(values: dict[str, Any]) -> None:
         os.write(1, json.dumps(values).encode() + b"\n")
 
 
+def raise_priority() -> None:
+    """Run before other processes when a datagram is due, if this process may: it mostly sleeps.
+
+    With ten busy processes on two cores, 0.02 % of the datagrams were later than 5 ms by real-time
+    scheduling, 4 % by a niceness of -10, and 13 % without.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (OSError, AttributeError):  # no rights, or not Linux
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
+
+
 def serve(outbox: Outbox) -> None:
     """Send datagrams at their times, until all are sent after END."""
     while not outbox.ended or outbox.waiting:
@@ -189,8 +211,7 @@ def main() -> None:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
+    raise_priority()
     outbox = Outbox()
     report({"ready": True})
     with suppress(Stop):

@@ -207,10 +207,6 @@ class PacketPart(_ModelSection):
     ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
     identifiers: dict[str, Identifier] = {}
 
-    def settings(self, lasers: Ints) -> PacketSettings:
-        """Return the settings of a sensor, `lasers` being the maker's number of each channel."""
-        return PacketSettings(self.format, self.ports, self.identifiers, lasers)
-
 
 class SensorModel(_ModelSection):
     """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
@@ -275,6 +271,14 @@ class SensorModel(_ModelSection):
         subrays = 1 if self.optics.divergence_mrad is None else 7
         missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
         return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
+
+    def packet_settings(self, lasers: Ints) -> PacketSettings | None:
+        """Return the packets of a sensor, `lasers` being the maker's number of each channel."""
+        if self.packets is None:
+            return None
+        return PacketSettings(
+            self.packets.format, self.packets.ports, self.packets.identifiers, lasers
+        )
 
     def firing_rates(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
         """Return the firings in a revolution, and the revolutions a second.
@@ -513,9 +517,11 @@ def load_sensor(
         common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
     if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
+        common_fields["packets"] = sensor_model.packet_settings(np.arange(1))
         return _listed(sensor_model, unit, head, common_fields)
     beams = sensor_model.beams.beams() if unit is None else _calibrated(sensor_model, unit)
     if sensor_model.prisms:
+        common_fields["packets"] = sensor_model.packet_settings(np.arange(len(beams)))
         mirror = sensor_model.turning_mirror
         return PrismSensor(beams, head, prisms=sensor_model.prisms, mirror=mirror, **common_fields)
     if sensor_model.mirror is not None:
@@ -524,8 +530,7 @@ def load_sensor(
     else:
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
-    if sensor_model.packets is not None:
-        common_fields["packets"] = sensor_model.packets.settings(laser_order(beams.elevation))
+    common_fields["packets"] = sensor_model.packet_settings(laser_order(beams.elevation))
     return kind(beams.lowest_first(), head, **common_fields)
 
 

@@ -105,15 +105,19 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     `ratio` is the refractive index before the face over the index behind it. The normals
     (3, k, 1), or (3, 1, 1), point along the light's direction.
     """
-    cosine = (rays * normals).sum(axis=0)
+    # Component by component: arrays of all components would take twice the time.
+    cosine = rays[0] * normals[0] + rays[1] * normals[1] + rays[2] * normals[2]
     behind = 1 - ratio * ratio * (1 - cosine * cosine)
     if not (behind >= 0).all():
         raise LidarError(
             "A prism reflects light back at its inner face, so that no ray leaves the sensor: "
             "make its wedge or its index smaller."
         )
-    behind = np.sqrt(behind)
-    return ratio * rays + (behind - ratio * cosine) * normals
+    along_normal = np.sqrt(behind) - ratio * cosine
+    refracted = ratio * rays
+    for component, normal in zip(refracted, normals, strict=True):
+        component += along_normal * normal
+    return refracted
 
 
 @dataclass(frozen=True, eq=False)

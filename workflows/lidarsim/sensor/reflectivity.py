@@ -46,4 +46,5 @@ SCALES = {
     "vls128": ByteScale(110, 1.0, _BEST),
     "ouster": ByteScale(100, 1.0, _BEST),
     "hesai": ByteScale(255, 2.55, 2.55),
+    "livox": ByteScale(150, 1.0, _BEST),
 }

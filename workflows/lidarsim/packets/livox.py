@@ -1,0 +1,281 @@
+"""Packets of Livox, in the format of SDK2: Mid-360 and HAP, points and samples of the IMU.
+
+Sources: Livox's communication protocol of the Mid-360, 1.4.11, and of the HAP, 1.4.8; user manual
+of the HAP, page 15 (tags); Livox-SDK2 1.4.3, livox_lidar_def.h and define.h; livox_ros_driver2,
+pub_handler.cpp. All numbers are little-endian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
+from ..base.vectors import applied, inverse, matmul
+from ..sensor.trajectory import matrices
+from .encoders import Datagrams, PacketEncoder, PacketSource
+from .imu_samples import ImuBatch, ImuSamples
+from .service import Destination, Service
+from .shots import CarryOver, Shots
+
+DOTS = 96  # of a packet
+IMU_DATA = 0  # type of data
+_CHECKED_FROM = 28  # byte of a packet from which its checksum counts
+_MODES = ("strongest", "first", "last")
+_STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
+_UNSYNCHRONIZED = 0  # sources of the time
+_PTP = 1
+
+
+@dataclass(frozen=True)
+class Ports:
+    """UDP ports of a kind of device: of the sensor, and by default of the host."""
+
+    points: int
+    imu: int
+    host_points: int
+    host_imu: int
+    command: int
+    state: int  # of state messages; 0: none are sent
+    host_state: int
+
+
+_MID360 = 9  # types of devices
+_HAP = 10
+PORTS = {
+    _MID360: Ports(56_300, 56_400, 56_301, 56_401, 56_100, 56_200, 56_201),
+    _HAP: Ports(57_000, 58_000, 57_000, 58_000, 56_000, 0, 0),
+}
+# Tag of the HAP for the first return. The light that the sensor itself returns is return 0, with
+# which returns nearer than 1.5 m are merged. Other tags, of noise, are 0: high confidence.
+_HAP_FIRST_RETURN = 0x10
+_HAP_MERGED_M = 1.5
+
+
+@dataclass(frozen=True)
+class Cartesian:
+    """Type of data with Cartesian coordinates."""
+
+    number: str  # type of a coordinate
+    unit_m: float
+
+    @property
+    def dots(self) -> np.dtype[np.void]:
+        """Type of a point."""
+        return np.dtype([("position", self.number, (3,)), ("reflectivity", "u1"), ("tag", "u1")])
+
+
+# {pcl_data_type of the sensor's parameters: points of that type}
+CARTESIAN = {1: Cartesian("<i4", 0.001), 2: Cartesian("<i2", 0.01)}
+
+_IMU_SAMPLE = np.dtype([("rate", "<f4", (3,)), ("acceleration", "<f4", (3,))])  # rad/s, g
+
+
+def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
+    """Return the type of a packet with a number of points or samples."""
+    return np.dtype(
+        [
+            ("version", "u1"),
+            ("length", "<u2"),
+            ("interval", "<u2"),  # from the first to the last point, 0.1 µs
+            ("count", "<u2"),
+            ("number", "<u2"),  # of the packet in its frame
+            ("frame", "u1"),
+            ("data_type", "u1"),
+            ("time_type", "u1"),
+            ("reserved", "u1", (12,)),
+            ("checksum", "<u4"),
+            ("stamp_ns", "<u8"),
+            ("data", data, (count,)),
+        ]
+    )
+
+
+class LivoxEncoder(PacketEncoder):
+    """Packets of 96 points, and packets of samples where the carrier has an IMU.
+
+    Points are positions in the sensor frame, at the time of each: a moving carrier's motion is not
+    removed. A pulse without a return is a point of zeros. Lines take turns: the point n is of line
+    n modulo the number of lines. The identifier `data_type` selects coordinates of 1 mm and 32 bits
+    (1, the default) or of 10 mm and 16 bits (2). Samples of the IMU are rotated to the sensor's
+    axes, as the sensor's IMU has them.
+    """
+
+    identifiers = ("device_type",)
+    optional_identifiers = ("data_type",)
+    address = "192.168.1.100"
+    destination = "192.168.1.5"
+    told_apart = True
+    has_own_address = True
+
+    def __init__(self, source: PacketSource) -> None:
+        super().__init__(source)
+        self.device_type = self.number("device_type")
+        if self.device_type not in PORTS:
+            types = ", ".join(map(str, PORTS))
+            raise self.unusable(f"have the device types {types}, not {self.device_type}")
+        self.data_type = source.settings.identifiers.get("data_type", 1)
+        if self.data_type not in CARTESIAN:
+            types = ", ".join(map(str, CARTESIAN))
+            raise self.unusable(f"have the data types {types}, not {self.data_type}")
+        if source.mode not in _MODES:
+            modes = ", ".join(_MODES)
+            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+        lines = source.sensor.channels
+        if DOTS % lines:
+            raise self.unusable(f"hold lines whose number divides {DOTS}, not {lines}")
+        self._firings = DOTS // lines
+        # Time from the first to the last line of a firing, as readers space points evenly.
+        self._lines_ns = self.firing_interval_ns * (lines - 1) / lines
+        self._carry = CarryOver(self._firings)
+        self._frame = 0
+        self._packets_of_frame = 0
+        self._samples = ImuSamples(source)
+        self._to_sensor = _imu_axes(source)
+
+    def encode(self, shots: Shots) -> list[Datagrams]:
+        """Return the packets that the shots of a sweep fill, and samples of the IMU until then."""
+        if not len(shots):
+            return []
+        imu = self._imu(self._samples.during(shots))
+        filling = self._carry.whole_packets(shots)
+        if not len(filling):
+            return imu
+        dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
+        return [self._points(filling).without(np.asarray(dropped)), *imu]
+
+    def finish(self) -> list[Datagrams]:
+        """Return the last samples of the IMU; points that fill no packet are not sent."""
+        return self._imu(self._samples.remaining())
+
+    @property
+    def ports(self) -> Mapping[str, int]:
+        """Ports of the host: {kind: port}."""
+        ports = PORTS[self.device_type]
+        defaults = {"points": ports.host_points, "imu": ports.host_imu}
+        return {**defaults, **self.source.settings.ports}
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service:
+        """Return the sensor's command interface, see `PacketEncoder.service`."""
+        from .livox_service import LivoxService, LivoxState
+
+        ports = PORTS[self.device_type]
+        state = LivoxState(
+            device_type=self.device_type,
+            product=self.source.sensor.model,
+            serial=f"LIDARPOOL{crc32(self.source.name.encode()) % 1_000_000:06d}",
+            command_port=ports.command,
+            state_ports=(ports.state, ports.host_state),
+            points_ports=(ports.points, self.ports["points"]),
+            imu_ports=(ports.imu, self.ports["imu"]),
+            data_type=int(self.data_type),
+            data_types=tuple(CARTESIAN),
+            is_synchronized=self.source.dated,
+        )
+        return LivoxService(address, destination, send_to, state, self.set_data_type)
+
+    def set_data_type(self, data_type: int) -> None:
+        """Change the type of the data of later packets, of `CARTESIAN`."""
+        self.data_type = data_type
+
+    def _points(self, shots: Shots) -> Datagrams:
+        """Return the packets of points of shots that fill packets."""
+        data_type = int(self.data_type)  # which a service may change meanwhile
+        kind = CARTESIAN[data_type]
+        firings = np.arange(len(shots)).reshape(-1, self._firings)
+        packets = np.zeros(len(firings), packet_type(kind.dots, DOTS))
+        first_ns = shots.starts_ns[firings[:, 0]]
+        last_ns = shots.starts_ns[firings[:, -1]]
+        packets["interval"] = np.rint((last_ns - first_ns + self._lines_ns) / 100)
+        packets["number"], packets["frame"] = self._numbers(first_ns)
+        packets["data_type"] = data_type
+        self._write_header(packets, shots.stamps_ns[firings[:, 0]])
+        self._fill_points(packets["data"], shots, kind)
+        due_ns = last_ns + self.firing_interval_ns
+        source_port = PORTS[self.device_type].points
+        return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
+
+    def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
+        """Write positions and reflectivities of shots to `points` (n, 96)."""
+        sensor = self.source.sensor
+        channels = self.source.settings.channels
+        range_m = shots.range_m[0]
+        vectors = sensor.directions(shots.firings)[:, channels]
+        vectors *= range_m[:, :, None]
+        origins = sensor.origins(shots.firings)
+        if origins is not None:
+            vectors += origins[:, channels]
+        vectors /= kind.unit_m
+        units = np.rint(vectors, out=vectors)
+        limit = np.iinfo(np.dtype(kind.number)).max
+        fits = (np.abs(units) <= limit).all(axis=2)  # not NaN, without a return
+        units[~fits] = 0
+        points["position"] = units.reshape(points["position"].shape)
+        reflectivities = shots.columns["reflectivity"][0] * fits
+        points["reflectivity"] = reflectivities.reshape(points.shape)
+        if self.device_type == _HAP:
+            is_first = fits & (range_m > _HAP_MERGED_M)
+            points["tag"] = _HAP_FIRST_RETURN * is_first.reshape(points.shape)
+
+    def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
+        """Return the numbers in their frame, and the frames, of packets that start at times (n,).
+
+        A frame lasts as long as a frame of the sensor; numbers continue from call to call.
+        """
+        frame_ns = 1e9 / self.source.sensor.head.rate_hz  # type: ignore[attr-defined]
+        frames = np.floor(first_ns / frame_ns + 1e-6).astype(np.int64)
+        count = np.arange(len(frames))
+        is_first = np.diff(frames, prepend=frames[0] - 1) != 0
+        numbers = count - np.maximum.accumulate(np.where(is_first, count, 0))
+        if frames[0] == self._frame:
+            numbers[frames == frames[0]] += self._packets_of_frame
+        self._frame = int(frames[-1])
+        self._packets_of_frame = int(numbers[-1]) + 1
+        return numbers, frames % 256
+
+    def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
+        """Return a packet for each sample of the IMU; none for None."""
+        if batch is None:
+            return []
+        packets = np.zeros(len(batch.times_ns), packet_type(_IMU_SAMPLE, 1))
+        packets["data_type"] = IMU_DATA
+        self._write_header(packets, batch.stamps_ns)
+        samples = packets["data"]
+        samples["rate"] = applied(self._to_sensor, batch.rates)[:, None]
+        samples["acceleration"] = (applied(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
+            :, None
+        ]
+        payloads = _with_checksums(packets)
+        source_port = PORTS[self.device_type].imu
+        return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
+
+    def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
+        """Write the common fields of packets (n,); `stamps_ns` (n,) are since the survey's start.
+
+        A sensor that no clock has told the time counts from its start.
+        """
+        packets["length"] = packets.dtype.itemsize
+        packets["count"] = packets["data"].shape[1]
+        packets["time_type"] = _PTP if self.source.dated else _UNSYNCHRONIZED
+        start_ns = self.source.start_ns if self.source.dated else 0
+        packets["stamp_ns"] = np.maximum(stamps_ns + start_ns, 0)
+
+
+def _imu_axes(source: PacketSource) -> Floats:
+    """Return the rotation (3, 3) from the axes of the carrier's IMU to the sensor's axes."""
+    if source.instruments is None or source.instruments.imu is None:
+        return np.eye(3)
+    on_carrier = matrices(np.array([source.instruments.imu.quaternion]))[0]
+    return matmul(inverse(source.mount[:3, :3]), on_carrier)
+
+
+def _with_checksums(packets: Records) -> Bytes:
+    """Return packets (n,) as bytes (n, size), with their CRC-32."""
+    payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
+    packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
+    return payloads

@@ -1,0 +1,333 @@
+"""The command interface of a live Livox: search, parameters, and state messages.
+
+Livox-SDK2 searches by broadcasts to port 56000, which do not reach a sensor on the same machine,
+and ignores datagrams from its own address. So the sensor has an address of its own, such as
+127.0.0.2, and tells the host each second that it is there, as if the host had searched.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from ipaddress import AddressValueError, IPv4Address
+from struct import Struct
+from typing import Self
+
+from ..base.errors import LidarError
+from .livox_commands import (
+    MAX_FRAME_BYTES,
+    Code,
+    Command,
+    Frame,
+    Key,
+    RefusedError,
+    answer_frame,
+    packed_count,
+    packed_values,
+    parse_keys,
+    parse_request,
+    parse_values,
+    push_frame,
+)
+from .service import Destination, Service
+
+SEARCH_PORT = 56_000
+_ANNOUNCE_S = 1.0  # as often as the SDK searches
+_LOOKS_S = 0.1  # for the end of the service
+_MAX_REQUESTS = 200  # in a second: others are dropped, so that a flood takes little time
+_SEARCH_ANSWER = Struct("<BB16s4sH")
+_SET_ANSWER = Struct("<BH")
+_GET_ANSWER = Struct("<BH")
+_HOST = Struct("<4sHH")  # address, port of the host, port of the sensor
+_SAMPLING = 1  # work modes
+_WORK_MODES = (_SAMPLING, 2, 9)  # sampling, idle, ready
+_APPLICATION = 1  # type of firmware
+_VERSION = bytes((1, 0, 0, 0))
+
+# {parameter that can be set: its length}; those without effect on the packets are kept as given.
+_LENGTHS: dict[int, int] = {
+    Key.DATA_TYPE: 1,
+    Key.PATTERN: 1,
+    0x0002: 1,  # two returns
+    0x0003: 1,  # points are sent
+    Key.STATE_HOST: 8,
+    Key.POINTS_HOST: 8,
+    Key.IMU_HOST: 8,
+    0x0012: 24,  # attitude of the installation
+    0x0013: 4,  # blind spot
+    0x0015: 20,  # first and second field of view
+    0x0016: 20,
+    0x0017: 1,  # which of them are valid
+    0x0018: 1,  # mode of detection
+    0x0019: 4,  # pins
+    Key.WORK_MODE: 1,
+    0x001B: 1,  # heating of the window
+    Key.IMU_ENABLED: 1,
+}
+
+
+@dataclass(frozen=True)
+class LivoxState:
+    """What the interface says of a sensor."""
+
+    device_type: int
+    product: str
+    serial: str
+    command_port: int
+    state_ports: tuple[int, int]  # of the sensor, and by default of the host; 0: no state messages
+    points_ports: tuple[int, int]  # of the sensor, and of its datagrams
+    imu_ports: tuple[int, int]
+    data_type: int
+    data_types: tuple[int, ...]
+    is_synchronized: bool
+
+
+class LivoxService(Service):
+    """Answers commands of Livox-SDK2 on a thread of its own, and tells the host of the sensor.
+
+    Parameters
+    ----------
+    address
+        HOST to listen at; the ports are Livox's.
+    destination, send_to
+        As of `Service`.
+    state
+        What the interface says.
+    set_data_type
+        Changes the type of the data of later packets.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        destination: Destination,
+        send_to: Callable[[Destination], None],
+        state: LivoxState,
+        set_data_type: Callable[[int], None],
+    ) -> None:
+        super().__init__(destination, send_to)
+        self.host = address
+        self._state = state
+        self._set_data_type = set_data_type
+        self._values: dict[int, bytes] = self._first_values()
+        self._stack = ExitStack()
+        self._sockets: dict[int, socket.socket] = {}  # {port: its socket}
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="Livox's commands", daemon=True)
+        self._pushed = 0  # state messages so far
+        self._started_ns = time.monotonic_ns()
+
+    @property
+    def description(self) -> str:
+        """The address of the sensor."""
+        return f"Livox's commands at {self.host} for a host at {self.destination.host}"
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            ports = {SEARCH_PORT, self._state.command_port, self._state.state_ports[0]} - {0}
+            for port in sorted(ports):
+                self._sockets[port] = stack.enter_context(self._bound(port))
+            self._stack = stack.pop_all()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._stack.close()
+
+    def _bound(self, port: int) -> socket.socket:
+        """Return a socket at a port of the sensor; LidarError if the port cannot be had."""
+        if ":" in self.host:
+            raise LidarError(
+                f"--api {self.host}: Livox's ports are fixed, give an address without a port, such "
+                "as 127.0.0.2."
+            )
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            opened.bind((self.host, port))
+        except OSError as error:
+            opened.close()
+            raise LidarError(
+                f"Livox's commands cannot be answered at {self.host}:{port} "
+                f"({os.strerror(error.errno or 0)}): give another address, such as --api 127.0.0.9."
+            ) from error
+        opened.setblocking(False)
+        return opened
+
+    # -- the thread ------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        """Answer requests, and tell the host of the sensor each second, until the end."""
+        announce_s = time.monotonic()
+        requests = 0
+        with selectors.DefaultSelector() as selector:
+            for opened in self._sockets.values():
+                selector.register(opened, selectors.EVENT_READ)
+            while not self._ended.is_set():
+                if time.monotonic() >= announce_s:
+                    self._announce()
+                    announce_s = time.monotonic() + _ANNOUNCE_S
+                    requests = 0
+                if requests >= _MAX_REQUESTS:
+                    self._ended.wait(_LOOKS_S)
+                    continue
+                for key, _ in selector.select(_LOOKS_S):
+                    requests += 1
+                    assert isinstance(key.fileobj, socket.socket)
+                    self._serve(key.fileobj)
+
+    def _serve(self, opened: socket.socket) -> None:
+        """Answer the next request of a socket; datagrams that are no requests are ignored."""
+        with suppress(OSError):  # such as of a host that has gone
+            content, peer = opened.recvfrom(MAX_FRAME_BYTES + 1)
+            request = parse_request(content)
+            if request is not None:
+                data = self.answer(request)
+                opened.sendto(answer_frame(request.command, request.number, data), peer)
+
+    def _announce(self) -> None:
+        """Tell the host that the sensor is there, and its state."""
+        announcement = answer_frame(Command.SEARCH, 0, self._search_answer())
+        with suppress(OSError):
+            self._sockets[SEARCH_PORT].sendto(announcement, (self.destination.host, SEARCH_PORT))
+        address, port, _ = _HOST.unpack(self._values[Key.STATE_HOST])
+        if not port or self._state.state_ports[0] not in self._sockets:
+            return
+        values = self._all_values()
+        self._pushed += 1
+        content = push_frame(self._pushed, packed_count(values) + packed_values(values))
+        with suppress(OSError):
+            state_socket = self._sockets[self._state.state_ports[0]]
+            state_socket.sendto(content, (str(IPv4Address(address)), port))
+
+    # -- answers ---------------------------------------------------------------------------------
+
+    def answer(self, request: Frame) -> bytes:
+        """Return the data of the answer to a request."""
+        if request.command == Command.SEARCH:
+            return self._search_answer()
+        if request.command == Command.GET:
+            return self._get(request.data)
+        if request.command == Command.SET:
+            return self._set(request.data)
+        is_accepted = request.command in (Command.REBOOT, Command.RESET, Command.SET_GPS_TIME)
+        return bytes([Code.SUCCESS if is_accepted else Code.NOT_SUPPORTED])
+
+    def _search_answer(self) -> bytes:
+        return _SEARCH_ANSWER.pack(
+            Code.SUCCESS,
+            self._state.device_type,
+            self._state.serial.encode(),
+            IPv4Address(self.host).packed,
+            self._state.command_port,
+        )
+
+    def _get(self, data: bytes) -> bytes:
+        """Return the parameters of a request to get, except parameters that the sensor lacks."""
+        try:
+            keys = parse_keys(data)
+        except RefusedError as error:
+            return _GET_ANSWER.pack(error.code, 0)
+        parameters = self._all_values()
+        values = {key: parameters[key] for key in keys if key in parameters}
+        return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
+
+    def _set(self, data: bytes) -> bytes:
+        """Set all parameters of a request, or none if a value is wrong; return the answer."""
+        try:
+            values = parse_values(data)
+            for key, value in values.items():
+                self._check(key, value)
+        except RefusedError as error:
+            return _SET_ANSWER.pack(error.code, error.key)
+        self._values |= values
+        if Key.DATA_TYPE in values:
+            self._set_data_type(values[Key.DATA_TYPE][0])
+        if values.keys() & {Key.POINTS_HOST, Key.IMU_HOST, Key.WORK_MODE, Key.IMU_ENABLED}:
+            self._redirect()
+        return _SET_ANSWER.pack(Code.SUCCESS, 0)
+
+    def _check(self, key: int, value: bytes) -> None:
+        """Raise RefusedError unless a parameter can be set to a value."""
+        if key not in _LENGTHS:
+            is_known = key in self._all_values()
+            raise RefusedError(Code.READ_ONLY if is_known else Code.NOT_SUPPORTED, key)
+        if len(value) != _LENGTHS[key]:
+            raise RefusedError(Code.INVALID_LENGTH, key)
+        if key in (Key.STATE_HOST, Key.POINTS_HOST, Key.IMU_HOST):
+            _check_host(key, value)
+        allowed = {Key.DATA_TYPE: self._state.data_types, Key.WORK_MODE: _WORK_MODES}
+        if key in allowed and value[0] not in allowed[Key(key)]:
+            raise RefusedError(Code.OUT_OF_RANGE, key)
+
+    def _redirect(self) -> None:
+        """Send the datagrams to the host of the points, as the parameters say."""
+        address, points_port, _ = _HOST.unpack(self._values[Key.POINTS_HOST])
+        _, imu_port, _ = _HOST.unpack(self._values[Key.IMU_HOST])
+        if not self._values[Key.IMU_ENABLED][0]:
+            imu_port = 0
+        if self._values[Key.WORK_MODE][0] != _SAMPLING:
+            points_port = imu_port = 0
+        ports = {self._state.points_ports[1]: points_port, self._state.imu_ports[1]: imu_port}
+        self.destination = Destination(str(IPv4Address(address)), ports)
+        self.send_to(self.destination)
+
+    # -- parameters ------------------------------------------------------------------------------
+
+    def _first_values(self) -> dict[int, bytes]:
+        """Return the parameters that can be set, with their values at the sensor's start."""
+        state = self._state
+        values = {key: bytes(length) for key, length in _LENGTHS.items()}
+        values[Key.DATA_TYPE] = bytes([state.data_type])
+        values[Key.WORK_MODE] = bytes([_SAMPLING])
+        values[Key.IMU_ENABLED] = b"\1"
+        host = IPv4Address(self.destination.host).packed
+        values[Key.STATE_HOST] = _HOST.pack(host, state.state_ports[1], state.state_ports[0])
+        for key, (sensor_port, port) in (
+            (Key.POINTS_HOST, state.points_ports),
+            (Key.IMU_HOST, state.imu_ports),
+        ):
+            values[key] = _HOST.pack(host, self.destination.ports.get(port, port), sensor_port)
+        return values
+
+    def _all_values(self) -> dict[int, bytes]:
+        """Return all parameters, also read-only parameters."""
+        state = self._state
+        work_mode = self._values[Key.WORK_MODE]
+        local_ns = time.monotonic_ns() - self._started_ns
+        return self._values | {
+            Key.LIDAR_ADDRESS: IPv4Address(self.host).packed + bytes((255, 255, 255, 0)) + bytes(4),
+            Key.SERIAL_NUMBER: state.serial.encode().ljust(16, b"\0"),
+            Key.PRODUCT: state.product.encode("ascii", "replace")[:64].ljust(64, b"\0"),
+            Key.FIRMWARE: _VERSION,
+            Key.LOADER: _VERSION,
+            Key.HARDWARE: _VERSION,
+            Key.MAC: bytes.fromhex("020000000001"),
+            Key.WORK_STATE: work_mode,
+            Key.CORE_TEMPERATURE: (4000).to_bytes(4, "little"),  # 0.01 degrees Celsius
+            Key.POWER_UPS: (1).to_bytes(4, "little"),
+            Key.LOCAL_TIME: local_ns.to_bytes(8, "little"),
+            Key.LAST_SYNCHRONIZED: bytes(8),
+            Key.TIME_OFFSET: bytes(8),
+            Key.TIME_SOURCE: bytes([state.is_synchronized]),
+            Key.DIAGNOSIS: bytes(2),
+            Key.FIRMWARE_TYPE: bytes([_APPLICATION]),
+            Key.HEALTH_CODES: bytes(32),
+        }
+
+
+def _check_host(key: int, value: bytes) -> None:
+    """Raise RefusedError unless a value is the address of a single receiver."""
+    try:
+        address = IPv4Address(value[:4])
+    except AddressValueError as error:
+        raise RefusedError(Code.OUT_OF_RANGE, key) from error
+    if address.is_multicast or str(address) == "255.255.255.255":
+        raise RefusedError(Code.OUT_OF_RANGE, key)
