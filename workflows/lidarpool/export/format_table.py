@@ -154,7 +154,7 @@ def _las(name: str) -> FormatRow:
 def _bag(name: str, file: str, **fields: Any) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.ros",
+        "lidarpool.export.ros.bags",
         f"write_{name}",
         packages=("rosbags",),
         extra="ros",

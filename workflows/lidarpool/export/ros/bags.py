@@ -35,9 +35,9 @@ from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
 
-from . import reading
-from .boxes import Boxes
-from .laser_scan import ScanRays
+from .. import reading
+from ..boxes import Boxes
+from ..laser_scan import ScanRays
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
 
