@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from heapq import merge
 from pathlib import Path
@@ -23,28 +23,26 @@ from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from lidarsim.base.arrays import AnyArray, Floats32, Records
+from lidarsim.base.arrays import Floats32, Records
 from lidarsim.columns.bags import POINT_FIELDS, message_types
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
-from lidarsim.scene.colours import as_float
-from lidarsim.sensor.optics import TWO_RETURNS
-from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
-from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
 
 from .. import reading
 from ..boxes import Boxes
 from ..laser_scan import ScanRays
+from .layouts import (
+    EXTRA_FIELDS,
+    FULL_INTENSITY,
+    TIME_FIELDS,
+    PointLayout,
+    point_rows,
+    sensor_traits,
+)
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
-
-# Types of returns of Autoware's sensor drivers.
-UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
-IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
-_SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
 # frames
 WORLD = "map"
@@ -57,37 +55,7 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
 )  # fmt: skip
-_XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
-_LAYOUTS = {
-    "velodyne": np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]),
-    "autoware": np.dtype([
-        *_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "<u2"), ("azimuth", "<f4"),
-        ("elevation", "<f4"), ("distance", "<f4"), ("time_stamp", "<u4"),
-    ]),
-    "ouster": np.dtype({
-        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
-        "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
-        "itemsize": 48,
-    }),
-}  # fmt: skip
-_LAYOUTS["images"] = _LAYOUTS["velodyne"]
 _ONCE = ("/tf_static", "/label_info", "/material_info")  # topics of one message, kept for readers
-# Points that are compensated for motion have no times; in Autoware's layout, PointXYZIRC.
-_TIMES = ("time", "t", "time_stamp")
-_COMPENSATED = {
-    "velodyne": _LAYOUTS["velodyne"].descr[:-1],
-    "images": _LAYOUTS["images"].descr[:-1],
-    "autoware": _LAYOUTS["autoware"].descr[:6],
-}
-# Additional fields after the layout: {name: (type, columns that the field needs)}.
-_EXTRA = {
-    "rgb": ("<f4", {*COLOURS}),
-    VELOCITY: ("<f4", {VELOCITY}),
-    "label": ("<u4", {"class"}),
-    **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
-    "material": ("<i4", {"material"}),
-}
 # Messages of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
@@ -153,52 +121,10 @@ def write_mcap(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class PointLayout:
-    """Layout of the points of a PointCloud2."""
-
-    name: str
-    compensated: bool  # points in the sensor's axes at the start of the sweep, without times
-
-    @property
-    def fields(self) -> np.dtype[np.void]:
-        """Type of a point, without additional fields."""
-        row = _LAYOUTS[self.name]
-        if not self.compensated:
-            return row
-        if self.name in _COMPENSATED:
-            return np.dtype(_COMPENSATED[self.name])
-        kinds = {name: kind for name, kind in (row.fields or {}).items() if name not in _TIMES}
-        return np.dtype(
-            {
-                "names": [*kinds],
-                "formats": [kind for kind, *_ in kinds.values()],
-                "offsets": [offset for _, offset, *_ in kinds.values()],
-                "itemsize": row.itemsize,
-            }
-        )
-
-    def row(self, extra: Sequence[str]) -> np.dtype[np.void]:
-        """Return the type of a point in the layout, followed by additional fields."""
-        row = self.fields
-        if not extra:
-            return row
-        kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
-        end = max(offset + kind.itemsize for kind, offset in kinds.values())
-        for name in extra:
-            kinds[name] = kind, _ = np.dtype(_EXTRA[name][0]), end
-            end += kind.itemsize
-        formats, offsets = map(list, zip(*kinds.values(), strict=True))
-        size = max(row.itemsize, end)
-        return np.dtype(
-            {"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size}
-        )
-
-
 def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any) -> Iterator[Sent]:
     """Yield the messages of a cloud, sweep by sweep."""
     columns = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
-    row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= columns])
+    row = layout.row([name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= columns])
     sweep_messages = _SweepMessages(_Messages(types), sweeps, layout, row)
     start_ns = _start_ns(sweeps)
     measured = sweep_messages.make.instrument_messages(sweeps, start_ns)
@@ -290,7 +216,7 @@ class _SweepMessages:
 
     def _point_cloud(self, sweep: int, points: Cloud, header: Any) -> Any:
         """Return the PointCloud2 of a sweep."""
-        rows = _rows(self._layout, self._row, points, self._sweeps, sweep)
+        rows = point_rows(self._layout, self._row, points, self._sweeps, sweep)
         (message,) = self.make.types_of("sensor_msgs", "PointCloud2")
         return message(
             header,
@@ -323,9 +249,6 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
     ]
 
 
-_FULL_INTENSITY = {"autoware": 255, "ouster": COUNTS}  # values of an intensity of 1
-
-
 class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity, limited by the layout, channel and named class."""
 
@@ -344,13 +267,15 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         message = self._point_cloud(sweep)
         names = {field.name for field in message.fields}
-        compensated = not names & {*_TIMES}
-        row = PointLayout(self.layout, compensated).row([name for name in _EXTRA if name in names])
+        compensated = not names & {*TIME_FIELDS}
+        row = PointLayout(self.layout, compensated).row(
+            [name for name in EXTRA_FIELDS if name in names]
+        )
         rows = message.data.view(row)
-        intensity = rows["intensity"].astype(np.float32) / _FULL_INTENSITY.get(self.layout, 1)
+        intensity = rows["intensity"].astype(np.float32) / FULL_INTENSITY.get(self.layout, 1)
         channel = rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16)
         if self.layout == "ouster":
-            channel = np.uint16(_traits(self.sweeps, sweep).channels - 1) - channel
+            channel = np.uint16(sensor_traits(self.sweeps, sweep).channels - 1) - channel
         columns = {"intensity": intensity, "channel": channel}
         if "label" in names:
             columns["class"] = rows["label"].astype(np.uint16)
@@ -375,7 +300,7 @@ class Reader(reading.Reader):
 
     def _at_start(self, sweep: int, points: Floats32, rows: Records) -> Floats32:
         """Return points (n, 3) as fired in the sensor frame at the start of the sweep."""
-        (field,) = (name for name in rows.dtype.names or () if name in _TIMES)
+        (field,) = (name for name in rows.dtype.names or () if name in TIME_FIELDS)
         since_ns = rows[field].astype(np.float64) * (1e9 if field == "time" else 1)
         stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
         scans = np.full(len(points), self.sweeps.scans[sweep])
@@ -404,100 +329,6 @@ def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
 
 def _start_ns(sweeps: Sweeps) -> int:
     return START_NS if sweeps.start_ns is None else sweeps.start_ns
-
-
-def _rows(
-    layout: PointLayout, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
-) -> Records:
-    """Return the points of a sweep in a layout, of the type of its `row`."""
-    if layout.compensated:
-        positions = sweeps.compensated(sweep, points).astype(np.float32)
-        columns = sweeps.columns_compensated(sweep, points)
-    else:
-        positions = sweeps.as_fired(sweep, points).astype(np.float32)
-        columns = sweeps.columns_as_fired(sweep, points)
-    values: dict[str, AnyArray] = dict(zip("xyz", positions.T, strict=True))
-    if layout.name in ("velodyne", "images"):
-        values |= {"intensity": columns["intensity"], "ring": columns["channel"]}
-    elif layout.name == "autoware":
-        values |= {
-            "intensity": np.round(np.clip(columns["intensity"], 0, 1) * 255),
-            "return_type": _return_types(points, _traits(sweeps, sweep).mode),
-            "channel": columns["channel"],
-        }
-    else:
-        traits = _traits(sweeps, sweep)
-        values |= {
-            "intensity": columns["signal"],
-            "reflectivity": columns["reflectivity"],
-            "ring": np.maximum(traits.channels - 1 - columns["channel"].astype(np.int64), 0),
-            "range": np.round((columns["range"].astype(np.float64) + traits.range_offset_m) * 1000),
-        }
-    if not layout.compensated:
-        begin_ns = sweeps.begins_ns[sweep] + sweeps.stamp_ns(sweep) - round(sweeps.begins_ns[sweep])
-        values |= _timed(layout.name, positions, columns["time"] - begin_ns, sweeps, sweep)
-    if "rgb" in (row.names or ()):
-        values["rgb"] = as_float(*(columns[name] for name in COLOURS))
-    same_names = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
-    for name, column in (*same_names, ("label", "class")):
-        if name in (row.names or ()):
-            values[name] = columns[column]
-    rows = np.zeros(len(points), row)
-    for name, values_of_field in values.items():
-        rows[name] = values_of_field
-    return rows
-
-
-def _timed(
-    layout: str, positions: Floats32, since_ns: AnyArray, sweeps: Sweeps, sweep: int
-) -> dict[str, AnyArray]:
-    """Return fields of points in the sensor frame at their firings, `since_ns` the stamp."""
-    if layout in ("velodyne", "images"):
-        return {"time": since_ns / 1e9}
-    stamps = np.clip(since_ns, 0, 2**32 - 1)
-    if layout == "ouster":
-        return {"t": stamps}
-    x, y, z = positions.astype(np.float64).T
-    level = np.hypot(x, y)
-    zero = np.radians(_traits(sweeps, sweep).zero_deg)
-    return {
-        "azimuth": (zero - np.arctan2(y, x)) % (2 * np.pi),
-        "elevation": np.arctan2(z, level),
-        "distance": np.hypot(level, z),
-        "time_stamp": stamps,
-    }
-
-
-def _return_types(points: Cloud, mode: str) -> AnyArray:
-    """Return Autoware's types of the returns of a sweep, (n,); returns follow their pulses.
-
-    Of two returns of a pulse the nearer is first, and the brighter is strong; of two equally bright
-    returns, the farther. A single return of a pulse is all of these.
-    """
-    count = len(points)
-    if mode in _SINGLE_RETURN_TYPES:
-        return np.full(count, _SINGLE_RETURN_TYPES[mode])
-    number = points["return_number"]
-    returns = points["returns"]
-    types = np.full(count, UNKNOWN)
-    types[number == 2] = SECOND
-    types[number == 1] = FIRST
-    types[number == returns] = LAST
-    types[returns == 1] = IDENTICAL
-    if mode not in TWO_RETURNS or count < 2:
-        return types
-    pairs = (number[:-1] == 1) & (returns[:-1] == 2) & (number[1:] == 2) & (returns[1:] == 2)
-    first = np.flatnonzero(pairs)
-    intensity = points["intensity"]
-    brighter = intensity[first] > intensity[first + 1]
-    types[first] = np.where(brighter, FIRST_STRONGEST, FIRST_WEAK)
-    types[first + 1] = np.where(brighter, LAST_WEAK, LAST_STRONGEST)
-    return types
-
-
-def _traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
-    """Return the traits of the sensor of a sweep."""
-    return sweeps.lidars[sweeps.sensor[sweep]]
 
 
 class _Messages:
