@@ -20,19 +20,25 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from lidarsim.base.arrays import Floats32, Records
+from lidarsim.base.arrays import AnyArray, Floats32
 from lidarsim.columns.bags import message_types
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
 from .. import reading
-from .layouts import EXTRA_FIELDS, FULL_INTENSITY, TIME_FIELDS, PointLayout, sensor_traits
+from .layouts import (
+    EXTRA_FIELDS,
+    LAYOUTS,
+    LaidOut,
+    message_stamp_ns,
+    sensor_traits,
+    survey_start_ns,
+)
 from .messages import (
     LATCHED_TOPICS,
     message_store,
     points_topic,
     survey_messages,
-    survey_start_ns,
 )
 
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
@@ -43,14 +49,20 @@ _LATCHED = Qos(
 
 
 def write_rosbag2(
-    path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str, compensated: bool = False
+    path: Path,
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    layout: str,
+    compensated: bool = False,
+    organized: bool = False,
 ) -> None:
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
+    laid_out = LaidOut(layout, compensated, organized)
     # Readers of Humble accept no later version: from 9 on, profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
-        bag.set_custom_data("lidarpool", COMPENSATED if compensated else AS_FIRED)
+        bag.set_custom_data("lidarpool", COMPENSATED if laid_out.compensated else AS_FIRED)
         topics: dict[str, Any] = {}
-        for message in survey_messages(cloud, sweeps, PointLayout(layout, compensated)):
+        for message in survey_messages(cloud, sweeps, laid_out):
             if message.topic not in topics:
                 latched = (_LATCHED,) if message.topic in LATCHED_TOPICS else ()
                 topics[message.topic] = bag.add_connection(
@@ -63,7 +75,12 @@ def write_rosbag2(
 
 
 def write_mcap(
-    path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str, compensated: bool = False
+    path: Path,
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    layout: str,
+    compensated: bool = False,
+    organized: bool = False,
 ) -> None:
     """Write an MCAP file.
 
@@ -85,16 +102,22 @@ def write_mcap(
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began), `autoware`
     (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from the start of the head,
-    time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes) and `ouster` (48
+    time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes), `ouster` (48
     bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
-    signal). Whole numbers of intensity are 255 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, where it has radial velocities, `radial_velocity`, where its
-    classes have names, `label`, and then any columns of normals, `incidence_deg` and origins of
-    rays, and `material`; each makes points of `velodyne` and `autoware` 4 bytes longer.
+    signal), `hesai` and `robosense` (26 bytes; intensity: reflectivity, timestamp in seconds since
+    1970; rings are the maker's) and `livox` (26 bytes; timestamp in ns since 1970; `/NAME/livox`,
+    or `/livox`, has the same points as a CustomMsg). Whole numbers of intensity are 255 at 1 and
+    above. Where the cloud has red, green and blue, a field `rgb` follows, where it has radial
+    velocities, `radial_velocity`, where its classes have names, `label`, and then any columns of
+    normals, `incidence_deg` and origins of rays, and `material`; each makes points 4 bytes longer,
+    up to the 48 bytes of `ouster`.
+
+    Organized clouds have a point for each ray, NaN without a return: see `organized_rows`. Second
+    returns of `ouster` are then on `/NAME/points2`.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
-        write_rosbag2(folder, cloud, sweeps, layout, compensated)
+        write_rosbag2(folder, cloud, sweeps, layout, compensated, organized)
         (written,) = folder.glob("*.mcap")
         written.replace(path)
     finally:
@@ -117,23 +140,21 @@ class Reader(reading.Reader):
 
     def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
+        layout = LAYOUTS[self.layout]
         message = self._point_cloud(sweep)
         names = {field.name for field in message.fields}
-        compensated = not names & {*TIME_FIELDS}
-        row = PointLayout(self.layout, compensated).row(
-            [name for name in EXTRA_FIELDS if name in names]
-        )
-        rows = message.data.view(row)
-        intensity = rows["intensity"].astype(np.float32) / FULL_INTENSITY.get(self.layout, 1)
-        channel = rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16)
-        if self.layout == "ouster":
-            channel = np.uint16(sensor_traits(self.sweeps, sweep).channels - 1) - channel
-        columns = {"intensity": intensity, "channel": channel}
+        compensated = layout.time_field not in names
+        extra = [name for name in EXTRA_FIELDS if name in names]
+        rows = message.data.view(layout.row(extra, compensated=compensated))
+        intensity = rows["intensity"].astype(np.float32) / layout.full_intensity
+        rings = rows[layout.ring_field].astype(np.int64)
+        channels = layout.channels(rings, sensor_traits(self.sweeps, sweep)).astype(np.uint16)
+        columns = {"intensity": intensity, "channel": channels}
         if "label" in names:
             columns["class"] = rows["label"].astype(np.uint16)
         points = np.stack([rows[axis] for axis in "xyz"], axis=1)
         if not compensated and self.sweeps.coordinates == "world":
-            points = self._at_start(sweep, points, rows)
+            points = self._at_start(sweep, points, rows[layout.time_field])
         return points, columns
 
     def _point_cloud(self, sweep: int) -> Any:
@@ -150,10 +171,12 @@ class Reader(reading.Reader):
         connection, _, data = record
         return message_types().deserialize_cdr(data, connection.msgtype)
 
-    def _at_start(self, sweep: int, points: Floats32, rows: Records) -> Floats32:
-        """Return points (n, 3) as fired in the sensor frame at the start of the sweep."""
-        (field,) = (name for name in rows.dtype.names or () if name in TIME_FIELDS)
-        since_ns = rows[field].astype(np.float64) * (1e9 if field == "time" else 1)
+    def _at_start(self, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
+        """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
+
+        `times` (n,) are those of the layout.
+        """
+        since_ns = LAYOUTS[self.layout].since_ns(times, message_stamp_ns(self.sweeps, sweep))
         stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
         scans = np.full(len(points), self.sweeps.scans[sweep])
         sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})

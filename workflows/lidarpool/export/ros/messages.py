@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from lidarsim.base.arrays import Floats32
+from lidarsim.base.arrays import Floats32, Records
 from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
@@ -20,7 +20,16 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps, plain_names
 
 from ..boxes import Boxes
 from ..laser_scan import ScanRays
-from .layouts import EXTRA_FIELDS, PointLayout, point_rows
+from .layouts import (
+    LaidOut,
+    message_stamp_ns,
+    point_rows,
+    sensor_traits,
+    since_stamp_ns,
+    survey_start_ns,
+)
+from .livox import CUSTOM_DEFINITION, CUSTOM_MSG, check_lines, custom_message
+from .organized import organized_rows
 
 
 class RosMessage(NamedTuple):
@@ -32,12 +41,17 @@ class RosMessage(NamedTuple):
     cdr: bytes | memoryview  # serialised, with the header of its encoding
 
 
+class Serialised(NamedTuple):
+    """The content of a message that is serialised already."""
+
+    kind: str
+    cdr: bytes
+
+
 # frames
 WORLD = "map"
 CARRIER = "base_link"
 _INSTRUMENTS = "imu", "gnss"
-# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
-START_NS = 1_000_000_000_000_000_000
 LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # kept for late readers
 # Messages of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
@@ -49,12 +63,13 @@ def message_store() -> Typestore:
     """Return the types of messages that a survey has."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
+    store.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_MSG))
     return store
 
 
-def survey_messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout) -> Iterator[RosMessage]:
+def survey_messages(cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut) -> Iterator[RosMessage]:
     """Yield the messages of a cloud, in the order of their times."""
-    messages = SurveyMessages(sweeps, layout, {column.name for column in cloud.table})
+    messages = SurveyMessages(sweeps, laid_out, {column.name for column in cloud.table})
     measured = messages.instruments()
     waiting = next(measured, None)
     yield from messages.static()
@@ -75,20 +90,18 @@ class SurveyMessages:
     ----------
     sweeps
         The sweeps of the survey.
-    layout
-        Layout of points.
+    laid_out
+        How points are laid out.
     columns
         Names of the columns of the cloud.
     """
 
-    def __init__(self, sweeps: Sweeps, layout: PointLayout, columns: Collection[str]) -> None:
+    def __init__(self, sweeps: Sweeps, laid_out: LaidOut, columns: Collection[str]) -> None:
         self._make = _Messages(message_store().types)
         self._sweeps = sweeps
-        self._layout = layout
+        self._laid_out = laid_out
         self._columns = {name for name in columns if name != "class" or sweeps.classes}
-        self._row = layout.row(
-            [name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= self._columns]
-        )
+        self._row = laid_out.row(self._columns)
         (field,) = self._make.types_of("sensor_msgs", "PointField")
         self._fields = [
             field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
@@ -132,26 +145,45 @@ class SurveyMessages:
         """Yield the messages of a sweep, which are sent at its start."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
-        stamp_ns = self._start_ns + sweeps.stamp_ns(sweep)
-        frame = self._frames[sweeps.sensor[sweep]]
-        topic = points_topic(sweeps, sweep)
         (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
         yield _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
-        header = self._make.header(frame, stamp_ns)
-        yield _sent(topic, self._point_cloud(sweep, points, header), time_ns)
-        if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
-            name = f"{topic.removesuffix('points')}scan"
-            yield _sent(name, self._make.laser_scan(rays, frame, stamp_ns), time_ns)
-        if self._layout.name == "images":
-            ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
-            ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
-            for plane, image in enumerate(ranges, 1):
-                name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
-                yield _sent(name, self._make.image(image[::-1], frame, stamp_ns), time_ns)
+        topic = points_topic(sweeps, sweep)
+        for name, content in self._measured(sweep, points).items():
+            yield _sent(f"{topic.removesuffix('points')}{name}", content, time_ns)
         if self._actors:
             boxes = Boxes.from_points(sweeps, sweep, points)
             yield _sent("/actors", self._make.markers(boxes, self._actors, time_ns), time_ns)
+
+    def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
+        """Return the messages of a sensor's sweep, by the last part of their topics."""
+        sweeps = self._sweeps
+        stamp_ns = message_stamp_ns(sweeps, sweep)
+        header = self._make.header(self._frames[sweeps.sensor[sweep]], stamp_ns)
+        rows = point_rows(self._laid_out, self._row, points, sweeps, sweep)
+        if self._laid_out.organized:
+            clouds = organized_rows(self._laid_out, rows, points, sweeps, sweep)
+        else:
+            clouds = [rows[np.newaxis]]
+        contents = {
+            _numbered("points", plane): self._point_cloud(cloud, header)
+            for plane, cloud in enumerate(clouds)
+        }
+        if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
+            contents["scan"] = self._make.laser_scan(rays, header)
+        if self._laid_out.name == "images":
+            ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
+            for plane, image in enumerate(ranges):
+                contents[_numbered("range_image", plane)] = self._make.image(image[::-1], header)
+        if self._laid_out.name == "livox":
+            check_lines(sensor_traits(sweeps, sweep).channels)
+            since_ns = np.zeros(len(points))
+            if not self._laid_out.compensated:
+                since_ns = since_stamp_ns(points, sweeps, sweep)
+            data = custom_message(message_store(), header, stamp_ns, since_ns, rows)
+            contents["livox"] = Serialised(CUSTOM_MSG, data)
+        return contents
 
     def _frames_in_world(self, sweep: int) -> list[tuple[str, str, SweepPoses, int]]:
         """Return the frames of the carrier and of the actors that are present during a sweep."""
@@ -162,21 +194,26 @@ class SurveyMessages:
             if is_present
         ]
 
-    def _point_cloud(self, sweep: int, points: Cloud, header: Any) -> Any:
-        """Return the PointCloud2 of a sweep."""
-        rows = point_rows(self._layout, self._row, points, self._sweeps, sweep)
+    def _point_cloud(self, rows: Records, header: Any) -> Any:
+        """Return the PointCloud2 of points (height, width)."""
+        height, width = rows.shape
         (message,) = self._make.types_of("sensor_msgs", "PointCloud2")
         return message(
             header,
-            1,
-            len(rows),
+            height,
+            width,
             self._fields,
             False,
             self._row.itemsize,
-            rows.nbytes,
-            rows.view(np.uint8).ravel(),
-            True,
+            width * self._row.itemsize,
+            rows.reshape(-1).view(np.uint8),
+            not self._laid_out.organized,
         )
+
+
+def _numbered(name: str, plane: int) -> str:
+    """Return the name of the topic of a return of each pulse, counted from 0."""
+    return f"{name}{plane + 1 if plane else ''}"
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
@@ -209,13 +246,10 @@ def points_topic(sweeps: Sweeps, sweep: int) -> str:
     return f"/{frame_names(sweeps)[sensor]}/points" if sweeps.sensors[sensor] else "/points"
 
 
-def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey, nanoseconds since 1970; `START_NS` without a date."""
-    return START_NS if sweeps.start_ns is None else sweeps.start_ns
-
-
 def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
     """Return a message that is sent at a time."""
+    if isinstance(content, Serialised):
+        return RosMessage(topic, content.kind, time_ns, content.cdr)
     kind = content.__msgtype__
     return RosMessage(topic, kind, time_ns, message_store().serialize_cdr(content, kind))
 
@@ -311,13 +345,13 @@ class _Messages:
                 message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
                 yield _sent("/gnss/position", message, time_ns)
 
-    def laser_scan(self, rays: ScanRays, frame: str, time_ns: int) -> Any:
+    def laser_scan(self, rays: ScanRays, header: Any) -> Any:
         """Return the LaserScan of a sweep of a 2D scanner."""
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")
         return scan(
-            self.header(frame, time_ns),
+            header,
             first,
             last,
             (last - first) / (len(rays.angles) - 1),
@@ -328,11 +362,10 @@ class _Messages:
             rays.intensities,
         )
 
-    def image(self, values: Floats32, frame: str, time_ns: int) -> Any:
+    def image(self, values: Floats32, header: Any) -> Any:
         """Return an image of numbers (height, width)."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
-        header = self.header(frame, time_ns)
         image = self._types["sensor_msgs/msg/Image"]
         return image(header, height, width, "32FC1", 0, 4 * width, data)
 
