@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import chain, count, islice
 
+from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 
 from .bridge import Bridge
@@ -41,16 +42,20 @@ def play_sweeps(
     with MadeAhead(_laps(played, loop=loop), AHEAD * sensors) as made_ahead:
         sweeps = iter(made_ahead)
         first = list(islice(sweeps, sensors))
+        for sweep, points, _ in first:
+            bridge.prepare(sweep, points)
         schedule.start(min(bridge.due_ns(sweep) for sweep, _, _ in first), _START_NS)
         for sweep, points, shift_ns in chain(first, sweeps):
-            late_s = schedule.wait_until(bridge.due_ns(sweep) + shift_ns)
-            if late_s > _BEHIND_S:
+            due_ns = bridge.due_ns(sweep) + shift_ns
+            schedule.wait_until(due_ns - bridge.lead_ns)
+            if schedule.late_s(due_ns) > _BEHIND_S:
                 if not late_sweeps:
                     note(BEHIND)
                 late_sweeps += 1
             bridge.send(sweep, points, shift_ns)
+        bridge.finish()
     if late_sweeps:
-        note(f"{late_sweeps:,} sweeps were late.")
+        note(f"{plural(late_sweeps, 'sweep')} left late.")
 
 
 def _laps(played: Played, *, loop: bool) -> Iterator[tuple[int, Cloud, int]]:

@@ -185,6 +185,11 @@ class Scanner:
         return self._rig.backend
 
     @property
+    def survey(self) -> Survey:
+        """Survey of a step, with the sensor, columns, returns and noise of the scanner."""
+        return self._rig.survey
+
+    @property
     def origin(self) -> Floats:
         """World coordinates of the scene's local origin, metres: (3,)."""
         return self._rig.scene.origin
