@@ -102,7 +102,9 @@ def play(
     return transmitter.sender.lateness
 
 
-def _sweeps(scanner: Scanner, trajectory: Any, duration_s: float | None) -> Iterator[_NumberedSweep]:
+def _sweeps(
+    scanner: Scanner, trajectory: Any, duration_s: float | None
+) -> Iterator[_NumberedSweep]:
     """Cast sweep after sweep until the end of the trajectory, or of the duration."""
     end_s = getattr(trajectory, "duration_ns", float("inf")) / 1e9
     for number in count():

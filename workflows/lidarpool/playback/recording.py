@@ -70,7 +70,9 @@ class Recording:
             last_ns = max(last_ns, datagram.time_ns)
             count += 1
         if not count:
-            raise LidarError(f"{path} has no UDP datagrams over IPv4: give a recording of a sensor.")
+            raise LidarError(
+                f"{path} has no UDP datagrams over IPv4: give a recording of a sensor."
+            )
         self.period_ns = last_ns + last_ns // max(1, count - 1)  # of repeating it
 
     def batches(self, length_ns: int) -> Iterator[tuple[int, dict[str, list[Datagrams]]]]:
@@ -81,10 +83,13 @@ class Recording:
             for datagram in datagrams:
                 key = datagram.port, len(datagram.payload)
                 groups.setdefault(datagram.source, {}).setdefault(key, []).append(datagram)
-            yield span * length_ns, {
-                source: [_joined(alike) for alike in by_kind.values()]
-                for source, by_kind in groups.items()
-            }
+            yield (
+                span * length_ns,
+                {
+                    source: [_joined(alike) for alike in by_kind.values()]
+                    for source, by_kind in groups.items()
+                },
+            )
 
     def _datagrams(self) -> Iterator[RecordedDatagram]:
         """Yield all datagrams."""
@@ -172,7 +177,9 @@ def _joined(datagrams: list[RecordedDatagram]) -> Datagrams:
     """Return datagrams of one size and port as arrays."""
     payloads = np.frombuffer(b"".join(datagram.payload for datagram in datagrams), np.uint8)
     times_ns = np.array([datagram.time_ns for datagram in datagrams], np.int64)
-    return Datagrams(payloads.reshape(len(datagrams), len(datagrams[0].payload)), times_ns, datagrams[0].port)
+    return Datagrams(
+        payloads.reshape(len(datagrams), len(datagrams[0].payload)), times_ns, datagrams[0].port
+    )
 
 
 def _read_datagrams(
@@ -250,4 +257,3 @@ def _join_fragments(
         return None
     fragments.pop(key, None)
     return joined
-

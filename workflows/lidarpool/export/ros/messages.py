@@ -77,6 +77,7 @@ def survey_messages(cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut) -> Iter
         while waiting is not None and waiting.time_ns <= messages.sweep_start_ns(sweep):
             yield waiting
             waiting = next(measured, None)
+        yield messages.clock(messages.sweep_start_ns(sweep))
         yield from messages.of_sweep(sweep, points)
     while waiting is not None:
         yield waiting
@@ -84,7 +85,7 @@ def survey_messages(cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut) -> Iter
 
 
 class SurveyMessages:
-    """Makes the messages of a survey: static messages, of single sweeps, and of instruments.
+    """Makes the messages of a survey: static, of the clock, of sweeps, and of instruments.
 
     Parameters
     ----------
@@ -141,12 +142,15 @@ class SurveyMessages:
         """Return the messages of IMU and GNSS receiver, in the order of their times."""
         return self._make.instrument_messages(self._sweeps, self._start_ns)
 
+    def clock(self, time_ns: int) -> RosMessage:
+        """Return the message of the clock at a time, nanoseconds since 1970."""
+        (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
+        return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
+
     def of_sweep(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
         """Yield the messages of a sweep, which are sent at its start."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
-        (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
-        yield _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
         topic = points_topic(sweeps, sweep)
         for name, content in self._measured(sweep, points).items():
