@@ -30,12 +30,15 @@ _MAX_DOMAIN = 232  # ports of further domains are above 65,535
 _PARTICIPANTS = 32  # of a machine, as ROS 2 takes it
 # Participants announce themselves once a second: readers that start later soon find the topics.
 _CONFIGURATION = """<CycloneDDS><Domain Id="{domain}">
-<General><Interfaces><NetworkInterface address="{address}"/></Interfaces></General>
+<General><Interfaces><NetworkInterface address="{address}"/></Interfaces>
+{sizes}</General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>{participants}</MaxAutoParticipantIndex>
 <SPDPInterval>1s</SPDPInterval><Peers>{peers}</Peers></Discovery>
 <Tracing><Verbosity>none</Verbosity></Tracing>
 </Domain></CycloneDDS>"""
+# The loopback interface takes datagrams of any size, and readers lose fewer of a few large ones.
+_LOOPBACK_SIZES = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
 # A reader that stops reading delays others by no more than this.
 _MAX_BLOCKING = duration(milliseconds=20)
 _BASE_TYPES = {
@@ -93,6 +96,7 @@ class Network:
         return _CONFIGURATION.format(
             domain=self.domain,
             address=self.address,
+            sizes=_LOOPBACK_SIZES if self.address == LOOPBACK else "",
             participants=_PARTICIPANTS,
             peers="".join(f'<Peer address="{peer}"/>' for peer in peers),
         )
@@ -174,7 +178,7 @@ class RosPublisher:
             Policy.History.KeepLast(depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
-        dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind), qos=qos)
+        dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
         return DataWriter(self._participant, dds_topic, qos=qos)
 
 

@@ -124,7 +124,12 @@ class Ros2Bridge(Bridge):
             yield messages.clock(time_ns)
 
     def _instruments(self) -> Iterator[RosMessage]:
-        """Yield the messages of IMU and GNSS receiver, of each lap."""
+        """Yield the messages of IMU and GNSS receiver, of each lap; none without instruments."""
         period_ns = self.options.period_ns
         for lap in count() if period_ns else range(1):
-            yield from self._of_lap(lap * period_ns).instruments()
+            last_message = None
+            for message in self._of_lap(lap * period_ns).instruments():
+                yield message
+                last_message = message
+            if last_message is None:
+                return
