@@ -17,6 +17,7 @@ from ..export.format_table import LAYOUTS
 from . import shared_options as options
 
 _PACKETS = "packets"
+_NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: time to prepare
 
 
 @click.command()
@@ -38,7 +39,7 @@ _PACKETS = "packets"
 @options.flag("--loop", help="Play again and again until Ctrl-C; times go on.")
 @click.option(
     "--rate",
-    type=click.FloatRange(0, min_open=True),
+    type=click.FloatRange(0.001, 1000),
     default=1.0,
     show_default=True,
     help="Speed: 0.5 takes twice as long.",
@@ -99,7 +100,7 @@ def play(
     if unknown := [name for name in given if name not in kind.settings]:
         raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
-    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix == RECORDING:
+    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() == RECORDING:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
         _play_recording(source, to, schedule, given, loop=loop)
@@ -108,14 +109,15 @@ def play(
         with terminal.status("reading the source", logged=False):
             played = stack.enter_context(open_source(source, kind.format_of(given)))
         sweeps = played.sweeps
+        start_at_ns = 0
         if now:
-            first_ns = round(float(sweeps.begins_ns.min()))
-            sweeps = replace(sweeps, start_ns=time.time_ns() - first_ns)
+            start_at_ns = time.time_ns() + _NOW_NS
+            sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, given)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
         with _summarized(lambda: bridge.summary), bridge:
             click.echo(f"ready: {bridge.description}; Ctrl-C stops")
-            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop)
+            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
 
 
 def _play_recording(
@@ -128,8 +130,8 @@ def _play_recording(
 
     recording = Recording(path)
     streams = recorded_streams(recording, to, settings.get("api", ()))
-    transmitter = Transmitter(streams, Terminal().tell)
-    with _summarized(lambda: transmitter.summary(settings.get("lateness"))), transmitter:
+    transmitter = Transmitter(streams, Terminal().tell, settings.get("lateness"))
+    with _summarized(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}; Ctrl-C stops")
         play_recording(recording, transmitter, schedule, loop=loop)
 

@@ -78,7 +78,7 @@ class Bridge(ABC):
         """
         return float(self.sweeps.ends_ns[sweep])
 
-    def prepare(self, sweep: int, points: Cloud) -> None:
+    def prepare(self, sweep: int, points: Cloud) -> None:  # noqa: B027 - most need nothing
         """Do what takes long the first time, such as compiling, before the schedule starts.
 
         `sweep` is the first sweep of a sensor, which `send` gets later.
@@ -88,7 +88,7 @@ class Bridge(ABC):
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
         """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
 
-    def finish(self) -> None:
+    def finish(self) -> None:  # noqa: B027 - messages are sent at once
         """Send what is left after the last sweep, and wait until all is sent."""
 
     @property

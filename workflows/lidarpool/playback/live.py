@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from itertools import chain, count
+from itertools import count
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -19,13 +19,13 @@ from lidarsim.packets.sweep_packets import Packets
 from lidarsim.sensor import Pose, Trajectory
 from lidarsim.simulator import Scanner
 
-from .schedule import MadeAhead, Schedule
+from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
 from .transmitter import Transmitter, sensor_streams
 
 _AHEAD = 4  # sweeps that are cast before they are due, of a trajectory that is known
 _START_NS = 20e6  # from the start of the schedule to the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
-Rate = Annotated[float, Field(gt=0)]
+Rate = Annotated[float, Field(ge=0.001, le=1000)]
 Seconds = Annotated[float | None, Field(gt=0)]
 
 
@@ -97,7 +97,7 @@ def play(
     made_ahead = nullcontext(sweeps) if callable(trajectory) else MadeAhead(sweeps, _AHEAD)
     with Transmitter(streams, note or (lambda words: None)) as transmitter:
         with made_ahead as clouds:
-            _send_all(packets, iter(clouds), Schedule(rate), transmitter, ready)
+            _send_all(packets, iter(clouds), Schedule(rate), transmitter, ready, note)
         transmitter.sender.finish()
     return transmitter.sender.lateness
 
@@ -121,6 +121,7 @@ def _send_all(
     schedule: Schedule,
     transmitter: Transmitter,
     ready: Callable[[str], Any] | None,
+    note: Callable[[str], Any] | None,
 ) -> None:
     """Hand the packets of all sweeps over, each up to a sweep before its time."""
 
@@ -136,8 +137,12 @@ def _send_all(
 
     for number, start_s, points in sweeps:
         groups = packets.encode(points, number=number)
-        if ready is not None and not schedule.started:
-            ready(f"ready: {transmitter.description}")
+        if not schedule.started:
+            if ready is not None:
+                ready(f"ready: {transmitter.description}")
+        elif note is not None and schedule.late_s(start_s * 1e9) > BEHIND_S:
+            note(BEHIND)
+            note = None
         send(groups)
         schedule.wait_until(start_s * 1e9)  # the next sweep is cast, or taken, one sweep ahead
     send(packets.finish())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from itertools import chain, count, islice
 
@@ -9,17 +10,11 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 
 from .bridge import Bridge
-from .schedule import MadeAhead, Schedule
+from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
 from .sources import Played
 
 # Sweeps that are cast before they are due, for each sensor.
 AHEAD = 4
-# How late a sweep may be before the user reads that casting falls behind, seconds.
-_BEHIND_S = 0.005
-BEHIND = (
-    "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
-    "(--rate)."
-)
 # From the start of the schedule to the first sweep, for what the bridge does before.
 _START_NS = 100e6
 
@@ -31,11 +26,13 @@ def play_sweeps(
     note: Callable[[str], None],
     *,
     loop: bool = False,
+    start_at_ns: int = 0,
 ) -> None:
     """Send each sweep through a bridge when it is due; the schedule starts with the first sweeps.
 
     With `loop`, all sweeps are sent again and again, with times that go on. A sweep that is not
-    cast in time is sent late, and the user is told once.
+    cast in time is sent late, and the user is told once. The schedule does not start before
+    `start_at_ns` by `time.time_ns`.
     """
     late_sweeps = 0
     sensors = len(played.sweeps.sensors)
@@ -44,11 +41,12 @@ def play_sweeps(
         first = list(islice(sweeps, sensors))
         for sweep, points, _ in first:
             bridge.prepare(sweep, points)
-        schedule.start(min(bridge.due_ns(sweep) for sweep, _, _ in first), _START_NS)
+        delay_ns = max(_START_NS, start_at_ns - time.time_ns())
+        schedule.start(min(bridge.due_ns(sweep) for sweep, _, _ in first), delay_ns)
         for sweep, points, shift_ns in chain(first, sweeps):
             due_ns = bridge.due_ns(sweep) + shift_ns
             schedule.wait_until(due_ns - bridge.lead_ns)
-            if schedule.late_s(due_ns) > _BEHIND_S:
+            if schedule.late_s(due_ns) > BEHIND_S:
                 if not late_sweeps:
                     note(BEHIND)
                 late_sweeps += 1

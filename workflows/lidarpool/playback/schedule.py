@@ -12,6 +12,12 @@ from lidarsim.base.arrays import Ints
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1
+# How late a sweep may be before the user reads that casting falls behind, seconds.
+BEHIND_S = 0.005
+BEHIND = (
+    "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
+    "(--rate)."
+)
 
 
 class Schedule:

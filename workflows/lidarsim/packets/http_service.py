@@ -182,9 +182,7 @@ class HttpService(Service):
             self._connections -= 1
             writer.close()
 
-    async def _answered(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> Answer:
+    async def _answered(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
         """Read a request, and return its answer."""
         try:
             try:

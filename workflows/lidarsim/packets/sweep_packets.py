@@ -144,9 +144,7 @@ class Packets:
         late_ns = 0
         if start_s is not None:
             late_ns = round(start_s * 1e9 - self._sensor.revolution_start_ns(number))
-        image = Image.from_steps(
-            self._sensor, steps, steps.start, late_ns, self._returns, sweep
-        )
+        image = Image.from_steps(self._sensor, steps, steps.start, late_ns, self._returns, sweep)
         datagrams = self.encoder.encode(Shots.from_image(image, sweep, self.encoder.columns))
         self._next_number = number + 1
         return datagrams

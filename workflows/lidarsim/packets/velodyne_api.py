@@ -13,15 +13,10 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl
 
-from .http_service import (
-    Answer,
-    HttpService,
-    RefusedError,
-    Request,
-    receiver_of,
-    receiver_port,
-)
+from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
 from .service import Destination
+
+_PORTS = ("dport", "tport")  # of data and position packets
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,8 @@ class VelodyneApi(HttpService):
         self._state = state
         self._ports = ports
         numbers = [destination.ports.get(port, port) for port in ports]
-        self._receiver = {"addr": destination.host, "dport": numbers[0], "tport": numbers[1]}
+        self._host = destination.host
+        self._host_ports = dict(zip(_PORTS, numbers, strict=True))
         self._laser = "On"
 
     def answer(self, request: Request) -> Answer:
@@ -108,21 +104,23 @@ class VelodyneApi(HttpService):
             "laser": self._laser,
             "fov": {"start": "0", "end": "359"},
             "phaselock": {"enabled": "Off", "offset": "0"},
-            "host": {name: str(value) for name, value in self._receiver.items()},
+            "host": {"addr": self._host, **{k: str(v) for k, v in self._host_ports.items()}},
             "net": {"addr": self.host, "dhcp": "Off"},
         }
 
     def _set_receiver(self, values: Mapping[str, str]) -> None:
         """Change the receiver of the packets."""
-        receiver = dict(self._receiver)
+        host = self._host
+        ports = dict(self._host_ports)
         for name, value in values.items():
             if name == "addr":
-                receiver[name] = receiver_of(name, value)
-            elif name in ("dport", "tport"):
-                receiver[name] = receiver_port(name, int(value) if value.isdecimal() else value)
+                host = receiver_of(name, value)
+            elif name in ports:
+                ports[name] = receiver_port(name, int(value) if value.isdecimal() else value)
             else:
                 raise RefusedError(f"the host has no {name}")
-        self._receiver = receiver
+        self._host = host
+        self._host_ports = ports
         self._apply()
 
     def _set(self, values: Mapping[str, str]) -> None:
@@ -144,9 +142,7 @@ class VelodyneApi(HttpService):
 
     def _apply(self) -> None:
         """Send the packets to the receiver, or nowhere without a laser."""
-        numbers = [self._receiver["dport"], self._receiver["tport"]]
-        if self._laser == "Off":
-            numbers = [0, 0]
-        ports = dict(zip(self._ports, map(int, numbers), strict=True))
-        self.destination = Destination(str(self._receiver["addr"]), ports)
+        numbers = [0, 0] if self._laser == "Off" else [*self._host_ports.values()]
+        ports = dict(zip(self._ports, numbers, strict=True))
+        self.destination = Destination(self._host, ports)
         self.send_to(self.destination)
