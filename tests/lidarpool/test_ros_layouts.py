@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.shapes import room
 
 from lidarpool import (
@@ -29,6 +31,7 @@ from lidarpool.cli.result_commands import export
 from lidarpool.export.format_table import FORMATS
 from lidarpool.export.formats import Format
 from lidarpool.export.ros import layouts
+from lidarpool.export.ros.livox import CUSTOM_DEFINITION
 from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.bags import livox_columns
 from lidarsim.columns.table import SCAN
@@ -249,6 +252,28 @@ def test_a_recording_of_livox_may_have_its_own_messages_only(tmp_path):
     np.testing.assert_array_equal(custom.points, plain.points)
     np.testing.assert_array_equal(custom.rings, plain.rings)
     np.testing.assert_array_equal(custom.intensities, plain.intensities)
+
+
+def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
+    cloud = cast("livox/mid360")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+    kind = "livox_interfaces/msg/CustomMsg"  # of livox_ros2_driver, for the Avia
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    definition = CUSTOM_DEFINITION.replace("livox_ros_driver2", "livox_interfaces")
+    store.register(get_types_from_msg(definition, kind))
+    with (
+        AnyReader([tmp_path / "c.mcap"]) as bag,
+        Writer(tmp_path / "old", version=8) as writer,
+    ):
+        topic = writer.add_connection("/livox/lidar", kind, typestore=store)
+        for connection, time_ns, data in bag.messages():
+            if connection.topic == "/roof/livox":
+                writer.write(topic, time_ns, data)
+    old = open_recording(tmp_path / "old")
+    points = old.read_points(1).points
+    assert old.count == 2
+    expected = open_recording(tmp_path / "c.mcap").read_points(1).points
+    np.testing.assert_array_equal(points, expected)
 
 
 def test_layouts_of_the_table_are_those_of_the_module():
