@@ -57,7 +57,7 @@ _DEPTH = 10
 
 @dataclass(frozen=True)
 class Network:
-    """Where topics are: an interface of this machine, other machines, and a domain."""
+    """Where topics are: an interface of this machine, its peers, and a domain."""
 
     address: str = LOOPBACK  # of the interface
     peers: tuple[str, ...] = ()  # machines that are told of the topics
@@ -103,7 +103,7 @@ class Network:
 
 
 def _ipv4_address(host: str) -> str:
-    """Return the address of a host; LidarError for other than a known host of IPv4."""
+    """Return the address of a host; LidarError for an unknown host, and without IPv4."""
     advice = "give a host or an IPv4 address, without a port"
     try:
         infos = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)

@@ -59,11 +59,11 @@ class Ros2Bridge(Bridge):
     def description(self) -> str:
         """Domain and interface of the topics."""
         network = self._publisher.network
-        others = f", told to {', '.join(network.peers)}" if network.peers else ""
-        return f"topics of ROS 2 in domain {network.domain} on {network.address}{others}"
+        peers = f", told to {', '.join(network.peers)}" if network.peers else ""
+        return f"topics of ROS 2 in domain {network.domain} on {network.address}{peers}"
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Publish what late readers get; LidarError if the cloud lacks columns of the layout."""
+        """Publish static messages; LidarError if the cloud lacks columns of the layout."""
         self._format.check_columns(points)
         if self._messages is None:
             self._columns = {column.name for column in points.table}

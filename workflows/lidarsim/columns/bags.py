@@ -112,7 +112,10 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
 
 
 def livox_columns(data: bytes) -> dict[str, AnyArray]:
-    """Return the points of a CustomMsg of Livox, {name: (n,)}; ValueError if it is too short."""
+    """Return the points of a CustomMsg of Livox, {name: (n,)}.
+
+    ValueError if the message is cut short.
+    """
     order: Literal["<", ">"] = "<" if data[1] & 1 else ">"
 
     def number(offset: int) -> int:

@@ -294,7 +294,7 @@ class LaidOut:
         return LAYOUTS[self.name]
 
     def row(self, columns: set[str]) -> np.dtype[np.void]:
-        """Return the type of a point of a cloud with some columns."""
+        """Return the type of a point; `columns` are the names of the columns of the cloud."""
         extra = [name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= columns]
         return self.layout.row(extra, compensated=self.compensated)
 

@@ -15,13 +15,12 @@ from .layouts import LaidOut, message_stamp_ns, sensor_traits
 def organized_rows(
     laid_out: LaidOut, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
 ) -> list[Records]:
-    """Return the clouds (height, width) of a sweep as the driver of the layout organizes them.
+    """Return the organized clouds (height, width) of a sweep, as the driver of the layout has lines.
 
-    `rows` (n,) are the points of the sweep in the layout. Lines are firings with a point for each
-    channel, the lowest first, and further returns as lines after those of their firing; or lines
-    are channels, the highest first, with a point for each firing, in a cloud for each return.
-    Columns of such lines are shifted by the azimuths of the beams, so that a column looks in one
-    direction.
+    `rows` (n,) are the points of the sweep in the layout. Lines are firings, with a point for each
+    channel, the lowest first, and further returns as lines after the line of their firing. Or lines
+    are channels, the highest first, with a point for each firing, in a cloud for each return; lines
+    are then shifted by the azimuths of the beams, so that a column is a single direction.
 
     LidarError if the points are not in order, or the rays of the survey are unknown.
     """
@@ -56,7 +55,7 @@ def _rays(
 
 
 def _looking_ahead(image: Image) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    """Return the firing of each pixel whose column looks in one direction, (channels, firings)."""
+    """Return the firing of each pixel, so that a column is a direction: (channels, firings)."""
     sensor = image.sensor
     count = len(image.firings)
     firings_per_turn = float(getattr(sensor.head, "firings_per_turn", count))
