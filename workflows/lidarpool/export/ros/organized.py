@@ -15,7 +15,7 @@ from .layouts import LaidOut, message_stamp_ns, sensor_traits
 def organized_rows(
     laid_out: LaidOut, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
 ) -> list[Records]:
-    """Return the organized clouds (height, width) of a sweep, as the driver of the layout has lines.
+    """Return the organized clouds (height, width) of a sweep, in the lines of the layout's driver.
 
     `rows` (n,) are the points of the sweep in the layout. Lines are firings, with a point for each
     channel, the lowest first, and further returns as lines after the line of their firing. Or lines
