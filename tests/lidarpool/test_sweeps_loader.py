@@ -26,7 +26,7 @@ import lidarpool
 from lidarpool import LidarError, Scene, Sweep
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.format_table import DATA_SETS
+from lidarpool.export.format_table import DATA_SETS, LAYOUTS
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -63,7 +63,9 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
     return sweep.job_number, sweep.sensor, sweep.number
 
 
-@pytest.mark.parametrize("name", [*DATA_SETS, "mcap-autoware", "mcap-ouster", "mcap-images"])
+@pytest.mark.parametrize(
+    "name", [*DATA_SETS, *(f"mcap-{layout}" for layout in LAYOUTS if layout != "velodyne")]
+)
 def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
     data = lidarpool.sweeps(written(name))
     assert len(data) == (JOBS - 1) * 2 * TURNS
@@ -83,7 +85,8 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         # The pose brings points back to where they are in the world.
         back = sweep.points.astype(float) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
         np.testing.assert_allclose(back, points.positions, atol=2e-5 if name != "folder" else 1e-3)
-        steps = {"kitti": 255, "mcap-autoware": 255, "mcap-ouster": 10_000}.get(name, 1e9)
+        counted = ("kitti", "mcap-autoware", "mcap-hesai", "mcap-livox", "mcap-robosense")
+        steps = {**dict.fromkeys(counted, 255), "mcap-ouster": 10_000}.get(name, 1e9)
         np.testing.assert_allclose(sweep.intensity, points.intensity, rtol=1e-6, atol=0.51 / steps)
         if name in ("kitti", "webdataset", "parquet", "images", "folder"):
             np.testing.assert_array_equal(sweep.classes, points["class"])

@@ -30,7 +30,7 @@ from lidarpool.datasets.job_table import JobRow
 from lidarpool.datasets.sweep_data import Sweep
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.images import Image
-from lidarpool.export.ros import write_rosbag2
+from lidarpool.export.ros.bags import write_rosbag2
 from lidarpool.export.webdataset import Pieces
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec

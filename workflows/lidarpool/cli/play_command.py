@@ -13,6 +13,7 @@ import click
 
 from lidarsim.base.storage import Storage
 
+from ..export.format_table import LAYOUTS
 from . import shared_options as options
 
 _PACKETS = "packets"
@@ -22,7 +23,11 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
 @click.command()
 @click.argument("source", metavar="SOURCE", type=options.StoragePath())
 @click.option(
-    "--as", "bridge_name", metavar="BRIDGE", required=True, help="packets: as the sensor sends."
+    "--as",
+    "bridge_name",
+    metavar="BRIDGE",
+    required=True,
+    help="packets: as the sensor sends; ros2: topics of ROS 2.",
 )
 @click.option(
     "--to",
@@ -47,6 +52,17 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
     help="packets: where the sensor's own interface listens, HOST or HOST:PORT.  "
     "[default: 127.0.0.1, port 80 or a free one]",
 )
+@click.option(
+    "--layout",
+    type=click.Choice(list(LAYOUTS)),
+    help="ros2: layout of points.  [default: velodyne]",
+)
+@click.option(
+    "--organized",
+    is_flag=True,
+    default=None,
+    help="ros2: a point for each ray, NaN without a return.",
+)
 @options.new_file("--lateness", help="packets: how late they were, as JSON.")
 def play(
     source: Path | Storage,
@@ -68,6 +84,7 @@ def play(
       lidarpool play drive.yaml --as packets --loop --now
       lidarpool play drive.yaml --as packets --to roof=127.0.0.1:2368 --to rear=127.0.0.1:2468
       lidarpool play packets/lidar.pcap --as packets --rate 0.5
+      lidarpool play drive.yaml --as ros2 --layout ouster --organized
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..playback.bridge import BridgeOptions, bridge_class
@@ -90,7 +107,7 @@ def play(
         return
     with ExitStack() as stack:
         with terminal.status("reading the source", logged=False):
-            played = stack.enter_context(open_source(source, kind.format))
+            played = stack.enter_context(open_source(source, kind.format_of(given)))
         sweeps = played.sweeps
         start_at_ns = 0
         if now:

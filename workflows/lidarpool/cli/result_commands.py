@@ -119,6 +119,11 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     is_flag=True,
     help="Points of mcap, rosbag2 and pcd at the start of the sweep, without their times.",
 )
+@click.option(
+    "--organized",
+    is_flag=True,
+    help="A point for each ray in mcap and rosbag2, NaN without a return.",
+)
 @options.copies
 @options.overwrite
 def export(
@@ -126,6 +131,7 @@ def export(
     formats: tuple[str, ...],
     layout: str,
     compensated: bool,
+    organized: bool,
     out: Path | Storage | None,
     overwrite: bool,
 ) -> None:
@@ -161,8 +167,14 @@ def export(
         compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
             *formats
         }
+        organized_names = {name for name in formats if row_of(name).organized_layouts} or {*formats}
         chosen_formats = [
-            Format(name, layout, compensated and name in compensated_names)
+            Format(
+                name,
+                layout,
+                compensated and name in compensated_names,
+                organized and name in organized_names,
+            )
             for name in dict.fromkeys(formats)
         ]
         written: list[str] = []

@@ -101,7 +101,7 @@ class DataSet:
     format
         kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
-        Layout of points in mcap: velodyne, autoware, ouster or images.
+        Layout of points in mcap, see `lidarpool.save_cloud`.
     compensated
         Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
         their firing. `lidarpool.sweeps` gives both at the start of the sweep.

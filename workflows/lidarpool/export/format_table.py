@@ -48,7 +48,9 @@ class FormatRow:
         Columns that it holds in addition if classes have names.
     layouts
         {layout: columns that it needs and holds in addition}, where there are layouts. The
-        function that writes it then takes `layout` and `compensated` as well.
+        function that writes it then takes `layout`, `compensated` and `organized` as well.
+    organized_layouts
+        Layouts that have an option for organized clouds: a point for each ray.
     raw_or_compensated
         Whether it has an option for points at the start of the sweep.
     one_system
@@ -81,6 +83,7 @@ class FormatRow:
     holds: tuple[str, ...] | None = None
     named: tuple[str, ...] = ()
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    organized_layouts: tuple[str, ...] = ()
     raw_or_compensated: bool = False
     one_system: bool = False
     compensates: bool = False
@@ -119,7 +122,11 @@ LAYOUTS = {
     "autoware": ("intensity", "time", "return_number", "returns"),
     "ouster": ("signal", "time", "reflectivity", "range"),
     "images": ("intensity", "time", *_ALL_RAYS),
+    "livox": ("reflectivity", "time"),
+    "hesai": ("reflectivity", "time"),
+    "robosense": ("reflectivity", "time"),
 }
+_ORGANIZED_LAYOUTS = ("velodyne", "ouster", "images", "robosense")
 _COLOURS = ("red", "green", "blue")
 _SURFACES = (
     "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
@@ -154,7 +161,7 @@ def _las(name: str) -> FormatRow:
 def _bag(name: str, file: str, **fields: Any) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.ros",
+        "lidarpool.export.ros.bags",
         f"write_{name}",
         packages=("rosbags",),
         extra="ros",
@@ -162,6 +169,7 @@ def _bag(name: str, file: str, **fields: Any) -> FormatRow:
         holds=_BAG_COLUMNS,
         named=("class",),
         layouts=LAYOUTS,
+        organized_layouts=_ORGANIZED_LAYOUTS,
         raw_or_compensated=True,
         laser_scans=True,
         **fields,
@@ -320,9 +328,9 @@ def plugin_rows(files: Collection[str]) -> list[FormatRow]:
 
 
 def check_whole(needs: Iterable[str], keep_every: int) -> None:
-    """Raise LidarError if returns are thinned out for a format of range images."""
+    """Raise LidarError if returns are thinned out for a format of all rays."""
     if "ray" in needs and keep_every > 1:
         raise LidarError(
-            f"Range images need every return, and keep_every is {keep_every}: set cloud.keep_every "
-            "to 1."
+            f"Range images and organized clouds need every return, and keep_every is {keep_every}: "
+            "set cloud.keep_every to 1."
         )

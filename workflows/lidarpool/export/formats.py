@@ -47,6 +47,13 @@ class Format:
             "without times of points; by default as drivers publish them, each at its firing"
         ),
     ] = False
+    organized: Annotated[
+        bool,
+        about(
+            "clouds of mcap and rosbag2 have a point for each ray, NaN without a return, in lines "
+            "as the driver of the layout has them (velodyne, ouster, images, robosense)"
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
         row = self.row  # LidarError if there is no such format
@@ -56,6 +63,23 @@ class Format:
                 f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
                 "out."
             )
+
+        if self.organized and self.layout not in row.organized_layouts:
+            self._refuse_organized(row)
+
+    def _refuse_organized(self, row: FormatRow) -> None:
+        """Raise LidarError: the format or layout has no organized clouds."""
+        layouts = row.organized_layouts
+        if not layouts:
+            choices = [name for name, row in FORMATS.items() if row.organized_layouts]
+            raise LidarError(
+                f"organized is an option of {', '.join(choices)}, not of {self.format}: leave it "
+                "out."
+            )
+        raise LidarError(
+            f"organized is an option of the layouts {', '.join(layouts)}, not of {self.layout}, "
+            "whose driver publishes no organized clouds: leave it out, or take another layout."
+        )
 
     @classmethod
     def from_entry(cls, entry: str | Mapping[str, Any]) -> Format:
@@ -75,6 +99,8 @@ class Format:
     @property
     def _laid_out(self) -> tuple[str, ...]:
         columns = self.row.layouts.get(self.layout, ())
+        if self.organized and "ray" not in columns:
+            columns = (*columns, "ray")
         return tuple(name for name in columns if name != "time" or not self.compensated)
 
     @property
@@ -174,7 +200,11 @@ class Format:
         """
         options: dict[str, Any] = {}
         if self.row.layouts:
-            options = {"layout": self.layout, "compensated": self.compensated}
+            options = {
+                "layout": self.layout,
+                "compensated": self.compensated,
+                "organized": self.organized,
+            }
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as staging_folder:
@@ -230,6 +260,7 @@ def save_cloud(
     format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
     layout: str = "velodyne",
     compensated: bool = False,
+    organized: bool = False,
     precision_m: float | None = None,
 ) -> list[str]:
     """Write points in the format of the path's ending, completely or not at all.
@@ -248,11 +279,14 @@ def save_cloud(
         Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
         "nuscenes", "webdataset" or "rosbag2"; also one of a plug-in.
     layout
-        Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
-        velodyne with range images.
+        Layout of points in mcap and rosbag2, of the driver of a maker: velodyne, ouster, hesai,
+        robosense or livox; autoware; or images, which is velodyne with range images.
     compensated
         In mcap, rosbag2 and pcd, points in the sensor's axes at the start of the sweep, without
         times of points; by default each is in the sensor's axes at its firing, as of drivers.
+    organized
+        In mcap and rosbag2, a point for each ray, NaN without a return, in lines as the driver
+        of the layout has them: velodyne, ouster, images and robosense.
     precision_m
         Step of stored positions, metres; by default that of the survey, else 0.001.
 
@@ -274,7 +308,7 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
-    file_format = Format(name, layout, compensated)
+    file_format = Format(name, layout, compensated, organized)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):

@@ -60,6 +60,12 @@ class Bridge(ABC):
         self.options = options
         self.note = note
 
+    @classmethod
+    def format_of(cls, settings: Mapping[str, Any]) -> Format | None:
+        """Return `format`, or that of `settings`; LidarError if these do not fit together."""
+        del settings
+        return cls.format
+
     @property
     @abstractmethod
     def description(self) -> str:
@@ -108,6 +114,7 @@ class BridgeEntry(NamedTuple):
 # {name for --as: the bridge}
 BRIDGES = {
     "packets": BridgeEntry("lidarpool.playback.packets:PacketsBridge"),
+    "ros2": BridgeEntry("lidarpool.playback.ros2:Ros2Bridge", "ros2"),
 }
 
 

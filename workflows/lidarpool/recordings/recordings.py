@@ -21,7 +21,13 @@ from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size, open_input, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import did_you_mean, natural
-from lidarsim.columns.bags import POINT_CLOUD, open_bag, point_columns
+from lidarsim.columns.bags import (
+    LIVOX_CLOUDS,
+    POINT_CLOUD,
+    livox_columns,
+    open_bag,
+    point_columns,
+)
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.scene.files.las import las_units, open_las
@@ -489,18 +495,28 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
 
 
 def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -> Recording:
-    """Open a topic of PointCloud2: each message is a sweep in the frame of the message."""
+    """Open a topic of PointCloud2: each message is a sweep in the frame of the message.
+
+    CustomMsg of Livox is read where a bag has no PointCloud2, or its topic is chosen.
+    """
     bag = open_bag(path, name)
-    topics = {
+    clouds = {
         connection.topic: connection
         for connection in bag.connections
         if connection.msgtype == POINT_CLOUD
     }
+    livox_clouds = {
+        connection.topic: connection
+        for connection in bag.connections
+        if connection.msgtype in LIVOX_CLOUDS
+    }
+    topics = livox_clouds if topic in livox_clouds else clouds or livox_clouds
     connection = topics[_choose(name, "topics of PointCloud2", topics, topic)]
     messages = partial(bag.messages, [connection])
+    columns_of = livox_columns if topics is livox_clouds else point_columns
 
     def points(message: Any) -> Read:
-        columns = point_columns(message[2])
+        columns = columns_of(message[2])
         return _positions(columns), columns, None
 
     def times() -> Iterator[float]:

@@ -1,4 +1,4 @@
-"""Bags of ROS 2 through rosbags: the files, types of messages, and columns of PointCloud2."""
+"""Bags of ROS 2 through rosbags: the files, types of messages, and columns of points."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,20 @@ if TYPE_CHECKING:
 
 BAG_FILES = (".mcap", ".db3")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+# Points of Livox's drivers: of livox_ros_driver2, and of its predecessors.
+LIVOX_CLOUDS = tuple(
+    f"{package}/msg/CustomMsg"
+    for package in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
+)
+LIVOX_POINT = np.dtype(
+    {
+        "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
+        "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"],
+        "offsets": [0, 4, 8, 12, 16, 17, 18],
+        "itemsize": 20,
+    }
+)
+LIVOX_PADDING = 1  # bytes between points, of which the last point of a message has none
 # {type of a field of a point: number of the type in PointField}
 POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
@@ -94,4 +108,27 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     lines = message.data.reshape(message.height, message.row_step)
     used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
     rows = used.reshape(-1).view(row)
+    return {name: rows[name] for name in row.names or ()}
+
+
+def livox_columns(data: bytes) -> dict[str, AnyArray]:
+    """Return the points of a CustomMsg of Livox, {name: (n,)}.
+
+    ValueError if the message is cut short.
+    """
+    order: Literal["<", ">"] = "<" if data[1] & 1 else ">"
+
+    def number(offset: int) -> int:
+        return int(np.frombuffer(data, f"{order}u4", 1, offset)[0])
+
+    name_start = 16  # after encoding, stamp, and length of the name of the frame
+    # The time of the first point is aligned to 8 bytes, not counting the encoding.
+    header_size = -(-(name_start - 4 + number(name_start - 4)) // 8) * 8
+    start = 4 + header_size + 20  # time, number of points, identifier, length of the points
+    count = number(start - 4)
+    row = LIVOX_POINT.newbyteorder(order)
+    content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
+    if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):
+        raise ValueError(f"{count:,} points announced, and there are fewer")
+    rows = np.frombuffer(content, row)
     return {name: rows[name] for name in row.names or ()}

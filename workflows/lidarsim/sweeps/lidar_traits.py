@@ -52,6 +52,8 @@ class LidarTraits:
     # Difference between the manufacturer's ranges and distances from the beam's origin, metres.
     range_offset_m: float = 0.0
     lines: MirrorLines | None = None  # of sensors that sweep across the direction of flight
+    # The maker's number of the laser of each channel, from 0; empty if unknown.
+    lasers: tuple[int, ...] = ()
 
     @classmethod
     def from_sensor(cls, sensor: Sensor, mode: str) -> LidarTraits:
@@ -70,6 +72,7 @@ class LidarTraits:
             float(np.ptp(delays)) if len(delays) else 0.0,
             offset_m,
             _lines_of(sensor),
+            () if sensor.packets is None else tuple(sensor.packets.lasers.tolist()),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -78,9 +81,10 @@ class LidarTraits:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> LidarTraits:
-        """Return the traits of a dictionary from `to_json`, whose `lines` are removed."""
+        """Return the traits of a dictionary from `to_json`, whose entries are removed."""
         lines = values.pop("lines")
-        return cls(**values, lines=lines and MirrorLines(**lines))
+        lasers = tuple(values.pop("lasers"))
+        return cls(**values, lines=lines and MirrorLines(**lines), lasers=lasers)
 
 
 def _lines_of(sensor: Sensor) -> MirrorLines | None:

@@ -119,8 +119,8 @@ def fired_of(sweeps: Sweeps) -> FiredRays:
     """Return the description of all rays of a survey; LidarError without a description."""
     if sweeps.fired is None:
         raise LidarError(
-            "Range images need every return of a survey: run it with keep_every 1 and the column "
-            "ray. Of a Sensor class of your own they are written with the run only (output.write, "
-            "Result.report)."
+            "Range images and organized clouds need every return of a survey: run it with "
+            "keep_every 1 and the column ray. Of a Sensor class of your own they are written with "
+            "the run only (output.write, Result.report)."
         )
     return sweeps.fired

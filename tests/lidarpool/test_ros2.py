@@ -1,0 +1,268 @@
+"""Sweeps as topics of ROS 2, read by cyclonedds, which is not a dependency: tests skip without."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from tests.shapes import room
+
+from lidarpool import Cloud, LidarError, Sensor, Survey
+from lidarpool.cli.play_command import play
+from lidarpool.export.ros.messages import RosMessage, message_store
+from lidarpool.playback.bridge import BridgeOptions, bridge_class
+from lidarpool.playback.schedule import Schedule
+from lidarscenes.writers.scene_file import write_scene
+from lidarsim.sweeps.sweeps import Sweeps
+
+DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet
+
+SCENARIO: dict[str, Any] = {
+    "scene": "room.ply",
+    "trajectory": {
+        "points": [{"time_s": k, "position": [k / 2, 0, 0]} for k in range(3)],
+        "duration_s": 1,
+    },
+    "sensors": {
+        "roof": {"model": "velodyne/vlp16", "max_range_m": 5.5},
+        "nose": {"rays_per_revolution": 90, "layers": 1, "vertical_fov_deg": 0, "rate_hz": 10},
+    },
+    "navigation": {"imu": {"rate_hz": 100}},
+    "planning": {"enabled": False},
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    write_scene(tmp_path / "room.ply", room())
+    (tmp_path / "scan.yaml").write_text(yaml.safe_dump(SCENARIO, sort_keys=False))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def dds() -> Any:
+    """The module that publishes; tests skip without cyclonedds."""
+    pytest.importorskip("cyclonedds.core")
+    from lidarpool.playback import dds
+
+    return dds
+
+
+class Nodes:
+    """Readers of topics, as nodes of ROS 2 have them."""
+
+    def __init__(self, dds: Any, domain: int) -> None:
+        from cyclonedds.domain import Domain, DomainParticipant
+
+        self._dds = dds
+        self._domain = Domain(domain, dds.Network(domain=domain).configuration)
+        self._participant = DomainParticipant(domain)
+
+    def subscribe(self, topic: str, kind: str, *, reliable: bool, latched: bool = False) -> Any:
+        from cyclonedds.qos import Policy, Qos
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        qos = Qos(
+            Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
+            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(50),
+        )
+        dds_topic = Topic(self._participant, f"rt{topic}", self._dds.message_class(kind))
+        return DataReader(self._participant, dds_topic, qos=qos)
+
+    def close(self) -> None:
+        for entity in (self._participant, self._domain):
+            entity._delete(entity._ref)
+
+
+def messages_of(reader: Any, count: int, limit_s: float = 20.0) -> list[Any]:
+    """Return at least `count` messages of a reader; fails after the limit."""
+    messages: list[Any] = []
+    stop = time.monotonic() + limit_s
+    while len(messages) < count:
+        messages += [sample for sample in reader.take(50) if sample.sample_info.valid_data]
+        assert time.monotonic() < stop, f"only {len(messages)} messages"
+        time.sleep(0.01)
+    return messages
+
+
+def nanoseconds(time_of_message: Any) -> int:
+    return time_of_message.sec_ * 10**9 + time_of_message.nanosec_
+
+
+@pytest.fixture
+def playing(folder, dds) -> Iterator[subprocess.Popen[str]]:
+    """Play the scenario in another process, until the test ends."""
+    command = [sys.executable, "-m", "lidarpool", "play", "scan.yaml", "--as", "ros2", "--loop",
+               "--layout", "velodyne", "--organized"]  # fmt: skip
+    environment = os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)}
+    process = subprocess.Popen(
+        command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_nodes_read_what_is_played(playing, dds):
+    nodes = Nodes(dds, DOMAIN)
+    points = nodes.subscribe("/roof/points", "sensor_msgs/msg/PointCloud2", reliable=True)
+    scans = nodes.subscribe("/nose/scan", "sensor_msgs/msg/LaserScan", reliable=False)
+    imu = nodes.subscribe("/imu/data_raw", "sensor_msgs/msg/Imu", reliable=False)
+    frames = nodes.subscribe("/tf", "tf2_msgs/msg/TFMessage", reliable=True)
+    clock = nodes.subscribe("/clock", "rosgraph_msgs/msg/Clock", reliable=False)
+    assert playing.stdout.readline() == (
+        f"ready: topics of ROS 2 in domain {DOMAIN} on 127.0.0.1; Ctrl-C stops\n"
+    )
+    clouds = messages_of(points, 3)
+    # A node that starts later gets the frames of the sensors.
+    fixed = nodes.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", reliable=True, latched=True)
+    names = [transform.child_frame_id_ for transform in messages_of(fixed, 1)[0].transforms_]
+    assert names == ["roof", "nose", "imu"]
+    for cloud in clouds:
+        assert (cloud.header_.frame_id_, cloud.width_, cloud.is_dense_) == ("roof", 16, False)
+        assert cloud.height_ in (1808, 1809) and cloud.point_step_ == 22
+        rows = np.frombuffer(bytes(cloud.data_), np.uint8).reshape(-1, 22)
+        x, z = rows[:, 0:4].copy().view("<f4"), rows[:, 8:12].copy().view("<f4")
+        returned = ~np.isnan(x)
+        assert 10_000 < returned.sum() < len(x)
+        assert np.abs(z[returned]).max() < 3.01  # the room's height is 6 m
+    starts = [nanoseconds(cloud.header_.stamp_) for cloud in clouds]
+    assert (np.diff(starts) > 0.99e8).all() and starts[0] >= 10**18
+    assert len(messages_of(scans, 2)[0].ranges_) == 90
+    force = messages_of(imu, 2)[0].linear_acceleration_
+    assert np.isclose(force.z_, 9.80665, atol=0.1)
+    parents = {
+        (transform.header_.frame_id_, transform.child_frame_id_)
+        for message in messages_of(frames, 2)
+        for transform in message.transforms_
+    }
+    assert parents == {("map", "base_link")}
+    times = [nanoseconds(message.clock_) for message in messages_of(clock, 5)]
+    assert (np.diff(times) > 0).all() and times[-1] > starts[0]
+    nodes.close()
+    playing.send_signal(signal.SIGINT)
+    playing.wait(20)
+    assert "Traceback" not in playing.stderr.read()
+
+
+def test_messages_of_all_types_are_read(dds):
+    """Messages of the publisher, as bags have them, are those that a reader takes apart."""
+    store = message_store()
+    kinds = store.types
+    header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](5, 6), "lidar")
+    status = kinds["sensor_msgs/msg/NavSatStatus"](-1, 1)
+    fix = kinds["sensor_msgs/msg/NavSatFix"](header, status, 52.5, 13.4, 34.0, np.arange(9.0), 2)
+    point = kinds["livox_ros_driver2/msg/CustomPoint"](7, 1.5, 2.5, 3.5, 255, 16, 3)
+    reserved = np.zeros(3, np.uint8)
+    custom = kinds["livox_ros_driver2/msg/CustomMsg"](header, 10**18, 2, 0, reserved, [point] * 2)
+    sent = {"/gnss/fix": fix, "/livox": custom}
+    with dds.RosPublisher(dds.Network(domain=DOMAIN + 1)) as publisher:
+        nodes = Nodes.__new__(Nodes)
+        nodes._dds = dds
+        nodes._participant = publisher._participant
+        for topic, content in sent.items():
+            kind = content.__msgtype__
+            reader = nodes.subscribe(topic, kind, reliable=True)
+            publisher.publish(RosMessage(topic, kind, 0, store.serialize_cdr(content, kind)))
+            (read,) = messages_of(reader, 1)
+            assert (read.header_.frame_id_, read.header_.stamp_.nanosec_) == ("lidar", 6)
+            if topic == "/livox":
+                assert [point.offset_time_ for point in read.points_] == [7, 7]
+                assert (read.timebase_, read.points_[1].reflectivity_) == (10**18, 255)
+            else:
+                assert (read.latitude_, read.status_.status_) == (52.5, -1)
+                assert read.position_covariance_ == [*range(9)]
+
+
+@pytest.mark.parametrize(
+    ("hosts", "environment", "message"),
+    [
+        ((), {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233': set it to a number from 0 to 232"),
+        ((), {"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
+        (("127.0.0.1:7400",), {}, "--to 127.0.0.1:7400: no such host: give a host or an IPv4 add"),
+        (("239.255.0.1",), {}, "--to 239.255.0.1 is a multicast address"),
+        (("::1",), {}, "--to ::1: no such host"),
+    ],
+)
+def test_a_network_that_cannot_be_is_one_line(dds, hosts, environment, message):
+    with pytest.raises(LidarError, match=message):
+        dds.Network.to(hosts, environment)
+
+
+def test_networks_are_on_loopback_unless_told_otherwise(dds):
+    assert dds.Network.to((), {}) == dds.Network("127.0.0.1", (), 0)
+    local = dds.Network.to(("localhost",), {"ROS_DOMAIN_ID": "7"})
+    assert (local.address, local.peers, local.domain) == ("127.0.0.1", ("127.0.0.1",), 7)
+    assert local.configuration.count("<Peer ") == 1
+
+
+def test_a_domain_whose_ports_are_taken_is_one_line(dds):
+    domain = DOMAIN + 2
+    sockets = []
+    try:
+        for participant in range(dds._PARTICIPANTS + 1):
+            taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sockets.append(taken)
+            taken.bind(("", 7400 + 250 * domain + 10 + 2 * participant))
+        with pytest.raises(
+            LidarError, match=rf"in domain {domain} on 127.0.0.1: its ports are tak"
+        ):
+            dds.RosPublisher(dds.Network(domain=domain))
+    finally:
+        for taken in sockets:
+            taken.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--as", "ros2", "--layout", "sick"], "'sick' is not one of"),
+        (["--as", "ros2", "--layout", "hesai", "--organized"], "organized is an option of the lay"),
+        (["--as", "packets", "--layout", "hesai"], "--layout is not for --as packets"),
+    ],
+)
+def test_options_that_do_not_fit_are_one_line(folder, dds, arguments, message):
+    result = CliRunner().invoke(play, ["scan.yaml", *arguments])
+    assert message in f"{result.output}{result.exception}"
+
+
+def test_a_cloud_without_the_columns_of_a_layout_is_one_line(dds, monkeypatch):
+    from lidarpool.playback.ros2 import Ros2Bridge
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN + 3))
+    sweeps = Sweeps.from_survey(Survey(Sensor.grid(90, 4), poses=[(0, 0, 0)], steps=4), room())
+    columns = {name: np.zeros(0, int) for name in ("scan", "object", "channel", "time")}
+    points = Cloud(np.zeros((0, 3)), columns)
+    options = BridgeOptions(settings={"layout": "livox"})
+    with (
+        Ros2Bridge(sweeps, Schedule(), options, print) as bridge,
+        pytest.raises(LidarError, match=r"layout livox needs reflectivity, which the cloud lacks"),
+    ):
+        bridge.prepare(0, points)
+
+
+def test_without_the_extra_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    for name in list(sys.modules):
+        if name.startswith("cyclonedds."):
+            monkeypatch.setitem(sys.modules, name, None)
+        elif name.startswith("lidarpool.playback."):
+            monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(
+        LidarError, match=r'--as ros2 needs cyclonedds.*pip install "lidarpool\[ros'
+    ):
+        bridge_class("ros2")

@@ -1,0 +1,320 @@
+"""Layouts of drivers of ROS 2 in bags, as the drivers publish them, and read back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from tests.shapes import room
+
+from lidarpool import (
+    Cloud,
+    LidarError,
+    Mounted,
+    Returns,
+    Sensor,
+    Survey,
+    Track,
+    load_sensor,
+    save_cloud,
+)
+from lidarpool.cli.result_commands import export
+from lidarpool.export.format_table import FORMATS
+from lidarpool.export.formats import Format
+from lidarpool.export.ros import layouts
+from lidarpool.export.ros.livox import CUSTOM_DEFINITION
+from lidarpool.recordings.recordings import open_recording
+from lidarsim.columns.bags import livox_columns
+from lidarsim.columns.table import SCAN
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+
+COLUMNS = ("ray", "range", "time", "intensity", "reflectivity", "signal", "return_number",
+           "returns")  # fmt: skip
+START_NS = 1_700_000_000_123_456_000  # on 14 November 2023
+SCENE = room()
+# Fields and step of a point in the sources of the drivers (master of each, November 2026):
+# PointField.datatype 2 uint8, 4 uint16, 7 float32, 8 float64.
+XYZI = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)]
+DRIVERS = {
+    "livox": ([*XYZI, ("tag", 16, 2), ("line", 17, 2), ("timestamp", 18, 8)], 26),
+    "hesai": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26),
+    "robosense": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26),
+}
+
+
+@cache
+def cast(model: str, mode: str = "strongest") -> Cloud:
+    """Return the cloud of two sweeps of a sensor that moves through a room, with its sweeps."""
+    sensor = load_sensor(model, max_range_m=5.5)  # some rays have no return
+    survey = Survey(
+        sensors=[Mounted(sensor, name="roof")],
+        trajectory=Track([0, 1], [[0, 0, 0], [0.5, 0, 0]]),
+        steps=sensor.steps_of_revolution(1).stop,
+        columns=COLUMNS,
+        returns=Returns(mode=mode, subrays=7, divergence_mrad=8.0),
+        start=datetime(2023, 11, 14, 22, 13, 20, 123_456, UTC),
+    )
+    part = columns_of(list(Rig(SCENE, survey, "embree").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, SCENE.origin)
+    sweeps = Sweeps.from_survey(survey, SCENE)
+    return Cloud(cloud.positions, cloud.columns, sweeps=lambda: sweeps)
+
+
+def messages(path: Path, suffix: str) -> list[Any]:
+    """Return the messages of the topics that end with `suffix`, by rosbags."""
+    with AnyReader([path]) as bag:
+        return [
+            bag.deserialize(data, connection.msgtype)
+            for connection, _, data in bag.messages()
+            if connection.topic.endswith(suffix)
+        ]
+
+
+def rows_of(message: Any) -> np.ndarray:
+    """Return the points of a PointCloud2, (height, width)."""
+    kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4", 8: "f8"}
+    row = np.dtype({
+        "names": [field.name for field in message.fields],
+        "formats": [kinds[field.datatype] for field in message.fields],
+        "offsets": [field.offset for field in message.fields],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    return message.data.view(row).reshape(message.height, message.width)
+
+
+def sweep_of(cloud: Cloud, sweep: int) -> Cloud:
+    return list(cloud.sweeps().points(cloud))[sweep]
+
+
+@pytest.mark.parametrize(
+    ("layout", "model"),
+    [("livox", "livox/mid360"), ("hesai", "hesai/xt32"), ("robosense", "robosense/rs-lidar-16")],
+)
+def test_fields_are_those_of_the_driver(layout, model, tmp_path):
+    cloud = cast(model)
+    save_cloud(cloud, tmp_path / "c.mcap", layout=layout)
+    message = messages(tmp_path / "c.mcap", "/points")[1]
+    fields, step = DRIVERS[layout]
+    assert [(field.name, field.offset, field.datatype) for field in message.fields] == fields
+    assert (message.point_step, message.height, message.is_dense) == (step, 1, True)
+    (rows,) = rows_of(message)
+    points = sweep_of(cloud, 1)
+    np.testing.assert_array_equal(rows["intensity"], points.reflectivity)
+    channel = {"livox": "line"}.get(layout, "ring")
+    highest = load_sensor(model).channels - 1
+    rings = highest - points.channel if layout == "hesai" else points.channel
+    np.testing.assert_array_equal(rows[channel], rings)
+    unit = 1 if layout == "livox" else 1e9
+    exact = START_NS + points.time.astype(np.int64)
+    np.testing.assert_allclose(rows["timestamp"] * unit - START_NS, exact - START_NS, atol=300)
+    stamp = message.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == START_NS + round(cloud.sweeps().begins_ns[1])
+
+
+def test_a_custom_message_of_livox_has_the_same_points(tmp_path):
+    cloud = cast("livox/mid360")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+    clouds = messages(tmp_path / "c.mcap", "/roof/points")
+    customs = messages(tmp_path / "c.mcap", "/roof/livox")
+    assert len(clouds) == len(customs) == 2
+    for sweep, (cloud_message, custom) in enumerate(zip(clouds, customs, strict=True)):
+        (rows,) = rows_of(cloud_message)
+        points = sweep_of(cloud, sweep)
+        assert custom.point_num == len(custom.points) == len(rows) > 1000
+        assert custom.timebase == START_NS + 100_000_000 * sweep
+        assert (custom.lidar_id, custom.rsvd.tolist()) == (0, [0, 0, 0])
+        for number in (0, 1, len(rows) - 1):
+            point = custom.points[number]
+            row = rows[number]
+            assert (point.x, point.y, point.z) == (row["x"], row["y"], row["z"])
+            assert (point.reflectivity, point.tag) == (row["intensity"], 0)
+            assert point.line == row["line"]
+            assert point.offset_time == points.time[number] - 100_000_000 * sweep
+
+
+def test_foxglove_reads_the_custom_message(tmp_path):
+    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    cloud = cast("livox/mid360")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+    with (tmp_path / "c.mcap").open("rb") as file:
+        reader = pytest.importorskip("mcap.reader").make_reader(file, decoder_factories=[decoder])
+        _, _, _, custom = next(reader.iter_decoded_messages(topics="/roof/livox"))
+    points = sweep_of(cloud, 0)
+    assert [point.offset_time for point in custom.points] == points.time.tolist()
+    assert [point.reflectivity for point in custom.points] == points.reflectivity.tolist()
+
+
+def test_a_custom_message_without_points_or_in_pieces(tmp_path):
+    cloud = cast("livox/mid360")
+    save_cloud(cloud[:0], tmp_path / "c.mcap", layout="livox")
+    with AnyReader([tmp_path / "c.mcap"]) as bag:
+        (data, _) = (data for found, _, data in bag.messages() if found.topic == "/roof/livox")
+    assert not len(livox_columns(data)["x"])
+    with pytest.raises(ValueError, match=r"5 points announced"):
+        livox_columns(data[:-4] + b"\5\0\0\0")
+
+
+@pytest.mark.parametrize(
+    ("layout", "model", "mode"),
+    [
+        ("velodyne", "velodyne/vlp16", "strongest"),
+        ("images", "velodyne/vlp16", "dual"),
+        ("robosense", "robosense/rs-lidar-16", "strongest"),
+        ("ouster", "ouster/os1-32", "strongest"),
+        ("ouster", "ouster/os1-32", "two_strongest"),
+    ],
+)
+def test_organized_clouds_have_a_point_for_each_ray(layout, model, mode, tmp_path):
+    cloud = cast(model, mode)
+    save_cloud(cloud, tmp_path / "plain.mcap", layout=layout)
+    save_cloud(cloud, tmp_path / "c.mcap", layout=layout, organized=True)
+    planes = 2 if mode in ("dual", "two_strongest") else 1
+    channels = load_sensor(model).channels
+    clouds = messages(tmp_path / "c.mcap", "/points")
+    plain = messages(tmp_path / "plain.mcap", "/points")
+    further = messages(tmp_path / "c.mcap", "/points2")
+    assert len(further) == (len(clouds) if layout == "ouster" and planes == 2 else 0)
+    for sweep, message in enumerate(clouds):
+        assert not message.is_dense and message.row_step == message.width * message.point_step
+        rows = rows_of(message)
+        if further:
+            rows = np.concatenate([rows, rows_of(further[sweep])])
+        (flat,) = rows_of(plain[sweep])
+        returned = ~np.isnan(rows["x"])
+        assert 0 < returned.sum() < rows.size
+        np.testing.assert_array_equal(np.sort(rows[returned]), np.sort(flat))
+        empty = rows[~returned]
+        assert np.isnan(empty["y"]).all() and np.isnan(empty["z"]).all()
+        if layout == "ouster":
+            assert (message.height, message.width) == (channels, 1024)
+            assert (rows["ring"] == np.arange(planes * channels)[:, None] % channels).all()
+            assert not empty["range"].any() and not empty["intensity"].any()
+        else:
+            assert message.width == channels
+            assert message.height // planes in (1801, 1802, 1808, 1809)  # 1808.6 a turn
+            assert (rows["ring"] == np.arange(channels)).all()
+            times = rows["timestamp" if layout == "robosense" else "time"][::planes]
+            assert (np.diff(times.mean(axis=1)) > 0).all()
+            lost = empty["intensity"]
+            assert not lost.any() if layout == "robosense" else np.isnan(lost).all()
+
+
+def test_a_column_of_an_organized_ouster_looks_in_one_direction(tmp_path):
+    cloud = cast("ouster/os1-64")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="ouster", organized=True)
+    rows = rows_of(messages(tmp_path / "c.mcap", "/points")[0])
+    azimuths = np.degrees(np.arctan2(rows["y"], rows["x"]))
+    column = np.round((180 - azimuths) * 1024 / 360) % 1024  # it turns clockwise
+    returned = ~np.isnan(column)
+    assert returned.sum() > 10_000
+    assert (column[returned] == np.broadcast_to(np.arange(1024), column.shape)[returned]).all()
+
+
+@pytest.mark.parametrize(
+    ("layout", "organized"),
+    [
+        *((layout, False) for layout in FORMATS["mcap"].layouts),
+        *((layout, True) for layout in FORMATS["mcap"].organized_layouts),
+    ],
+)
+def test_recordings_of_each_layout_are_read_back(layout, organized, tmp_path):
+    cloud = cast("hesai/xt32" if layout == "hesai" else "velodyne/vlp16")
+    save_cloud(cloud, tmp_path / "c.mcap", layout=layout, organized=organized)
+    recording = open_recording(tmp_path / "c.mcap")
+    assert recording.count == 2
+    points = sweep_of(cloud, 1)
+    positions = cloud.sweeps().as_fired(1, points)
+    read = recording.read_points(1)
+    order, read_order = (np.lexsort(np.round(p, 4).T) for p in (positions, read.points))
+    np.testing.assert_allclose(read.points[read_order], positions[order], atol=2e-4)
+    highest = {"ouster": 15, "hesai": 31}.get(layout)
+    rings = read.rings if highest is None else highest - read.rings
+    np.testing.assert_array_equal(rings[read_order], points.channel[order])
+    assert read.intensities is not None
+
+
+def test_a_recording_of_livox_may_have_its_own_messages_only(tmp_path):
+    cloud = cast("livox/mid360")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+    plain = open_recording(tmp_path / "c.mcap").read_points(1)
+    custom = open_recording(tmp_path / "c.mcap", sensor="/roof/livox").read_points(1)
+    np.testing.assert_array_equal(custom.points, plain.points)
+    np.testing.assert_array_equal(custom.rings, plain.rings)
+    np.testing.assert_array_equal(custom.intensities, plain.intensities)
+
+
+def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
+    cloud = cast("livox/mid360")
+    save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+    kind = "livox_interfaces/msg/CustomMsg"  # of livox_ros2_driver, for the Avia
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    definition = CUSTOM_DEFINITION.replace("livox_ros_driver2", "livox_interfaces")
+    store.register(get_types_from_msg(definition, kind))
+    with (
+        AnyReader([tmp_path / "c.mcap"]) as bag,
+        Writer(tmp_path / "old", version=8) as writer,
+    ):
+        topic = writer.add_connection("/livox/lidar", kind, typestore=store)
+        for connection, time_ns, data in bag.messages():
+            if connection.topic == "/roof/livox":
+                writer.write(topic, time_ns, data)
+    old = open_recording(tmp_path / "old")
+    points = old.read_points(1).points
+    assert old.count == 2
+    expected = open_recording(tmp_path / "c.mcap").read_points(1).points
+    np.testing.assert_array_equal(points, expected)
+
+
+def test_layouts_of_the_table_are_those_of_the_module():
+    row = FORMATS["mcap"]
+    assert tuple(row.layouts) == tuple(layouts.LAYOUTS)
+    organized = {name for name, layout in layouts.LAYOUTS.items() if layout.lines}
+    assert organized == {*row.organized_layouts}
+
+
+def test_what_cannot_be_organized_is_one_line(tmp_path):
+    with pytest.raises(LidarError, match=r"layouts velodyne, ouster, images, robosense, not of he"):
+        Format("mcap", "hesai", organized=True)
+    with pytest.raises(LidarError, match=r"organized is an option of mcap, rosbag2, not of laz"):
+        Format("laz", organized=True)
+    cloud = cast("velodyne/vlp16")
+    without = Cloud(
+        cloud.positions,
+        {name: column for name, column in cloud.columns.items() if name != "ray"},
+        sweeps=cloud.sweeps,
+    )
+    with pytest.raises(LidarError, match=r"needs ray, which the cloud lacks"):
+        save_cloud(without, tmp_path / "c.mcap", organized=True)
+    unknown = Cloud(
+        cloud.positions, cloud.columns, sweeps=lambda: replace(cloud.sweeps(), fired=None)
+    )
+    with pytest.raises(LidarError, match=r"organized clouds need every return"):
+        save_cloud(unknown, tmp_path / "c.mcap", organized=True)
+
+
+def test_livox_has_a_line_in_a_byte(tmp_path):
+    survey = Survey(
+        Sensor.grid(36, 300, 80.0), poses=[(0, 0, 0)], steps=1, columns=("time", "reflectivity")
+    )
+    columns = {name: np.zeros(0, int) for name in ("scan", "object", "channel", "time")}
+    columns["reflectivity"] = np.zeros(0, np.uint8)
+    sweeps = Sweeps.from_survey(survey, SCENE)
+    cloud = Cloud(np.zeros((0, 3)), columns, sweeps=lambda: sweeps)
+    with pytest.raises(LidarError, match=r"has 300 channels: use another layout"):
+        save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
+
+
+def test_the_command_names_the_layouts():
+    wrong = CliRunner().invoke(export, ["out", "-f", "mcap", "--layout", "sick"])
+    assert wrong.exit_code and "'robosense'" in wrong.output

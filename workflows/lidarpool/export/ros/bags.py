@@ -1,0 +1,190 @@
+"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, frames, /actors and /clock."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader as Bag
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from lidarsim.base.arrays import AnyArray, Floats32
+from lidarsim.columns.bags import message_types
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
+
+from .. import reading
+from .layouts import (
+    EXTRA_FIELDS,
+    LAYOUTS,
+    LaidOut,
+    message_stamp_ns,
+    sensor_traits,
+    survey_start_ns,
+)
+from .messages import (
+    LATCHED_TOPICS,
+    message_store,
+    points_topic,
+    survey_messages,
+)
+
+# Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
+    QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
+)  # fmt: skip
+
+
+def write_rosbag2(
+    path: Path,
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    layout: str,
+    compensated: bool = False,
+    organized: bool = False,
+) -> None:
+    """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
+    laid_out = LaidOut(layout, compensated, organized)
+    # Readers of Humble accept no later version: from 9 on, profiles are lists.
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        bag.set_custom_data("lidarpool", COMPENSATED if laid_out.compensated else AS_FIRED)
+        topics: dict[str, Any] = {}
+        for message in survey_messages(cloud, sweeps, laid_out):
+            if message.topic not in topics:
+                latched = (_LATCHED,) if message.topic in LATCHED_TOPICS else ()
+                topics[message.topic] = bag.add_connection(
+                    message.topic,
+                    message.kind,
+                    typestore=message_store(),
+                    offered_qos_profiles=latched,
+                )
+            bag.write(topics[message.topic], message.time_ns, message.cdr)
+
+
+def write_mcap(
+    path: Path,
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    layout: str,
+    compensated: bool = False,
+    organized: bool = False,
+) -> None:
+    """Write an MCAP file.
+
+    Each sweep is a PointCloud2 on `/NAME/points`, NAME from its sensor, or on `/points`. Points are
+    in the sensor frame at their own firing, as drivers publish them, and have times; or
+    compensated, in the sensor frame at the start of the sweep, without times. `/tf` has the frames
+    of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
+    `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
+    names of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
+    without one. `/actors` has a MarkerArray of the boxes of actors where their points of the sweep
+    are.
+
+    Of a 2D scanner (one beam in the plane of its x and y axes) `/NAME/scan`, or `/scan`, also has a
+    LaserScan of each sweep, where the survey keeps every return and has the columns ray and range.
+
+    Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
+    orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
+    PointStamped in `map`.
+
+    Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began), `autoware`
+    (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from the start of the head,
+    time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes), `ouster` (48
+    bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
+    signal), `hesai` and `robosense` (26 bytes; intensity: reflectivity, timestamp in seconds since
+    1970; rings are the maker's) and `livox` (26 bytes; timestamp in ns since 1970; `/NAME/livox`,
+    or `/livox`, has the same points as a CustomMsg). Whole numbers of intensity are 255 at 1 and
+    above. Where the cloud has red, green and blue, a field `rgb` follows, where it has radial
+    velocities, `radial_velocity`, where its classes have names, `label`, and then any columns of
+    normals, `incidence_deg` and origins of rays, and `material`; each makes points 4 bytes longer,
+    up to the 48 bytes of `ouster`.
+
+    Organized clouds have a point for each ray, NaN without a return: see `organized_rows`. Second
+    returns of `ouster` are then on `/NAME/points2`.
+    """
+    folder = path.with_name(f"{path.name}.bag")
+    try:
+        write_rosbag2(folder, cloud, sweeps, layout, compensated, organized)
+        (written,) = folder.glob("*.mcap")
+        written.replace(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity, limited by the layout, channel and named class."""
+
+    def files(self, sweep: int) -> list[str]:
+        """Return the name of the job's bag."""
+        return [self.entry.path_of("mcap")]
+
+    @cached_property
+    def _bag(self) -> Bag:
+        # AnyReader would parse the definitions of messages, which takes longer than a sweep.
+        bag = Bag(self.local(self.files(0)[0]))
+        bag.open()
+        return bag
+
+    def read(self, sweep: int) -> reading.PointColumns:
+        """Return the points of a sweep."""
+        layout = LAYOUTS[self.layout]
+        message = self._point_cloud(sweep)
+        names = {field.name for field in message.fields}
+        compensated = layout.time_field not in names
+        extra = [name for name in EXTRA_FIELDS if name in names]
+        rows = message.data.view(layout.row(extra, compensated=compensated))
+        intensity = rows["intensity"].astype(np.float32) / layout.full_intensity
+        rings = rows[layout.ring_field].astype(np.int64)
+        channels = layout.channels(rings, sensor_traits(self.sweeps, sweep)).astype(np.uint16)
+        columns = {"intensity": intensity, "channel": channels}
+        if "label" in names:
+            columns["class"] = rows["label"].astype(np.uint16)
+        points = np.stack([rows[axis] for axis in "xyz"], axis=1)
+        if not compensated and self.sweeps.coordinates == "world":
+            points = self._at_start(sweep, points, rows[layout.time_field])
+        return points, columns
+
+    def _point_cloud(self, sweep: int) -> Any:
+        """Return the PointCloud2 of a sweep; ValueError if the bag lacks the message."""
+        topic = points_topic(self.sweeps, sweep)
+        connections = [opened for opened in self._bag.connections if opened.topic == topic]
+        time_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
+        record = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
+        if record is None:  # rosbags 0.11.2 misses some messages by their time
+            records = self._bag.messages(connections)
+            record = next((candidate for candidate in records if candidate[1] == time_ns), None)
+        if record is None:
+            raise ValueError(f"it has no message on {topic} at {time_ns} ns")
+        connection, _, data = record
+        return message_types().deserialize_cdr(data, connection.msgtype)
+
+    def _at_start(self, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
+        """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
+
+        `times` (n,) are those of the layout.
+        """
+        since_ns = LAYOUTS[self.layout].since_ns(times, message_stamp_ns(self.sweeps, sweep))
+        stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
+        scans = np.full(len(points), self.sweeps.scans[sweep])
+        sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})
+        fired_in_sensor = replace(self.sweeps, coordinates="sensor")
+        return fired_in_sensor.compensated(sweep, sensor_cloud).astype(np.float32)
+
+    def close(self) -> None:
+        """Close the bag."""
+        if "_bag" in self.__dict__:
+            self._bag.close()
+        super().close()

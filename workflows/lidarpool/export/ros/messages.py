@@ -1,0 +1,415 @@
+"""Messages of ROS 2 of a survey, in the order of their times, serialised."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import cache
+from heapq import merge
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from lidarsim.base.arrays import Floats32, Records
+from lidarsim.columns.bags import POINT_FIELDS
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
+from lidarsim.sweeps.ray_image import Image
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps, plain_names
+
+from ..boxes import Boxes
+from ..laser_scan import ScanRays
+from .layouts import (
+    LaidOut,
+    message_stamp_ns,
+    point_rows,
+    sensor_traits,
+    since_stamp_ns,
+    survey_start_ns,
+)
+from .livox import CUSTOM_DEFINITION, CUSTOM_MSG, check_lines, custom_message
+from .organized import organized_rows
+
+
+class RosMessage(NamedTuple):
+    """A message on a topic."""
+
+    topic: str
+    kind: str  # such as "sensor_msgs/msg/PointCloud2"
+    time_ns: int  # when it is sent
+    cdr: bytes | memoryview  # serialised, with the header of its encoding
+
+
+class Serialised(NamedTuple):
+    """The content of a message that is serialised already."""
+
+    kind: str
+    cdr: bytes
+
+
+# frames
+WORLD = "map"
+CARRIER = "base_link"
+_INSTRUMENTS = "imu", "gnss"
+LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # kept for late readers
+# Messages of vision_msgs, which rosbags lacks.
+_LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
+_LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
+
+
+@cache
+def message_store() -> Typestore:
+    """Return the types of messages that a survey has."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
+    store.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_MSG))
+    return store
+
+
+def survey_messages(cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut) -> Iterator[RosMessage]:
+    """Yield the messages of a cloud, in the order of their times."""
+    messages = SurveyMessages(sweeps, laid_out, {column.name for column in cloud.table})
+    measured = messages.instruments()
+    waiting = next(measured, None)
+    yield from messages.static()
+    for sweep, points in enumerate(sweeps.points(cloud)):
+        while waiting is not None and waiting.time_ns <= messages.sweep_start_ns(sweep):
+            yield waiting
+            waiting = next(measured, None)
+        yield messages.clock(messages.sweep_start_ns(sweep))
+        yield from messages.of_sweep(sweep, points)
+    while waiting is not None:
+        yield waiting
+        waiting = next(measured, None)
+
+
+class SurveyMessages:
+    """Makes the messages of a survey: static, of the clock, of sweeps, and of instruments.
+
+    Parameters
+    ----------
+    sweeps
+        The sweeps of the survey.
+    laid_out
+        How points are laid out.
+    columns
+        Names of the columns of the cloud.
+    """
+
+    def __init__(self, sweeps: Sweeps, laid_out: LaidOut, columns: Collection[str]) -> None:
+        self._make = _Messages(message_store().types)
+        self._sweeps = sweeps
+        self._laid_out = laid_out
+        self._columns = {name for name in columns if name != "class" or sweeps.classes}
+        self._row = laid_out.row(self._columns)
+        (field,) = self._make.types_of("sensor_msgs", "PointField")
+        self._fields = [
+            field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
+            for name, (kind, offset, *_) in (self._row.fields or {}).items()
+        ]
+        self._frames = frame_names(sweeps)
+        self._actors = self._frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
+        poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
+        # Carrier and actors: frame and poses.
+        self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
+        self._start_ns = survey_start_ns(sweeps)
+
+    def sweep_start_ns(self, sweep: int) -> int:
+        """Return the start of a sweep, nanoseconds since 1970."""
+        return self._start_ns + round(self._sweeps.begins_ns[sweep])
+
+    def static(self) -> Iterator[RosMessage]:
+        """Yield the messages that are sent once."""
+        sweeps = self._sweeps
+        start_ns = self._start_ns
+        on_carrier = [
+            (CARRIER, frame, sweeps.mounts, number)
+            for number, frame in enumerate(self._frames[: len(sweeps.sensors)])
+        ]
+        on_carrier += _instruments(sweeps)
+        yield _sent("/tf_static", self._make.transforms(on_carrier, start_ns), start_ns)
+        info, named = self._make.types_of("vision_msgs", "LabelInfo", "VisionClass")
+        header = self._make.header("", start_ns)
+        if sweeps.classes:
+            classes = [named(number, name) for number, name in sweeps.classes.items()]
+            yield _sent("/label_info", info(header, classes, 0.0), start_ns)
+        if "material" in self._columns and sweeps.materials:
+            materials = [named(number, name) for number, name in enumerate(sweeps.materials)]
+            yield _sent("/material_info", info(header, materials, 0.0), start_ns)
+
+    def instruments(self) -> Iterator[RosMessage]:
+        """Return the messages of IMU and GNSS receiver, in the order of their times."""
+        return self._make.instrument_messages(self._sweeps, self._start_ns)
+
+    def clock(self, time_ns: int) -> RosMessage:
+        """Return the message of the clock at a time, nanoseconds since 1970."""
+        (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
+        return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
+
+    def of_sweep(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
+        """Yield the messages of a sweep, which are sent at its start."""
+        sweeps = self._sweeps
+        time_ns = self.sweep_start_ns(sweep)
+        yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
+        topic = points_topic(sweeps, sweep)
+        for name, content in self._measured(sweep, points).items():
+            yield _sent(f"{topic.removesuffix('points')}{name}", content, time_ns)
+        if self._actors:
+            boxes = Boxes.from_points(sweeps, sweep, points)
+            yield _sent("/actors", self._make.markers(boxes, self._actors, time_ns), time_ns)
+
+    def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
+        """Return the messages of a sensor's sweep, by the last part of their topics."""
+        sweeps = self._sweeps
+        stamp_ns = message_stamp_ns(sweeps, sweep)
+        header = self._make.header(self._frames[sweeps.sensor[sweep]], stamp_ns)
+        rows = point_rows(self._laid_out, self._row, points, sweeps, sweep)
+        if self._laid_out.organized:
+            clouds = organized_rows(self._laid_out, rows, points, sweeps, sweep)
+        else:
+            clouds = [rows[np.newaxis]]
+        contents = {
+            _numbered("points", plane): self._point_cloud(cloud, header)
+            for plane, cloud in enumerate(clouds)
+        }
+        if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
+            contents["scan"] = self._make.laser_scan(rays, header)
+        if self._laid_out.name == "images":
+            ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
+            for plane, image in enumerate(ranges):
+                contents[_numbered("range_image", plane)] = self._make.image(image[::-1], header)
+        if self._laid_out.name == "livox":
+            check_lines(sensor_traits(sweeps, sweep).channels)
+            since_ns = np.zeros(len(points))
+            if not self._laid_out.compensated:
+                since_ns = since_stamp_ns(points, sweeps, sweep)
+            data = custom_message(message_store(), header, stamp_ns, since_ns, rows)
+            contents["livox"] = Serialised(CUSTOM_MSG, data)
+        return contents
+
+    def _frames_in_world(self, sweep: int) -> list[tuple[str, str, SweepPoses, int]]:
+        """Return the frames of the carrier and of the actors that are present during a sweep."""
+        present = [True, *self._sweeps.actor_there[:, sweep]]
+        return [
+            (WORLD, name, poses, sweep)
+            for (name, poses), is_present in zip(self._moving, present, strict=True)
+            if is_present
+        ]
+
+    def _point_cloud(self, rows: Records, header: Any) -> Any:
+        """Return the PointCloud2 of points (height, width)."""
+        height, width = rows.shape
+        (message,) = self._make.types_of("sensor_msgs", "PointCloud2")
+        return message(
+            header,
+            height,
+            width,
+            self._fields,
+            False,
+            self._row.itemsize,
+            width * self._row.itemsize,
+            rows.reshape(-1).view(np.uint8),
+            not self._laid_out.organized,
+        )
+
+
+def _numbered(name: str, plane: int) -> str:
+    """Return the name of the topic of a return of each pulse, counted from 0."""
+    return f"{name}{plane + 1 if plane else ''}"
+
+
+def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
+    """Return the frames of the instruments on the carrier."""
+    instruments = sweeps.instruments
+    if instruments is None or instruments.folder is None:
+        return []
+    frames = zip(frame_names(sweeps)[-2:], (instruments.imu, instruments.gnss), strict=True)
+    return [
+        (
+            CARRIER,
+            frame,
+            SweepPoses(np.array([instrument.position]), np.array([instrument.quaternion])),
+            0,
+        )
+        for frame, instrument in frames
+        if instrument is not None
+    ]
+
+
+def frame_names(sweeps: Sweeps) -> list[str]:
+    """Return the frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
+    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
+    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2:]
+
+
+def points_topic(sweeps: Sweeps, sweep: int) -> str:
+    """Return the topic of the points of a sweep."""
+    sensor = sweeps.sensor[sweep]
+    return f"/{frame_names(sweeps)[sensor]}/points" if sweeps.sensors[sensor] else "/points"
+
+
+def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
+    """Return a message that is sent at a time."""
+    if isinstance(content, Serialised):
+        return RosMessage(topic, content.kind, time_ns, content.cdr)
+    kind = content.__msgtype__
+    return RosMessage(topic, kind, time_ns, message_store().serialize_cdr(content, kind))
+
+
+class _Messages:
+    """Makes messages and their common parts."""
+
+    def __init__(self, types: Any) -> None:
+        self._types = types
+
+    def types_of(self, package: str, *names: str) -> list[Any]:
+        """Return types of messages of a package."""
+        return [self._types[f"{package}/msg/{name}"] for name in names]
+
+    def stamp(self, time_ns: int) -> Any:
+        """Return the time of a message."""
+        return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
+
+    def header(self, frame: str, time_ns: int) -> Any:
+        """Return the header of a message."""
+        return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
+
+    def transforms(self, frames: list[tuple[str, str, SweepPoses, int]], time_ns: int) -> Any:
+        """Return frames in their parents: (parent, name, poses, index of the pose)."""
+        vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
+        transform, stamped = self.types_of("geometry_msgs", "Transform", "TransformStamped")
+        return self._types["tf2_msgs/msg/TFMessage"](
+            [
+                stamped(
+                    self.header(parent, time_ns),
+                    name,
+                    transform(
+                        vector(*placed.positions[index].tolist()),
+                        quaternion(*placed.quaternions[index].tolist()),
+                    ),
+                )
+                for parent, name, placed, index in frames
+            ]
+        )
+
+    def instrument_messages(self, sweeps: Sweeps, start_ns: int) -> Iterator[RosMessage]:
+        """Return the messages of IMU and GNSS receiver, in order of time."""
+        instruments = sweeps.instruments
+        if instruments is None:
+            return iter(())
+        *_, imu, gnss = frame_names(sweeps)
+        streams = self._imu(instruments, imu, start_ns), self._gnss(instruments, gnss, start_ns)
+        return merge(*streams, key=lambda message: message.time_ns)
+
+    def _imu(self, instruments: Instruments, frame: str, start_ns: int) -> Iterator[RosMessage]:
+        vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
+        (imu,) = self.types_of("sensor_msgs", "Imu")
+        unknown = np.zeros(9)
+        unknown[0] = -1  # there is no orientation
+        rate, force = (
+            np.zeros((2, 9))
+            if instruments.imu is None
+            else [np.eye(3).ravel() * variance for variance in instruments.imu.variances]
+        )
+        for time, *numbers in instruments.rows(IMU_FILE):
+            time_ns = start_ns + int(time)
+            values = [*map(float, numbers)]
+            message = imu(
+                self.header(frame, time_ns),
+                quaternion(0.0, 0.0, 0.0, 1.0),
+                unknown,
+                vector(*values[:3]),
+                rate,
+                vector(*values[3:]),
+                force,
+            )
+            yield _sent("/imu/data_raw", message, time_ns)
+
+    def _gnss(self, instruments: Instruments, frame: str, start_ns: int) -> Iterator[RosMessage]:
+        point, stamped = self.types_of("geometry_msgs", "Point", "PointStamped")
+        fix, status = self.types_of("sensor_msgs", "NavSatFix", "NavSatStatus")
+        variances = (
+            np.zeros(3) if instruments.gnss is None else np.array(instruments.gnss.variances)
+        )
+        covariance_type = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
+        for time, x, y, z, *geodetic in instruments.rows(GNSS_FILE):
+            time_ns = start_ns + int(time)
+            if geodetic:
+                message = fix(
+                    self.header(frame, time_ns),
+                    status(status.STATUS_FIX, status.SERVICE_GPS),
+                    *map(float, geodetic),
+                    np.diag(variances).ravel(),
+                    covariance_type,
+                )
+                yield _sent("/gnss/fix", message, time_ns)
+            else:
+                message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
+                yield _sent("/gnss/position", message, time_ns)
+
+    def laser_scan(self, rays: ScanRays, header: Any) -> Any:
+        """Return the LaserScan of a sweep of a 2D scanner."""
+        first = float(rays.angles[0])
+        last = float(rays.angles[-1])
+        (scan,) = self.types_of("sensor_msgs", "LaserScan")
+        return scan(
+            header,
+            first,
+            last,
+            (last - first) / (len(rays.angles) - 1),
+            rays.time_increment_s,
+            rays.scan_time_s,
+            *rays.range_limits_m,
+            rays.ranges,
+            rays.intensities,
+        )
+
+    def image(self, values: Floats32, header: Any) -> Any:
+        """Return an image of numbers (height, width)."""
+        height, width = values.shape
+        data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
+        image = self._types["sensor_msgs/msg/Image"]
+        return image(header, height, width, "32FC1", 0, 4 * width, data)
+
+    def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
+        """Return the boxes of actors in a sweep as markers, which replace earlier markers."""
+        types = self._types
+        names = ("Point", "Quaternion", "Pose", "Vector3")
+        point, quaternion, pose, vector = self.types_of("geometry_msgs", *names)
+        marker, mesh = self.types_of("visualization_msgs", "Marker", "MeshFile")
+        image = types["sensor_msgs/msg/CompressedImage"]
+        header = self.header(WORLD, time_ns)
+        none = np.empty(0, np.uint8)
+        orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
+        always = types["builtin_interfaces/msg/Duration"](0, 0)
+        return types["visualization_msgs/msg/MarkerArray"](
+            [
+                marker(
+                    header,
+                    "actors",
+                    number,
+                    marker.CUBE,
+                    marker.ADD if boxes.present[number] else marker.DELETE,
+                    pose(
+                        point(*boxes.centres[number].tolist()),
+                        quaternion(*boxes.quaternions[number].tolist()),
+                    ),
+                    vector(*boxes.sizes[number].tolist()),
+                    orange,
+                    always,
+                    False,
+                    [],
+                    [],
+                    "",
+                    image(header, "", none),
+                    [],
+                    name,
+                    "",
+                    mesh("", none),
+                    False,
+                )
+                for number, name in enumerate(actors)
+            ]
+        )

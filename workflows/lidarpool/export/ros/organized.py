@@ -1,0 +1,65 @@
+"""Organized clouds: a point for each ray of a sweep, NaN where the ray has no return."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsim.base.arrays import Records
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.ray_image import Image
+from lidarsim.sweeps.sweeps import Sweeps
+
+from .layouts import LaidOut, message_stamp_ns, sensor_traits
+
+
+def organized_rows(
+    laid_out: LaidOut, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
+) -> list[Records]:
+    """Return the organized clouds (height, width) of a sweep, in the lines of the layout's driver.
+
+    `rows` (n,) are the points of the sweep in the layout. Lines are firings, with a point for each
+    channel, the lowest first, and further returns as lines after the line of their firing. Or lines
+    are channels, the highest first, with a point for each firing, in a cloud for each return; lines
+    are then shifted by the azimuths of the beams, so that a column is a single direction.
+
+    LidarError if the points are not in order, or the rays of the survey are unknown.
+    """
+    image = Image.from_points(sweeps, sweep, points)
+    without_return = _rays(laid_out, image, rows.dtype, sweeps, sweep)
+    planes = np.repeat(without_return[np.newaxis], image.planes, axis=0)
+    planes[image.plane, image.row, image.column] = rows
+    if laid_out.layout.lines == "firings":
+        lines = planes.transpose(2, 0, 1)
+        return [np.ascontiguousarray(lines).reshape(-1, image.sensor.channels)]
+    columns = _looking_ahead(image)
+    in_direction = np.take_along_axis(planes, columns[np.newaxis], axis=2)
+    return [np.ascontiguousarray(plane[::-1]) for plane in in_direction]
+
+
+def _rays(
+    laid_out: LaidOut, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
+) -> Records:
+    """Return points of all rays without a return, (channels, firings)."""
+    layout = laid_out.layout
+    channels = np.arange(image.sensor.channels)
+    rays = np.zeros((len(channels), len(image.firings)), row)
+    for axis in "xyz":
+        rays[axis] = np.nan
+    rays["intensity"] = layout.no_intensity
+    rays[layout.ring_field] = layout.rings(channels, sensor_traits(sweeps, sweep))[:, np.newaxis]
+    if not laid_out.compensated:
+        fired_ns = image.begin_ns + image.sensor.times_ns(image.firings).T
+        since_ns = fired_ns - sweeps.begins_ns[sweep]
+        rays[layout.time_field] = layout.times(since_ns, message_stamp_ns(sweeps, sweep))
+    return rays
+
+
+def _looking_ahead(image: Image) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+    """Return the firing of each pixel, so that a column is a direction: (channels, firings)."""
+    sensor = image.sensor
+    count = len(image.firings)
+    firings_per_turn = float(getattr(sensor.head, "firings_per_turn", count))
+    clockwise = -1 if getattr(sensor.head, "clockwise", False) else 1
+    azimuth = sensor.beams.azimuth if len(sensor.beams.azimuth) else np.zeros(sensor.channels)
+    shifts = np.rint(clockwise * azimuth * firings_per_turn / (2 * np.pi)).astype(np.int64)
+    return (np.arange(count) - shifts[:, np.newaxis]) % count
