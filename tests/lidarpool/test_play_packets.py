@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 import shutil
 import signal
@@ -12,6 +13,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,13 +72,22 @@ def played(tmp_path_factory):
     return folder
 
 
+def bound():
+    """Return a socket at a port that leaves room for those of other packets."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    opened.settimeout(20)
+    for port in random.sample(range(20_000, 30_000), 100):
+        with suppress(OSError):
+            opened.bind(("127.0.0.1", port))
+            return opened
+    raise AssertionError("no port is free")
+
+
 @pytest.fixture
 def receiver():
     """A socket on the loopback interface that holds the packets of seconds."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
-        opened.bind(("127.0.0.1", 0))
-        opened.settimeout(20)
+    with bound() as opened:
         yield opened
 
 
@@ -243,7 +254,7 @@ steps: 36
         (VLP16, ["--to", "::1"], "is of IPv6"),
         (VLP16, ["--to", "lidar=239.1.1.1"], "a multicast address"),
         (VLP16, ["--to", "127.0.0.1:65535"], "would go to port 65536: give a port nearer"),
-        (VLP16, ["--api", "192.0.2.1"], "cannot listen at 192.0.2.1:80"),
+        (VLP16, ["--api", "203.0.113.1"], "cannot listen at 203.0.113.1:80"),
         (VLP16, ["--as", "radar"], "'radar' is no bridge: use packets"),
         (
             "sensor: velodyne/hdl64e-s3\nposes: [[0, 0, 1]]\nsteps: 9\n",
@@ -430,6 +441,30 @@ def test_the_interface_of_an_ouster_answers_for_a_recording(tmp_path):
     outcome = command("play", tmp_path / "a.pcap", "--as", "packets")
     assert outcome.exit_code == 0, outcome.output
     assert "a.pcap of 192.168.1.200 sends to 127.0.0.1, port 7502; Ouster's HTTP" in outcome.stdout
+
+
+def test_several_sensors_send_to_a_port_each(receiver, tmp_path):
+    (tmp_path / "s.yaml").write_text(TWO)
+    with bound() as other:
+        options = []
+        for name, opened in (("roof", receiver), ("rear", other)):
+            options += ["--to", f"{name}=127.0.0.1:{port_of(opened)}"]
+        outcome = command("play", tmp_path / "s.yaml", "--as", "packets", *options)
+        assert outcome.exit_code == 0, outcome.output
+        roof = received(receiver, 75)
+        rear = received(other, 75)
+    assert roof != rear  # from other positions
+    assert [packet[1200:] for packet in roof] == [packet[1200:] for packet in rear]
+
+
+def test_stamps_are_those_of_the_clock_of_this_machine(receiver, tmp_path):
+    (tmp_path / "s.yaml").write_text(VLP16)
+    to = f"127.0.0.1:{port_of(receiver)}"
+    outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--to", to, "--now")
+    now_s = time.time() % 3600
+    assert outcome.exit_code == 0, outcome.output
+    (stamp_us,) = struct.unpack_from("<I", received(receiver, 1)[0], 1200)
+    assert (now_s - stamp_us / 1e6) % 3600 < 10
 
 
 @pytest.mark.parametrize("name", ["s.yaml", "a.pcap", "out"])

@@ -225,5 +225,5 @@ def test_an_address_that_cannot_be_had_is_refused_in_a_line():
             pass
         assert "\n" not in str(raised.value)
     elsewhere = pytest.raises(LidarError, match="Cannot assign requested address")
-    with elsewhere, interface("ouster/os1-64", address="192.0.2.1:8080"):
+    with elsewhere, interface("ouster/os1-64", address="203.0.113.1:8080"):
         pass

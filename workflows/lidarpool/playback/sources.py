@@ -101,7 +101,16 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
             )
     sweeps = Sweeps.load(folder / SWEEPS_FILE)
     cloud = CloudFile(folder / CLOUD)
-    return Played(sweeps, lambda sweep: next(sweeps.points(cloud, sweep, sweep + 1)))
+
+    def read(sweep: int) -> Cloud:
+        """Read the points of a sweep, and no others."""
+        first, stop = (cloud.row_of(scan) for scan in sweeps.scans[sweep : sweep + 2].tolist())
+        if stop <= first:  # the scans may still be out of order
+            return next(sweeps.points(cloud, sweep, sweep + 1))
+        points = next(cloud.chunks(stop - first, first))
+        return next(sweeps.points(points, sweep, sweep + 1))
+
+    return Played(sweeps, read)
 
 
 def scenario_job(path: Path, needs: Format | None = None) -> Job:

@@ -56,6 +56,10 @@ class Stream:
 
         A port is that of the returns; other kinds of datagrams move by as much.
         """
+        if receiver.port is not None and not self.kinds:
+            raise LidarError(
+                f"--to {receiver}: the ports of {self.model} are not known: leave the port out."
+            )
         first = next(iter(self.kinds.values()), 0)
         shift = 0 if receiver.port is None else receiver.port - first
         numbers = {port: port + shift for port in self.kinds.values()}

@@ -100,6 +100,7 @@ class HttpService(Service):
         self._socket: socket.socket | None = None
         self._connections = 0
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._ended = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
 
     @abstractmethod
@@ -123,7 +124,7 @@ class HttpService(Service):
 
     def __exit__(self, *error: object) -> None:
         assert self._loop is not None
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join()
 
     def _listening_socket(self) -> socket.socket:
@@ -149,20 +150,21 @@ class HttpService(Service):
         raise AssertionError("the last port returns or raises")
 
     def _run(self) -> None:
-        """Serve until the loop is stopped."""
+        """Serve until the context ends."""
         loop = self._loop
         assert loop is not None
-        asyncio.set_event_loop(loop)
-        server = loop.run_until_complete(
-            asyncio.start_server(self._serve, sock=self._socket, limit=_MAX_HEAD_BYTES)
-        )
-        loop.run_forever()
+        loop.run_until_complete(self._serve_all())
+        loop.close()
+
+    async def _serve_all(self) -> None:
+        """Answer connections until the context ends; then drop all that are open."""
+        server = await asyncio.start_server(self._serve, sock=self._socket, limit=_MAX_HEAD_BYTES)
+        await self._ended.wait()
         server.close()
-        tasks = asyncio.all_tasks(loop)
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
         for task in tasks:
             task.cancel()
-        loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-        loop.close()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the request of a connection, and close it; drop a connection too many."""

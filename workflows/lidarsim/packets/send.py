@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address, IPv6Address
 from pathlib import Path
@@ -105,6 +105,7 @@ class Sender:
         )
         assert self._process.stdout is not None
         os.read(self._process.stdout.fileno(), 1 << 16)  # that it is ready: starting takes 0.1 s
+        os.set_blocking(self._process.stdout.fileno(), False)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -169,11 +170,9 @@ class Sender:
         assert self._process is not None
         file = self._process.stdout
         assert file is not None
-        while select.select([file], [], [], 0)[0]:
-            content = os.read(file.fileno(), 1 << 16)
-            if not content:
-                return
-            self._note_lines(content)
+        with suppress(BlockingIOError):
+            while content := os.read(file.fileno(), 1 << 16):
+                self._note_lines(content)
 
     def _note_lines(self, content: bytes) -> None:
         *lines, self._reported = (self._reported + content).split(b"\n")
@@ -209,10 +208,8 @@ class Sender:
 def _close(file: IO[bytes] | None) -> None:
     """Close a pipe, whose buffered bytes have no reader any more."""
     assert file is not None
-    try:
+    with suppress(BrokenPipeError):
         file.close()
-    except BrokenPipeError:
-        return
 
 
 def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
