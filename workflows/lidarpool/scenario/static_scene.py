@@ -235,7 +235,7 @@ class Shapes:
             return self._still_robot(entry, transform)
         objects = load_objects(
             scenario.path(entry.file),
-            **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
+            **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window", "sag_m"}),
             transform=transform,
             colours=scenario.coloured,
             materials=scenario.names_materials,

@@ -50,6 +50,8 @@ class MeshFormat:
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
         Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
+    curved
+        Whether files have curves, whose reader takes `ReadOptions.sag_m`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -62,6 +64,7 @@ class MeshFormat:
     signatures: tuple[bytes, ...] = ()
     from_path: bool = False
     raster: bool = False
+    curved: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -151,10 +154,6 @@ _NOT_READ = (
         (".xml",),
         advice=f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
         "scenario names floating car data of SUMO",
-    ),
-    MeshFormat(
-        (".xodr",),
-        advice="it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
     ),
 )
 

@@ -8,9 +8,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
@@ -98,6 +99,7 @@ def load_objects(
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
+    sag_m: Annotated[float, Field(gt=0, le=1)] | None = None,
     assets: str | Path | None = None,
     animation: str | None = None,
     tell: Callable[[str], None] = warn,
@@ -122,6 +124,9 @@ def load_objects(
     epsg
         Code of the coordinate system to which a raster is transformed, in metres. None keeps the
         system of the file if it is in metres, else takes the UTM zone of the raster's middle.
+    sag_m
+        Of roads (.xodr): largest distance of triangles from curves in plan, metres, above 0 to 1;
+        heights are ten times as exact. None takes 0.01.
     animation
         Name of the animation to play by the meshes, or the number of an animation without a name;
         "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
@@ -148,6 +153,11 @@ def load_objects(
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
     raster = RasterOptions(unit, step_m, window, epsg)
     _check_options(path, row, raster, up_axis, animation)
+    if sag_m is not None and not row.curved:
+        raise LidarError(
+            f"{path} has no curves that are read: leave out sag_m, or give a file of roads "
+            f"({' '.join(endings(lambda row: row.curved))})."
+        )
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     folders = [path.parent] if assets is None else [path.parent, Path(assets)]
@@ -158,6 +168,7 @@ def load_objects(
         animation=animation,
         materials=materials,
         raster=raster,
+        sag_m=sag_m,
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):

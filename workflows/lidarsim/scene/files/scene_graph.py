@@ -75,6 +75,7 @@ class ReadOptions(NamedTuple):
     animation: str | None = None  # name of the animation to bake; "" for the first
     materials: bool = False  # names of the materials of faces
     raster: RasterOptions = RasterOptions()
+    sag_m: float | None = None  # tolerance of triangles along curves; None for the reader's
 
     def allows(self, file: Path) -> bool:
         """Return True if a file that the mesh file names may be read."""
