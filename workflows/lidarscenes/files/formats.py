@@ -31,6 +31,6 @@ MESH_FORMATS = (
         from_path=True,
         raster=True,
     ),
-    MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", curved=True),
+    MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

@@ -43,7 +43,8 @@ Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
 
 def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the roads of a file: lanes, marks, objects and signals."""
-    root = xml_root(data)
+    # A comment before the declaration is not XML, and common.
+    root = xml_root(data[max(data.find(b"<?xml"), 0) :])
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":

@@ -209,7 +209,7 @@ class PlanTable:
         distances = np.append(0, np.add.accumulate(lengths))
         if not (0 < distances[-1] < np.inf and speeds.min() > _MIN_SPEED * speeds.max()):
             raise MeshFileError(f"has a <{shape.tag}> that has no length or stops: correct it")
-        if shape.tag == "paramPoly3":  # the end of its parameters is the end of its length
+        if is_normalized:  # the end of the parameters is the end of the length
             distances = distances * (length / distances[-1])
         self._cubics.append(_Cubic(start, x, y, cosine, sine, distances, parameters, u, v))
         bends = np.abs(du * _bend(v, parameters) - dv * _bend(u, parameters)) / speeds**3
@@ -233,9 +233,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
     table = np.array([piece])
     heading = piece.heading + (piece.curvature + piece.growth / 2 * step) * step
     steps = step * _NODES
-    sines, cosines = sin_cos(
-        table[0, 3] + (piece.curvature + piece.growth / 2 * steps) * steps
-    )
+    sines, cosines = sin_cos(table[0, 3] + (piece.curvature + piece.growth / 2 * steps) * steps)
     x = piece.x + step * sum((cosines * _WEIGHTS).tolist())
     y = piece.y + step * sum((sines * _WEIGHTS).tolist())
     return _Clothoid(piece.start + step, x, y, heading, curvature, piece.growth)
@@ -272,5 +270,3 @@ def _bend(coefficients: Floats, p: Floats) -> Floats:
     """Return the second derivatives of a cubic at parameters."""
     _, _, c, d = coefficients
     return np.asarray(2 * c + 6 * d * p)
-
-

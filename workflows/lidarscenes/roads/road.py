@@ -62,7 +62,9 @@ class Road:
         self.name = (element.get("id") or "")[:MAX_SHOWN]
         self.length = positive(element, "length")
         if self.length > MAX_ROAD_M:
-            raise MeshFileError(f"has a road {self.name!r} of {self.length:g} m: correct its length")
+            raise MeshFileError(
+                f"has a road {self.name!r} of {self.length:g} m: correct its length"
+            )
         self.offset = 0.0  # of the road in the table of reference lines, m
         self.geometry_starts = np.zeros(0)  # (g,), of pieces of geometry, m
         self.elevation = Cubics.read(element.iterfind("elevationProfile/elevation"))

@@ -104,7 +104,9 @@ def _knots_of(line: _Line, stations: Floats, border: Floats) -> _Knots:
         knots = np.append(rows, rows[-1])
         last = np.append(np.zeros(len(rows)), 1.0)
         following = middle[knots + 1]
-        return _Knots(stations, knots, last, middle[knots], following, line.width, rows, line.colour)
+        return _Knots(
+            stations, knots, last, middle[knots], following, line.width, rows, line.colour
+        )
     distances = np.sort(np.concatenate([line.starts, line.stops, stations]))
     distances = distances[np.append(True, np.diff(distances) > 0)]
     middles = (distances[1:] + distances[:-1]) / 2
@@ -195,9 +197,7 @@ def _lines_of_mark(
     ]
 
 
-def _explicit_line(
-    line: Element, start: float, stop: float, width: float, colour: str
-) -> _Line:
+def _explicit_line(line: Element, start: float, stop: float, width: float, colour: str) -> _Line:
     """Return a single line of a mark."""
     first = start + number(line, "sOffset", 0.0)
     last = min(first + positive(line, "length", 0.0), stop)

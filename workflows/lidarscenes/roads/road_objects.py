@@ -122,9 +122,7 @@ class ObjectBuilder(NamedTuple):
             share = min(1.0, k * distance / span) if span > 0 else 0.0
             yield base.repeated(repeat, share, number(repeat, "s") + k * distance)
 
-    def _continuous(
-        self, road: Road, element: Element, repeat: Element, kind: str
-    ) -> Piece | None:
+    def _continuous(self, road: Road, element: Element, repeat: Element, kind: str) -> Piece | None:
         """Return an object that is drawn along a road, such as a guard rail; None without size."""
         start = number(repeat, "s")
         stop = min(start + positive(repeat, "length", 0.0), road.length)
@@ -336,9 +334,7 @@ class _Outline(NamedTuple):
     outer: bool
 
     @classmethod
-    def of(
-        cls, network: Network, road: Road, element: Element, frame: _ObjectFrame
-    ) -> _Outline:
+    def of(cls, network: Network, road: Road, element: Element, frame: _ObjectFrame) -> _Outline:
         """Return the outline of an <outline>."""
         points = []
         heights = []

@@ -139,8 +139,11 @@ def _hangs(road: Road, sections: Sequence[LaneSection], element: Element) -> boo
         return False
     borders = {key: float(v[0]) for key, v in section.borders(road, np.array([s])).items()}
     for lane in section.all_lanes:
-        inner = max((k for k in borders if abs(k) < abs(lane.number) and k * lane.number >= 0),
-                    key=abs, default=0)
+        inner = max(
+            (k for k in borders if abs(k) < abs(lane.number) and k * lane.number >= 0),
+            key=abs,
+            default=0,
+        )
         lower, upper = sorted((borders[inner], borders[lane.number]))
         if lane.type in _CARRIAGEWAY and lower < t < upper:
             return True

@@ -50,8 +50,8 @@ class MeshFormat:
         Whether the reader opens the path itself: it gets the first bytes of the file only.
     raster
         Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
-    curved
-        Whether files have curves, whose reader takes `ReadOptions.sag_m`.
+    roads
+        Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -64,7 +64,7 @@ class MeshFormat:
     signatures: tuple[bytes, ...] = ()
     from_path: bool = False
     raster: bool = False
-    curved: bool = False
+    roads: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property

@@ -153,10 +153,10 @@ def load_objects(
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
     raster = RasterOptions(unit, step_m, window, epsg)
     _check_options(path, row, raster, up_axis, animation)
-    if sag_m is not None and not row.curved:
+    if sag_m is not None and not row.roads:
         raise LidarError(
             f"{path} has no curves that are read: leave out sag_m, or give a file of roads "
-            f"({' '.join(endings(lambda row: row.curved))})."
+            f"({' '.join(endings(lambda row: row.roads))})."
         )
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
