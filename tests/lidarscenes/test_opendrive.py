@@ -214,11 +214,6 @@ def heights_below(mesh, points):
     return heights
 
 
-def middle(mesh, stations=2):
-    """Return the mean of the vertices."""
-    return mesh.vertices.mean(axis=0)
-
-
 def test_middles_of_lanes_are_those_of_carla(tmp_path):
     meshes = load(tmp_path, network())
     rows = carla_rows()
@@ -270,7 +265,10 @@ def profile(*elements):
 @pytest.mark.parametrize(
     ("inside", "expected"),
     [
-        ('<superelevation s="0" a="0.1" b="0" c="0" d="0"/>', (0, -4 * np.cos(0.1), -4 * np.sin(0.1))),
+        (
+            '<superelevation s="0" a="0.1" b="0" c="0" d="0"/>',
+            (0, -4 * np.cos(0.1), -4 * np.sin(0.1)),
+        ),
         ('<crossfall side="right" s="0" a="0.02" b="0" c="0" d="0"/>', (0, -4, -4 * np.tan(0.02))),
         ('<crossfall side="left" s="0" a="0.02" b="0" c="0" d="0"/>', (0, -4, 0)),
         (
@@ -333,7 +331,8 @@ def test_lanes_that_end_have_no_empty_triangles(tmp_path):
 
 
 def mark(inside="", kind="solid", colour="white", metres=0.2, s=0):
-    return f'<roadMark sOffset="{s}" type="{kind}" color="{colour}" width="{metres}">{inside}</roadMark>'
+    head = f'<roadMark sOffset="{s}" type="{kind}" color="{colour}" width="{metres}">'
+    return f"{head}{inside}</roadMark>"
 
 
 def painted(mesh):
@@ -477,18 +476,19 @@ def test_crosswalks_have_stripes(tmp_path):
         *(f's="{s}" t="{t}" dz="0"' for s, t in ((20, -4), (23, -4), (23, 4), (20, 4))),
     )
     crossing = load(tmp_path, document(road(more=thing("crosswalk", "", outline))), materials=True)
-    size, extent = painted(crossing["crosswalk 1/7"])
+    size, _ = painted(crossing["crosswalk 1/7"])
     assert size == pytest.approx(3 * 8 / 2)
     assert crossing["crosswalk 1/7"].materials.names == ("paint white",)
     marking = (
-        '<markings><marking width="0.5" color="yellow" lineLength="0.5" spaceLength="1.5" startOffset="1" '
+        '<markings><marking width="0.5" color="yellow" lineLength="0.5" spaceLength="1.5" '
+        'startOffset="1" '
         'stopOffset="0"><cornerReference id="0"/><cornerReference id="1"/></marking></markings>'
     )
     line = corners("cornerRoad", 's="20" t="-4" dz="0" id="0"', 's="20" t="4" dz="0" id="1"')
     crossing = load(
         tmp_path, document(road(more=thing("crosswalk", "", line + marking))), materials=True
     )
-    size, extent = painted(crossing["crosswalk 1/7"])
+    size, _ = painted(crossing["crosswalk 1/7"])
     assert size == pytest.approx(4 * 0.25)
     assert crossing["crosswalk 1/7"].materials.names == ("paint yellow",)
 
@@ -506,9 +506,10 @@ def test_classes_and_materials(tmp_path):
     }
     built = build(Scenario.from_data(scenario, folder=tmp_path))
     assert built.survey.classes == {11: "road surface", 64: "road mark", 65: "sidewalk"}
-    names = [built.scene.names[k] for k in range(3)]
-    assert names == ["driving lane 1/-1", "sidewalk lane 1/-2", "road mark 1"]
-    assert built.scene.material_names == ("asphalt", "concrete", "paint white")
+    assert {*built.scene.names} == {"driving lane 1/-1", "sidewalk lane 1/-2", "road mark 1"}
+    assert {*built.scene.material_names} == {"asphalt", "concrete", "paint white"}
+    heights = [pose.position[2] for pose in built.survey.poses]
+    np.testing.assert_allclose(heights, [1, 2, 3], atol=0.01)  # above a road
 
 
 @pytest.mark.parametrize(
@@ -537,6 +538,10 @@ def test_unknown_elements_are_named_once(tmp_path):
     assert [note.partition(" is read ")[2] for note in notes] == ["without 1 railroad, 2 bridge"]
 
 
+TINY_DASHES = mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken")
+ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -546,14 +551,17 @@ def test_unknown_elements_are_named_once(tmp_path):
         (document(road(length="nan")), "length 'nan', not a number"),
         (document(road(length="1e300")), "a road '1' of 1e\\+300 m"),
         (document(road(shape="<circle/>")), "a <geometry> of circle"),
-        (document(road()).replace('length="100"', 'length="2000"', 1), "of 2,000 m, whose geometry ends at 100 m"),
-        (document(road()).replace("<planView>", "<view>").replace("</planView>", "</view>"), "without geometry"),
+        (
+            document(road()).replace('length="100"', 'length="2000"', 1),
+            "of 2,000 m, whose geometry ends at 100 m",
+        ),
+        (document(road()).replace("planView", "view"), "without geometry"),
         (document(road(shape='<arc curvature="1e99"/>')), "would unpack to"),
         (document(road(shape='<paramPoly3 pRange="normalized"/>')), "has no length"),
-        (document(road(section(right=lane(-1, width(4) + mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken"))))), "would unpack to"),
+        (document(road(section(right=lane(-1, width(4) + TINY_DASHES)))), "would unpack to"),
         (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes of the same id"),
         (document(road(section(right=lane(-1)))), "no triangles"),
-        ('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><OpenDRIVE/>', "declares an XML entity"),
+        (ENTITY + "<OpenDRIVE/>", "declares an XML entity"),
         (document(road())[:-30], "is broken or cut short"),
     ],
 )  # fmt: skip

@@ -257,8 +257,9 @@ def _carrier_track(scenario: Scenario, standing: StandingSurfaces) -> Track | No
 def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
     """Choose poses for a scenario of mesh files that gives neither poses nor a trajectory.
 
-    Scenes with rasters or networks of roads are landscapes. If the scenario states no field of the sensor, and the scene
-    looks like a single object, the sensor becomes a grid as wide as the object.
+    Scenes with rasters or networks of roads are landscapes. If the scenario states no field of the
+    sensor, and the scene looks like a single object, the sensor becomes a grid as wide as the
+    object.
     """
     is_unmounted = scenario.mount is None and not scenario.sensors
     return place_sensor(

@@ -22,6 +22,7 @@ from lidarsim.scene.files.scene_graph import (
     ReadOptions,
     join_pieces,
 )
+from lidarsim.scene.scene_mesh import SceneMesh
 
 from .elements import UnreadElements, number
 from .lanes import Lane, SectionSurface, lane_sections
@@ -77,7 +78,7 @@ class _RoadReader:
         self._pieces: Pieces = defaultdict(list)
         self._sag_m = options.sag_m or SAG_M
 
-    def meshes(self, network: Network) -> list:
+    def meshes(self, network: Network) -> list[SceneMesh]:
         """Return the meshes of all objects."""
         sections_of_roads = [lane_sections(road, self._unread) for road in network.roads]
         sections = [
@@ -138,22 +139,23 @@ class _RoadReader:
             return
         a, b, c = np.concatenate(corners).reshape(3, -1, 3)
         areas = np.cross(b - a, c - a)
-        has_area = areas.any(axis=1)
+        has_area = np.asarray(areas.any(axis=1))
         if has_area.all():
             return
         stop = 0
         for name, object_pieces in self._pieces.items():
-            kept = []
+            remaining = []
             for piece in object_pieces:
                 start = stop
                 stop += len(piece.faces)
                 mask = has_area[start:stop]
                 if mask.all():
-                    kept.append(piece)
+                    remaining.append(piece)
                 elif mask.any():
-                    colours = piece.colours and piece.colours.take(np.flatnonzero(mask))
-                    kept.append(piece._replace(faces=piece.faces[mask], colours=colours))
-            self._pieces[name] = kept
+                    rows = np.flatnonzero(mask)
+                    colours = None if piece.colours is None else piece.colours.take(rows)
+                    remaining.append(piece._replace(faces=piece.faces[rows], colours=colours))
+            self._pieces[name] = remaining
 
 
 def _material(lane: Lane) -> str:

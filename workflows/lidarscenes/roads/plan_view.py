@@ -190,34 +190,26 @@ class PlanTable:
 
     def _add_cubic(self, geometry: Element, shape: Element, start: float, length: float) -> None:
         """Add a geometry of a cubic."""
-        x, y, heading = _origin(geometry)
-        sine, cosine = (float(value) for value in sin_cos(heading))
-        if shape.tag == "poly3":
-            u = np.array([0.0, 1.0, 0.0, 0.0])
-            v = np.array([number(shape, name, 0.0) for name in "abcd"])
-        else:
-            u = np.array([number(shape, f"{name}U", 0.0) for name in "abcd"])
-            v = np.array([number(shape, f"{name}V", 0.0) for name in "abcd"])
-        is_normalized = shape.get("pRange") == "normalized" or (
-            shape.tag == "paramPoly3" and shape.get("pRange") is None
-        )
-        parameters = np.linspace(0, 1.0 if is_normalized else length, 1 + _CUBIC_SAMPLES * 16)
-        du = _slope(u, parameters)
-        dv = _slope(v, parameters)
-        speeds = hypot(du, dv)
+        u, v = _coefficients(shape)
+        # Without pRange, parameters are normalized (ASAM OpenDRIVE 1.4 to 1.8).
+        is_normalized = shape.tag == "paramPoly3" and shape.get("pRange") != "arcLength"
+        count = 1 + _CUBIC_SAMPLES * _CUBIC_PIECES
+        parameters = np.linspace(0, 1.0 if is_normalized else length, count)
+        speeds = hypot(_slope(u, parameters), _slope(v, parameters))
         lengths = np.diff(parameters) * (speeds[1:] + speeds[:-1]) / 2
         distances = np.append(0, np.add.accumulate(lengths))
         if not (0 < distances[-1] < np.inf and speeds.min() > _MIN_SPEED * speeds.max()):
             raise MeshFileError(f"has a <{shape.tag}> that has no length or stops: correct it")
         if is_normalized:  # the end of the parameters is the end of the length
             distances = distances * (length / distances[-1])
+        x, y, heading = _origin(geometry)
+        sine, cosine = (float(value) for value in sin_cos(heading))
         self._cubics.append(_Cubic(start, x, y, cosine, sine, distances, parameters, u, v))
-        bends = np.abs(du * _bend(v, parameters) - dv * _bend(u, parameters)) / speeds**3
-        step = len(parameters) // _CUBIC_PIECES
-        for k in range(_CUBIC_PIECES):
-            samples = slice(k * step, (k + 1) * step + 1)
-            piece_start = start + float(distances[k * step])
-            self._bends.append((piece_start, float(bends[samples].max())))
+        bends = _curvatures(u, v, parameters)
+        for first in range(0, count - 1, _CUBIC_SAMPLES):
+            if distances[first] < length:
+                bend = float(bends[first : first + _CUBIC_SAMPLES + 1].max())
+                self._bends.append((start + float(distances[first]), bend))
 
 
 _SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
@@ -252,6 +244,24 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
     x = cubic.x + u * cubic.cosine - v * cubic.sine + beyond * cosines
     y = cubic.y + u * cubic.sine + v * cubic.cosine + beyond * sines
     return PlanPoints(x, y, cosines, sines)
+
+
+def _coefficients(shape: Element) -> tuple[Floats, Floats]:
+    """Return the coefficients (4,) of a cubic along the heading, and to the left."""
+    if shape.tag == "poly3":
+        u = [0.0, 1.0, 0.0, 0.0]
+        v = [number(shape, name, 0.0) for name in "abcd"]
+    else:
+        u = [number(shape, f"{name}U", 0.0) for name in "abcd"]
+        v = [number(shape, f"{name}V", 0.0) for name in "abcd"]
+    return np.array(u), np.array(v)
+
+
+def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
+    """Return the curvatures of a cubic at parameters, without sign, 1/m."""
+    du = _slope(u, p)
+    dv = _slope(v, p)
+    return np.abs(du * _bend(v, p) - dv * _bend(u, p)) / hypot(du, dv) ** 3
 
 
 def _value(coefficients: Floats, p: Floats) -> Floats:

@@ -58,29 +58,38 @@ def painted_quads(
     """Return the road marks of a lane section, by colours."""
     section = surface.section
     lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
-    knots: list[_Knots] = []
-    for lane in lanes:
-        for line in _lines_of(lane, section.start, section.stop, allowance, unread):
-            knots.append(_knots_of(line, section.stations, surface.borders[lane.number]))
+    knots = [
+        _knots_of(line, section.stations, surface.borders[lane.number])
+        for lane in lanes
+        for line in _lines_of(lane, section.start, section.stop, allowance, unread)
+    ]
     knots = [entry for entry in knots if len(entry.quads)]
     if not knots:
         return []
     points = _points_of(surface, knots)
-    groups: dict[str, list[tuple[int, _Knots]]] = {}
+    rows_of_colours: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
     offset = 0
     for entry in knots:
-        groups.setdefault(entry.colour, []).append((offset, entry))
+        rows_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
         offset += len(entry.distances)
-    right = np.arange(offset)
-    left = right + offset
-    quads_of_colours = []
-    for colour, entries in groups.items():
-        rows = np.concatenate([start + entry.quads for start, entry in entries])
-        corners = (right[rows], right[rows + 1], left[rows + 1], left[rows])
-        a, b, c, d = corners
-        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-        quads_of_colours.append(PaintedQuads(colour, points, faces))
-    return quads_of_colours
+    return [
+        PaintedQuads(colour, points, _quads(np.concatenate(rows), offset))
+        for colour, rows in rows_of_colours.items()
+    ]
+
+
+def _quads(rows: Ints, count: int) -> Ints:
+    """Return triangles (f, 3) between cross sections and the following.
+
+    `rows` are the cross sections' right points; their left points follow after `count`.
+    """
+    left = rows + count
+    return np.concatenate(
+        [
+            np.stack([rows, rows + 1, left + 1], axis=1),
+            np.stack([rows, left + 1, left], axis=1),
+        ]
+    )
 
 
 class _Knots(NamedTuple):
@@ -239,7 +248,8 @@ def _dashes(
     allowance.take(int(min(count, 1e15)) * _BYTES_PER_DASH)
     starts = start + (length + space) * np.arange(int(count) + 1)
     starts = starts[starts < stop]
-    return starts, np.minimum(starts + length, stop)
+    stops: Floats = np.minimum(starts + length, stop)
+    return starts, stops
 
 
 def _colour(element: Element, default: str) -> str:

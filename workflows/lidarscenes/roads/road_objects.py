@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
@@ -64,9 +65,9 @@ class ObjectBuilder(NamedTuple):
         count = 0
         for repeat in repeats:
             if positive(repeat, "distance", 0.0) == 0 and not _outlines(element):
-                piece = self._continuous(road, element, repeat, kind)
-                if piece is not None:
-                    yield name, piece
+                strip = self._continuous(road, element, repeat, kind)
+                if strip is not None:
+                    yield name, strip
                 continue
             for placement in self._copies(element, repeat):
                 count += 1
@@ -82,33 +83,23 @@ class ObjectBuilder(NamedTuple):
         outlines = [
             _Outline.of(self.network, road, outline, frame) for outline in _outlines(element)
         ]
-        is_flat = all(not outline.heights.any() for outline in outlines)
         painted = [*self._markings(element, frame, placement, outlines)]
         yield from painted
-        if outlines:
-            if kind in _FLAT and is_flat:
-                if kind == "crosswalk" and not painted:
-                    for outline in outlines:
-                        yield zebra(outline.corners + [0, 0, LIFT_M], STRIPE_M, f"{PAINT} white")
-                elif kind == "roadMark" and not painted:
-                    yield _roof(outlines, _paint_of(element))
-            else:
-                yield _roof(outlines, material)
-            return
         size = placement.size
-        if placement.radius > 0 and placement.height > 0:
+        if kind in _FLAT and not (outlines and any(outline.heights.any() for outline in outlines)):
+            if not painted and (outlines or (min(size[:2]) > 0 and size[2] <= 0)):
+                yield from _flat_pieces(element, kind, frame, placement, outlines)
+            elif not outlines and size[2] > 0 and kind != "parkingSpace":
+                yield box(size, frame.origin, frame.turn, material)
+        elif outlines:
+            yield _roof(outlines, material)
+        elif placement.radius > 0 and placement.height > 0:
             yield cylinder(
                 placement.radius, placement.height, frame.origin, frame.turn, material, self.sag_m
             )
-        elif max(size[:2]) > 0 and placement.height > 0 and kind != "parkingSpace":
+        elif max(size[:2]) > 0 and placement.height > 0:
             yield box(size, frame.origin, frame.turn, material)
-        elif min(size[:2]) > 0 and kind in ("crosswalk", "roadMark") and not painted:
-            corners = placed(_rectangle(size), frame.origin + [0, 0, LIFT_M], frame.turn)
-            if kind == "crosswalk":
-                yield zebra(corners, STRIPE_M, f"{PAINT} white")
-            else:
-                yield prism([corners], [np.zeros(4)], True, _paint_of(element))
-        elif kind not in _FLAT:
+        else:
             self.unread.add("object without a size")
 
     def _copies(self, element: Element, repeat: Element) -> Iterator[_Placement]:
@@ -211,7 +202,7 @@ class ObjectBuilder(NamedTuple):
         space = positive(marking, "spaceLength", 0.0)
         starts = []
         stops = []
-        for begin, end in zip(line[:-1], line[1:], strict=True):
+        for begin, end in pairwise(line):
             size = float(length(end - begin))
             first = positive(marking, "startOffset", 0.0)
             last = size - positive(marking, "stopOffset", 0.0)
@@ -394,6 +385,24 @@ def _roof(outlines: Sequence[_Outline], material: str) -> Piece:
         ),
         material=material,
     )
+
+
+def _flat_pieces(
+    element: Element,
+    kind: str,
+    frame: _ObjectFrame,
+    placement: _Placement,
+    outlines: Sequence[_Outline],
+) -> Iterator[Piece]:
+    """Yield the paint of an object without height: stripes, or the whole area of a mark."""
+    lift = np.array([0, 0, LIFT_M])
+    rings = [outline.corners for outline in outlines]
+    rings = rings or [placed(_rectangle(placement.size), frame.origin, frame.turn)]
+    for ring in rings:
+        if kind == "crosswalk":
+            yield zebra(ring + lift, STRIPE_M, f"{PAINT} white")
+        elif kind == "roadMark":
+            yield prism([ring + lift], [np.zeros(len(ring))], True, _paint_of(element))
 
 
 def _rectangle(size: Sequence[float]) -> Floats:

@@ -55,7 +55,8 @@ def cylinder(
     count = int(np.clip(np.ceil(np.pi / np.sqrt(2 * sag_share)), MIN_SEGMENTS, MAX_SEGMENTS))
     sines, cosines = sin_cos(2 * np.pi * np.arange(count) / count)
     ring = np.stack([radius * cosines, radius * sines, np.zeros(count)], axis=1)
-    points = placed(np.concatenate([ring, ring + [0, 0, height]]), origin, turn)
+    up = np.array([0, 0, height])
+    points = placed(np.concatenate([ring, ring + up]), origin, turn)
     lower = np.arange(count)
     following = (lower + 1) % count
     walls = _walls(lower, following, count)

@@ -145,7 +145,7 @@ class Scene:
         assets: str | Path | None = None,
         same_names: SameNames = "number",
     ) -> Scene:
-        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, or a raster of heights (.tif).
+        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, or a raster (.tif).
 
         Parameters
         ----------
@@ -165,7 +165,8 @@ class Scene:
             .obj, .usd). With "ignore", triangles are solid, and no image is read.
         colours
             Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
-            and .xodr without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
+            and .xodr without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off,
+            .usd).
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
             CityJSON, .xodr), by which `Material` may choose them.
