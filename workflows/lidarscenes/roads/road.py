@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from operator import itemgetter
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import length
 from lidarsim.scene.files.scene_graph import MeshFileError
@@ -144,11 +145,19 @@ class LateralShapes:
     """Heights across a road: cubics of t at stations, between which heights are interpolated."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
-        groups: dict[float, list[Element]] = {}
+        groups: dict[float, list[list[float]]] = {}
         for element in elements:
-            groups.setdefault(number(element, "s"), []).append(element)
+            row = [number(element, name, 0.0) for name in ("t", *"abcd")]
+            groups.setdefault(number(element, "s"), []).append(row)
         self.stations: Floats = np.array(sorted(groups))  # (m,)
-        self._profiles = [Cubics.read(groups[s], "t") for s in self.stations.tolist()]
+        # Cubics of each station in ascending order; those that lack are never reached.
+        count = max(map(len, groups.values()))
+        table = np.zeros((len(groups), count, 5))
+        table[..., 0] = np.inf
+        for profile, s in zip(table, self.stations.tolist(), strict=True):
+            profile[: len(groups[s])] = sorted(groups[s], key=itemgetter(0))
+        self._starts: Floats = table[..., 0]  # (m, r), m
+        self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats) -> Floats:
         """Return heights at distances (k,) and t (..., k), m."""
@@ -157,14 +166,15 @@ class LateralShapes:
         following = np.minimum(rows + 1, last)
         gaps = np.maximum(self.stations[following] - self.stations[rows], 1e-9)
         share = np.clip((distances - self.stations[rows]) / gaps, 0, 1)
-        heights = np.empty_like(t)
-        for row in np.unique(rows).tolist():
-            mask = rows == row
-            t_here = t[..., mask]
-            lower = self._profiles[row].values(t_here)
-            upper = self._profiles[min(row + 1, last)].values(t_here)
-            heights[..., mask] = lower + share[mask] * (upper - lower)
-        return heights
+        lower = self._profiles(rows, t)
+        return np.asarray(lower + share * (self._profiles(following, t) - lower))
+
+    def _profiles(self, rows: Ints, t: Floats) -> Floats:
+        """Return the heights of the stations `rows` (k,) at t (..., k), m."""
+        pieces = np.maximum((self._starts[rows] <= t[..., None]).sum(axis=-1) - 1, 0)
+        a, b, c, d = self._coefficients[:, rows, pieces]
+        x = np.maximum(t - self._starts[rows, pieces], 0)
+        return np.asarray(((d * x + c) * x + b) * x + a)
 
 
 class Network:

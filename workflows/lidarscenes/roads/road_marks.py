@@ -248,8 +248,7 @@ def _dashes(
     allowance.take(int(min(count, 1e15)) * _BYTES_PER_DASH)
     starts = start + (length + space) * np.arange(int(count) + 1)
     starts = starts[starts < stop]
-    stops: Floats = np.minimum(starts + length, stop)
-    return starts, stops
+    return np.asarray(starts, np.float64), np.asarray(np.minimum(starts + length, stop))
 
 
 def _colour(element: Element, default: str) -> str:

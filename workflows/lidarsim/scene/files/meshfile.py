@@ -438,7 +438,8 @@ def _placed_object(
     """Return an object in the world, with a name that is safe for terminals and files."""
     name = printable(item.name) or printable(stem)
     for transform in transforms:
-        item = item.moved(name, transform.linear, transform.offset)
+        if name != item.name or not _keeps_places(transform):
+            item = item.moved(name, transform.linear, transform.offset)
     reach = np.abs(_corners(item)).max()
     if reach > MAX_COORDINATE_M:
         raise LidarError(
@@ -446,6 +447,11 @@ def _placed_object(
             "on Earth: check its unit and placement."
         )
     return item
+
+
+def _keeps_places(transform: Transform) -> bool:
+    """Return True if a transform moves nothing: files of many objects are read sooner."""
+    return np.array_equal(transform.linear, np.eye(3)) and not transform.offset.any()
 
 
 def _actor_of_part(part: RigidPart, stem: str, upright: Transform, placement: Transform) -> Actor:
