@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 
 import numpy as np
 import pytest
@@ -323,6 +324,14 @@ def test_borders_and_lane_offsets(tmp_path):
     assert sorted(corners) == [[0, -4], [0, -2], [100, -4], [100, -3]]
 
 
+def test_driving_lanes_are_on_top_in_junctions(tmp_path):
+    lanes = lane(-1, width(4)) + lane(-2, width(4), "sidewalk") + lane(-3, width(4), "none")
+    text = document(road(section(right=lanes))).replace('junction="-1"', 'junction="5"')
+    meshes = load(tmp_path, text)
+    heights = {name.split()[0]: mesh.vertices[:, 2].max() for name, mesh in meshes.items()}
+    assert heights == {"driving": 0, "sidewalk": -0.002, "none": -0.005}
+
+
 def test_lanes_that_end_have_no_empty_triangles(tmp_path):
     lanes = lane(-1, '<width sOffset="0" a="2" b="-0.02" c="0" d="0"/>') + lane(-2, width(0))
     meshes = load(tmp_path, document(road(section(right=lanes))))
@@ -573,6 +582,21 @@ def test_broken_files(tmp_path, text, message):
 
 def test_a_comment_before_the_declaration(tmp_path):
     assert load(tmp_path, "<!-- licence -->\n" + document(road()))
+
+
+def test_replaced_numbers_are_read_or_refused(tmp_path):
+    lanes = section(lane(1, WIDTHS + mark(kind="broken")), lane(-1, width(3) + mark()))
+    text = document(road(lanes, more=thing("pole", 'radius="0.5" height="3"')))
+    spans = [match.span(1) for match in re.finditer(r'"([-\d.]+)"', text)]
+    values = ("", "x", "nan", "-1", "0", "1e-12", "1e6", "1e300")
+    refused = 0
+    for k, (start, stop) in enumerate(spans):
+        try:
+            load(tmp_path, text[:start] + values[k % len(values)] + text[stop:])
+        except LidarError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert 0.1 < refused / len(spans) < 0.8
 
 
 def test_garbled_files_are_read_or_refused(tmp_path):

@@ -81,6 +81,12 @@ _SURFACES = {
     "soil": EARTH,
 }
 
+# Types of lanes on which vehicles drive.
+CARRIAGEWAY = (
+    "driving", "bidirectional", "bus", "taxi", "HOV", "entry", "exit", "mwyEntry", "mwyExit",
+    "onRamp", "offRamp", "connectingRamp", "slipLane", "shared", "stop",
+)  # fmt: skip
+
 # Class 1 is for types that have no class in ASPRS LAS; 64 and above are free for users.
 CLASSES = {
     1: ObjectClass("unclassified", ("obstacle *", "object *", "patch *", "wind *")),

@@ -26,13 +26,17 @@ from lidarsim.scene.scene_mesh import SceneMesh
 
 from .elements import UnreadElements, number
 from .lanes import Lane, SectionSurface, lane_sections
-from .materials import CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
+from .materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
 from .road import Network, Road
 from .road_marks import painted_quads
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
 SAG_M = 0.01  # tolerance of curves in plan unless the reader gets another
+# Roads of a junction lie on each other. These lanes are lower by metres, so that lanes on which
+# vehicles drive are hit.
+_SINK_OF_NONE_M = 0.005
+_SINK_M = 0.002
 _SMALLER = "give a larger sag_m, or divide the file"
 _KNOWN = ("header", "road", "junction", "junctionGroup", "controller", "station")
 _KNOWN_OF_JUNCTIONS = ("connection", "priority", "controller", "surface", "crossPath")
@@ -115,7 +119,11 @@ class _RoadReader:
         for strip in (*surface.strips, *surface.kerbs):
             lane = strip.lane
             material = CONCRETE if strip.is_kerb else _material(lane)
-            piece = Piece(strip.points.reshape(-1, 3), strip.faces, material=material)
+            points = strip.points.reshape(-1, 3)
+            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_kerb:
+                sink_m = _SINK_OF_NONE_M if lane.type == "none" else _SINK_M
+                points = points - np.array([0, 0, sink_m])
+            piece = Piece(points, strip.faces, material=material)
             self._add(f"{lane.type} lane {road.name}/{lane.number}", piece)
         for quads in painted_quads(surface, self._allowance, self._unread):
             piece = Piece(quads.points, quads.faces, material=f"{PAINT} {quads.colour}")

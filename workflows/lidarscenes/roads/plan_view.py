@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.elementary import interp, sin_cos
+from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import hypot
 from lidarsim.scene.files.scene_graph import MeshFileError
 
@@ -234,7 +234,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
 def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
     """Return points of a cubic at distances (k,) of the table."""
     along = distances - cubic.start
-    parameters = interp(along, cubic.distances, cubic.parameters)
+    parameters = _parameters(cubic, along)
     u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
     du, dv = (_slope(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
     speed = hypot(du, dv)
@@ -244,6 +244,16 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
     x = cubic.x + u * cubic.cosine - v * cubic.sine + beyond * cosines
     y = cubic.y + u * cubic.sine + v * cubic.cosine + beyond * sines
     return PlanPoints(x, y, cosines, sines)
+
+
+def _parameters(cubic: _Cubic, along: Floats) -> Floats:
+    """Return the parameters of a cubic at distances (k,) from its start; its end beyond."""
+    rows = np.searchsorted(cubic.distances, along, "right") - 1
+    rows = np.clip(rows, 0, len(cubic.distances) - 2)
+    gaps = cubic.distances[rows + 1] - cubic.distances[rows]
+    share = np.clip((along - cubic.distances[rows]) / gaps, 0, 1)
+    steps = cubic.parameters[rows + 1] - cubic.parameters[rows]
+    return np.asarray(cubic.parameters[rows] + share * steps)
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:

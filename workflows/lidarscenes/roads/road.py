@@ -66,6 +66,7 @@ class Road:
             raise MeshFileError(
                 f"has a road {self.name!r} of {self.length:g} m: correct its length"
             )
+        self.in_junction = (element.get("junction") or "-1") != "-1"
         self.offset = 0.0  # of the road in the table of reference lines, m
         self.geometry_starts = np.zeros(0)  # (g,), of pieces of geometry, m
         self.elevation = Cubics.read(element.iterfind("elevationProfile/elevation"))

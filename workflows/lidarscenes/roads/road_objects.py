@@ -25,6 +25,7 @@ from .solids import box, cylinder, extruded, painted_strips, placed, prism, rota
 TUNNEL_HEIGHT_M = 5.0
 TUNNEL_MARGIN_M = 0.5  # from the outermost lanes to the walls
 STRIPE_M = 0.5  # stripes and gaps of crosswalks that state no markings
+UNTYPED = "object"  # name of objects without a type, whose flat outlines may be lines or decals
 _FLAT = ("crosswalk", "roadMark", "parkingSpace")  # types that are paint if they have no height
 _BYTES_PER_COPY = 4000
 _KNOWN_OBJECTS = ("object", "objectReference", "tunnel")
@@ -55,7 +56,7 @@ class ObjectBuilder(NamedTuple):
         """Yield the names and triangles of an object and of its copies."""
         kind = element.get("type")
         if kind in (None, "", "none", "-1"):
-            kind = "object"
+            kind = UNTYPED
         name = f"{kind[:MAX_SHOWN]} {road.name}/{(element.get('id') or '')[:MAX_SHOWN]}"
         repeats = element.findall("repeat")
         if not repeats:
@@ -86,18 +87,19 @@ class ObjectBuilder(NamedTuple):
         painted = [*self._markings(element, frame, placement, outlines)]
         yield from painted
         size = placement.size
-        if kind in _FLAT and not (outlines and any(outline.heights.any() for outline in outlines)):
+        has_walls = any(outline.heights.any() for outline in outlines)
+        if kind in _FLAT and not has_walls:
             if not painted and (outlines or (min(size[:2]) > 0 and size[2] <= 0)):
                 yield from _flat_pieces(element, kind, frame, placement, outlines)
             elif not outlines and size[2] > 0 and kind != "parkingSpace":
                 yield box(size, frame.origin, frame.turn, material)
-        elif outlines:
+        elif has_walls or (outlines and kind != UNTYPED):
             yield _roof(outlines, material)
         elif placement.radius > 0 and placement.height > 0:
             yield cylinder(
                 placement.radius, placement.height, frame.origin, frame.turn, material, self.sag_m
             )
-        elif max(size[:2]) > 0 and placement.height > 0:
+        elif not outlines and max(size[:2]) > 0 and placement.height > 0:
             yield box(size, frame.origin, frame.turn, material)
         else:
             self.unread.add("object without a size")

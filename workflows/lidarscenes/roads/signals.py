@@ -14,7 +14,7 @@ from lidarsim.scene.files.scene_graph import Piece
 
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .lanes import LaneSection
-from .materials import LAMP, METAL, SIGN
+from .materials import CARRIAGEWAY, LAMP, METAL, SIGN
 from .road import Network, Road
 from .solids import FRONT_FACES, box, cylinder, rotation
 
@@ -34,8 +34,6 @@ _KNOWN = (
     "dependency", "reference", "semantics", "positionInertial", "positionRoad", "physicalPosition",
     "staticBoard", "vmsBoard",
 )  # fmt: skip
-# Lanes above which a signal hangs without a pole.
-_CARRIAGEWAY = ("driving", "bidirectional", "bus", "taxi", "HOV", "entry", "exit", "onRamp")
 
 
 class SignalBuilder(NamedTuple):
@@ -145,6 +143,6 @@ def _hangs(road: Road, sections: Sequence[LaneSection], element: Element) -> boo
             default=0,
         )
         lower, upper = sorted((borders[inner], borders[lane.number]))
-        if lane.type in _CARRIAGEWAY and lower < t < upper:
+        if lane.type in CARRIAGEWAY and lower < t < upper:
             return True
     return False
