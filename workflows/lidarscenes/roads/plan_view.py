@@ -271,7 +271,8 @@ def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
     """Return the curvatures of a cubic at parameters, without sign, 1/m."""
     du = _slope(u, p)
     dv = _slope(v, p)
-    return np.abs(du * _bend(v, p) - dv * _bend(u, p)) / hypot(du, dv) ** 3
+    speeds = hypot(du, dv)
+    return np.abs(du * _bend(v, p) - dv * _bend(u, p)) / (speeds * speeds * speeds)
 
 
 def _value(coefficients: Floats, p: Floats) -> Floats:
