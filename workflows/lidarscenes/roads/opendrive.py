@@ -1,6 +1,6 @@
 """OpenDRIVE files, .xodr, after ASAM OpenDRIVE 1.4 to 1.8.
 
-This is not libOpenDRIVE, which reads neither borders nor shapes and is not packaged for Python.
+This is not libOpenDRIVE, which reads neither borders of lanes nor lateral shapes.
 """
 
 from __future__ import annotations
