@@ -283,3 +283,11 @@ def test_the_sensor_stands_beside_buildings_or_around_them(tmp_path, ground, sid
         inside = [max(abs(x - at), abs(y)) < side and z < 16 for at in (0, 3 * side)]
         assert not any(inside)
         assert not ground or z in (2, 4, 6)
+
+
+def test_a_scene_without_buildings_has_default_poses(tmp_path):
+    flat = [[0, 0, 0], [60, 0, 0], [60, 60, 0], [0, 60, 0]]
+    road = thing(geometry("MultiSurface", [[[0, 1, 2, 3]]]), kind="Road")
+    write(tmp_path / "a.city.json", city({"a": road}, flat))
+    built = build(Scenario.from_data({"scene": {"files": ["a.city.json"]}}, folder=tmp_path))
+    assert [pose.position[2] for pose in built.survey.poses] == [1, 2, 3]

@@ -302,7 +302,8 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
 
 
 @pytest.mark.parametrize(
-    ("page", "package"), [("openusd", "pxr"), ("cityjson", "json"), ("terrain", "rasterio")]
+    ("page", "package"),
+    [("openusd", "pxr"), ("cityjson", "json"), ("roads", "json"), ("terrain", "rasterio")],
 )
 def test_a_scene_is_checked_as_shown(lidarpool, page, package):
     pytest.importorskip(package)
@@ -392,7 +393,13 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
     ("pages", "suffixes"),
     [
         (
-            ("how-to/meshes", "how-to/terrain", "how-to/cityjson", "how-to/openusd"),
+            (
+                "how-to/meshes",
+                "how-to/terrain",
+                "how-to/cityjson",
+                "how-to/openusd",
+                "how-to/roads",
+            ),
             endings(),
         ),
         (("how-to/terrain",), endings(lambda row: row.raster)),

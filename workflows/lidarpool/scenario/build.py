@@ -18,6 +18,7 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
 from lidarsim.sensor.materials import (
@@ -51,7 +52,7 @@ from .actor_motion import (
 from .ground import StandingSurfaces
 from .placing import Placing, place_sensor
 from .scenario import Scenario
-from .sections import CopiesSection, SensorSection
+from .sections import CopiesSection, MeshFile, SensorSection
 from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
@@ -68,6 +69,7 @@ SEED_KEEP_EVERY = 5
 
 # Class of buildings by ASPRS LAS: sensors are not placed inside objects of this class.
 BUILDING = 6
+ROAD_SURFACE = 11
 
 # Precision of points in scenes without the default objects, if no sensor states a resolution.
 MESH_PRECISION_M = 0.001
@@ -255,17 +257,25 @@ def _carrier_track(scenario: Scenario, standing: StandingSurfaces) -> Track | No
 def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
     """Choose poses for a scenario of mesh files that gives neither poses nor a trajectory.
 
-    Scenes with rasters are landscapes. If the scenario states no field of the sensor, and the scene
-    looks like a single object, the sensor becomes a grid as wide as the object.
+    Scenes with rasters or networks of roads are landscapes. If the scenario states no field of the
+    sensor, and the scene looks like a single object, the sensor becomes a grid as wide as the
+    object.
     """
     is_unmounted = scenario.mount is None and not scenario.sensors
     return place_sensor(
         scene,
         sensor,
-        landscape=bool(findings.rasters),
+        landscape=bool(findings.rasters) or any(map(_has_roads, scenario.scene.files)),
         buildings=findings.named(BUILDING),
+        roads=findings.named(ROAD_SURFACE),
         narrow=is_unmounted and not scenario.sensor.model_fields_set,
     )
+
+
+def _has_roads(entry: MeshFile) -> bool:
+    """Return True if a file is a network of roads."""
+    row = format_of(entry.file)
+    return row is not None and row.roads
 
 
 def _build_traffic(

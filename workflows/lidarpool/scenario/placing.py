@@ -63,6 +63,7 @@ def place_sensor(
     *,
     landscape: bool = False,
     buildings: Sequence[str] = (),
+    roads: Sequence[str] = (),
     narrow: bool = False,
 ) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
@@ -72,16 +73,20 @@ def place_sensor(
     height of a lower room. Around an object they are on four sides and above; with `narrow`, the
     sensor is a grid that is as wide as the object. Objects whose names fit a pattern of
     `buildings` are not entered: poses are on ground beside the buildings, or around all of them.
+    If a landscape has a hole in the middle, poses are on the nearest object that fits a pattern of
+    `roads`, or on the nearest ground.
     """
     lower_m, upper_m = scene.bounds + scene.origin
     middle = (lower_m + upper_m) / 2
     drawn = _draw_instances(scene, middle - scene.origin)
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
-        ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
+        ground_scene = _select_objects(drawn, roads) or drawn
+        ground = ground_scene.vertices[ground_scene.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
     standing = _poses_above_floor(drawn, middle)
     surroundings = None if landscape else _surroundings(drawn)
-    if buildings and len(heights_at(_select_objects(drawn, buildings), middle[0], middle[1])):
+    building_scene = _select_objects(drawn, buildings)
+    if building_scene and len(heights_at(building_scene, middle[0], middle[1])):
         standing = _poses_beside(drawn, middle, buildings)
         is_object = not standing
     else:
@@ -156,10 +161,14 @@ def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene:
-    """Return the triangles of the objects whose names fit a pattern."""
+def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
+    """Return the triangles of the objects whose names fit a pattern; None without any."""
+    if not patterns:
+        return None
     objects = np.concatenate([rows_named(pattern, scene.names) for pattern in patterns])
     selected = np.isin(scene.face_object, objects)
+    if not selected.any():
+        return None
     return replace(scene, faces=scene.faces[selected], face_object=scene.face_object[selected])
 
 
@@ -176,7 +185,7 @@ def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -
     surroundings = replace(
         scene, faces=scene.faces[in_reach], face_object=scene.face_object[in_reach]
     )
-    building_scene = _select_objects(surroundings, buildings) if buildings else None
+    building_scene = _select_objects(surroundings, buildings)
     for distance_m in _ASIDE_M:
         for angle in np.arange(8) * np.pi / 4:
             step = distance_m * np.array([np.cos(angle), np.sin(angle), 0.0])

@@ -84,9 +84,10 @@ class MeshFile(Section):
     file: Annotated[
         str,
         about(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
-            "AMAPVox (.vox), a world of Gazebo (.sdf), a robot that stands still (.urdf), or a "
-            "raster of heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
+            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), roads of "
+            "OpenDRIVE (.xodr), voxels of AMAPVox (.vox), a world of Gazebo (.sdf), a robot that "
+            "stands still (.urdf), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
+            "scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -117,6 +118,10 @@ class MeshFile(Section):
     window: Annotated[
         Rectangle | None,
         about("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
+    ] = None
+    sag_m: Annotated[
+        float | None,
+        about("of roads (.xodr): largest distance of triangles from curves, metres", gt=0, le=1),
     ] = None
     opacity: Annotated[
         OpacityMode,

@@ -33,5 +33,6 @@ MESH_FORMATS = (
         raster=True,
     ),
     MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
+    MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

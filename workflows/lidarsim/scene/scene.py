@@ -141,11 +141,12 @@ class Scene:
         step_m: float | None = None,
         window: Window | None = None,
         epsg: int | None = None,
+        sag_m: float | None = None,
         assets: str | Path | None = None,
         geometry: Geometry | None = None,
         same_names: SameNames = "number",
     ) -> Scene:
-        """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
+        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, or a raster (.tif).
 
         Parameters
         ----------
@@ -165,12 +166,16 @@ class Scene:
             .obj, .usd). With "ignore", triangles are solid, and no image is read.
         colours
             Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
-            without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
+            and .xodr without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off,
+            .usd).
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
-            CityJSON), by which `Material` may choose them.
+            CityJSON, .xodr), by which `Material` may choose them.
         step_m, window, epsg
             Options of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
+        sag_m
+            Of roads (.xodr): largest distance of triangles from curves in plan, metres; None takes
+            0.01.
         assets
             A folder: further files that the scene file names are read from this folder and from
             the folder of the scene file, and from the folders below. Of a world of Gazebo, models
@@ -201,6 +206,7 @@ class Scene:
             step_m=step_m,
             window=window,
             epsg=epsg,
+            sag_m=sag_m,
             assets=assets,
             geometry=geometry,
         )

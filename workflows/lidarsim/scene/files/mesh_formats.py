@@ -52,6 +52,8 @@ class MeshFormat:
         Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
     collisions
         Whether files may have shapes for collisions, see `ReadOptions.collisions`.
+    roads
+        Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -65,6 +67,7 @@ class MeshFormat:
     from_path: bool = False
     raster: bool = False
     collisions: bool = False
+    roads: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -149,10 +152,6 @@ _NOT_READ = (
         (".xml",),
         advice=f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
         "scenario names floating car data of SUMO",
-    ),
-    MeshFormat(
-        (".xodr",),
-        advice="it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
     ),
 )
 

@@ -8,9 +8,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
@@ -99,6 +100,7 @@ def load_objects(
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
+    sag_m: Annotated[float, Field(gt=0, le=1)] | None = None,
     assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
     geometry: Geometry | None = None,
@@ -124,6 +126,9 @@ def load_objects(
     epsg
         Code of the coordinate system to which a raster is transformed, in metres. None keeps the
         system of the file if it is in metres, else takes the UTM zone of the raster's middle.
+    sag_m
+        Of roads (.xodr): largest distance of triangles from curves in plan, metres, above 0 to 1;
+        heights are ten times as exact. None takes 0.01.
     animation
         Name of the animation to play by the meshes, or the number of an animation without a name;
         "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
@@ -153,6 +158,11 @@ def load_objects(
     raster = RasterOptions(unit, step_m, window, epsg)
     _check_options(path, row, raster, up_axis, animation)
     _check_geometry(path, row, geometry)
+    if sag_m is not None and not row.roads:
+        raise LidarError(
+            f"{path} has no curves that are read: leave out sag_m, or give a file of roads "
+            f"({' '.join(endings(lambda row: row.roads))})."
+        )
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
@@ -164,6 +174,7 @@ def load_objects(
         materials=materials,
         raster=raster,
         collisions=geometry == "collision",
+        sag_m=sag_m,
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
@@ -442,7 +453,8 @@ def _placed_object(
     """Return an object in the world, with a name that is safe for terminals and files."""
     name = printable(item.name) or printable(stem)
     for transform in transforms:
-        item = item.moved(name, transform.linear, transform.offset)
+        if name != item.name or not _keeps_places(transform):
+            item = item.moved(name, transform.linear, transform.offset)
     reach = np.abs(_corners(item)).max()
     if reach > MAX_COORDINATE_M:
         raise LidarError(
@@ -450,6 +462,11 @@ def _placed_object(
             "on Earth: check its unit and placement."
         )
     return item
+
+
+def _keeps_places(transform: Transform) -> bool:
+    """Return True if a transform moves nothing: files of many objects are read sooner."""
+    return np.array_equal(transform.linear, np.eye(3)) and not transform.offset.any()
 
 
 def _actor_of_part(part: RigidPart, stem: str, upright: Transform, placement: Transform) -> Actor:

@@ -1,0 +1,66 @@
+"""Elements of OpenDRIVE files: checked numbers, and a count of the elements that are not read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from math import isfinite
+from xml.etree.ElementTree import Element
+
+from lidarsim.scene.files.scene_graph import MeshFileError
+
+MAX_SHOWN = 40  # letters of a value that an error shows
+# Elements that carry no geometry, in any element.
+_WITHOUT_GEOMETRY = {"userData", "dataQuality", "link", "validity", "vectorScene", "vectorRoad"}
+
+
+def number(element: Element, name: str, default: float | None = None) -> float:
+    """Return a number of an element; MeshFileError if it is missing without a default, or broken.
+
+    An empty text is missing.
+    """
+    text = element.get(name)
+    if not text:
+        if default is None:
+            raise MeshFileError(f"has a <{element.tag}> without {name}: correct it")
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        raise MeshFileError(
+            f"has a <{element.tag}> with {name} {text[:MAX_SHOWN]!r}, not a number: correct it"
+        )
+    return value
+
+
+def positive(element: Element, name: str, default: float | None = None) -> float:
+    """Return a number of 0 or more of an element; MeshFileError if it is negative."""
+    value = number(element, name, default)
+    if value < 0:
+        raise MeshFileError(
+            f"has a <{element.tag}> with {name} {value:g}, which is negative: correct it"
+        )
+    return value
+
+
+class UnreadElements:
+    """Count of the elements that are not read, by their tags."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def add(self, tag: str, count: int = 1) -> None:
+        """Count elements of a tag, or other content that is described by words."""
+        self._counts[tag[:MAX_SHOWN]] += count
+
+    def check(self, element: Element, known: Collection[str]) -> None:
+        """Count the children of an element whose tags are not known."""
+        for child in element:
+            if child.tag not in known and child.tag not in _WITHOUT_GEOMETRY:
+                self.add(child.tag)
+
+    def __str__(self) -> str:
+        """Return counts and tags: «2 bridge, 1 CRG»; empty without elements."""
+        return ", ".join(f"{count} {tag}" for tag, count in self._counts.items())

@@ -1,0 +1,136 @@
+"""Materials of roads, their colours, and classes of objects."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from lidarsim.base.arrays import Bytes
+from lidarsim.scene.colours import as_srgb
+from lidarsim.scene.files.scene_graph import ObjectClass
+
+ASPHALT = "asphalt"
+CONCRETE = "concrete"
+EARTH = "earth"
+GRASS = "grass"
+PAINT = "paint"  # with a colour: "paint white"
+SIGN = "sign face"
+LAMP = "lamp"
+METAL = "metal"
+LEAVES = "leaves"
+WALL = "wall"
+
+# {material: reflectance for red, green and blue light}. Luminances are those of measured spectra at
+# 905 nm (`lidarsim.sensor.materials.reflectances`) where the table has the material.
+_LINEAR = {
+    ASPHALT: (0.13, 0.13, 0.13),
+    CONCRETE: (0.31, 0.31, 0.31),
+    EARTH: (0.34, 0.31, 0.25),
+    GRASS: (0.3, 0.62, 0.2),
+    SIGN: (0.8, 0.8, 0.8),
+    LAMP: (0.1, 0.1, 0.1),
+    METAL: (0.4, 0.4, 0.4),
+    LEAVES: (0.25, 0.58, 0.15),
+    WALL: (0.5, 0.4, 0.3),
+    f"{PAINT} white": (0.6, 0.6, 0.6),
+    f"{PAINT} yellow": (0.65, 0.5, 0.02),
+    f"{PAINT} red": (0.5, 0.03, 0.03),
+    f"{PAINT} blue": (0.03, 0.1, 0.5),
+    f"{PAINT} green": (0.03, 0.35, 0.1),
+    f"{PAINT} orange": (0.6, 0.2, 0.02),
+    f"{PAINT} violet": (0.3, 0.03, 0.4),
+    f"{PAINT} black": (0.03, 0.03, 0.03),
+}
+_OTHER = (0.5, 0.5, 0.5)
+
+# {type of a lane: material}; others are of asphalt.
+_LANES = {
+    "sidewalk": CONCRETE,
+    "walking": CONCRETE,
+    "curb": CONCRETE,
+    "median": GRASS,
+    "none": EARTH,
+}
+# {type of an object: material}; others are of concrete.
+_OBJECTS = {
+    "building": WALL,
+    "tree": LEAVES,
+    "vegetation": LEAVES,
+    "pole": METAL,
+    "streetLamp": METAL,
+    "gantry": METAL,
+    "railing": METAL,
+    "car": METAL,
+    "van": METAL,
+    "bus": METAL,
+    "trailer": METAL,
+    "train": METAL,
+    "tram": METAL,
+    "bike": METAL,
+    "motorbike": METAL,
+}
+# Words of the attribute `surface` of lanes, and their materials.
+_SURFACES = {
+    "asphalt": ASPHALT,
+    "concrete": CONCRETE,
+    "pavement": CONCRETE,
+    "cobble": CONCRETE,
+    "grass": GRASS,
+    "gravel": EARTH,
+    "soil": EARTH,
+}
+
+# Types of lanes on which vehicles drive.
+CARRIAGEWAY = (
+    "driving", "bidirectional", "bus", "taxi", "HOV", "entry", "exit", "mwyEntry", "mwyExit",
+    "onRamp", "offRamp", "connectingRamp", "slipLane", "shared", "stop",
+)  # fmt: skip
+
+# Class 1 is for types that have no class in ASPRS LAS; 64 and above are free for users.
+CLASSES = {
+    1: ObjectClass("unclassified", ("obstacle *", "object *", "patch *", "wind *")),
+    2: ObjectClass("ground", ("none lane *", "median lane *")),
+    5: ObjectClass("high vegetation", ("tree *", "vegetation *")),
+    6: ObjectClass("building", ("building *",)),
+    10: ObjectClass("rail", ("rail lane *", "tram lane *")),
+    11: ObjectClass(
+        "road surface",
+        tuple(
+            f"{lane_type} lane *"
+            for lane_type in (
+                "bidirectional", "border", "bus", "connectingRamp", "driving", "entry", "exit",
+                "HOV", "mwyEntry", "mwyExit", "offRamp", "onRamp", "parking", "restricted",
+                "roadWorks", "shared", "shoulder", "slipLane", "special?", "stop", "taxi",
+            )
+        ),
+    ),
+    64: ObjectClass("road mark", ("road mark *", "crosswalk *", "parkingSpace *", "roadMark *")),
+    65: ObjectClass("sidewalk", ("sidewalk lane *", "walking lane *", "curb lane *")),
+    66: ObjectClass("cycle lane", ("biking lane *",)),
+    67: ObjectClass("barrier", ("barrier *", "railing *", "soundBarrier *")),
+    68: ObjectClass("pole", ("pole *", "streetLamp *", "gantry *")),
+    69: ObjectClass("traffic sign", ("traffic sign *",)),
+    70: ObjectClass("traffic light", ("traffic light *",)),
+    71: ObjectClass("traffic island", ("trafficIsland *",)),
+    72: ObjectClass("tunnel", ("tunnel *",)),
+}  # fmt: skip
+
+
+@cache
+def colour_of(material: str) -> Bytes:
+    """Return the sRGB colour (1, 1, 3) of a material."""
+    return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
+
+
+def material_of_lane(lane_type: str, surface: str | None) -> str:
+    """Return the material of a lane by its type, or by the surface that it states."""
+    for word, material in _SURFACES.items():
+        if surface and word in surface.lower():
+            return material
+    return _LANES.get(lane_type, ASPHALT)
+
+
+def material_of_object(object_type: str) -> str:
+    """Return the material of an object by its type."""
+    return _OBJECTS.get(object_type, CONCRETE)

@@ -1,0 +1,218 @@
+"""OpenDRIVE files, .xodr, after ASAM OpenDRIVE 1.4 to 1.8.
+
+This is not libOpenDRIVE, which reads neither borders of lanes nor lateral shapes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.xmlfile import xml_root
+from lidarsim.scene.colours import Colours
+from lidarsim.scene.files.scene_graph import (
+    Content,
+    MeshFileError,
+    Piece,
+    ReadOptions,
+    join_pieces,
+)
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from .elements import UnreadElements, number
+from .lanes import Lane, SectionSurface, lane_sections
+from .materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
+from .road import Network, Road
+from .road_marks import painted_quads
+from .road_objects import ObjectBuilder
+from .signals import SignalBuilder
+
+SAG_M = 0.01  # tolerance of curves in plan unless the reader gets another
+# Roads of a junction lie on each other. These lanes are lower by metres, so that lanes on which
+# vehicles drive are hit.
+_SINK_OF_NONE_M = 0.005
+_SINK_M = 0.002
+_SMALLER = "give a larger sag_m, or divide the file"
+_KNOWN = ("header", "road", "junction", "junctionGroup", "controller", "station")
+_KNOWN_OF_JUNCTIONS = ("connection", "priority", "controller", "surface", "crossPath")
+_UTM = re.compile(r"\+proj=utm\b.*\+zone=(\d{1,2})\b")
+_EPSG = re.compile(r"(?i)\bepsg:(\d{4,6})\b")
+
+Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
+
+
+def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the roads of a file: lanes, marks, objects and signals."""
+    # A comment before the declaration is not XML, and common.
+    root = xml_root(data[max(data.find(b"<?xml"), 0) :])
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    if root.tag != "OpenDRIVE":
+        raise MeshFileError(f"is XML, but not OpenDRIVE: it begins with <{root.tag[:40]}>")
+    header = root.find("header")
+    if header is not None and number(header, "revMajor", 1.0) > 1:
+        raise MeshFileError(f"is OpenDRIVE {header.get('revMajor')}, and 1.4 to 1.8 are read")
+    unread = UnreadElements()
+    unread.check(root, _KNOWN)
+    for junction in root.iterfind("junction"):
+        unread.check(junction, _KNOWN_OF_JUNCTIONS)
+    allowance = Allowance(len(data), _SMALLER)
+    reader = _RoadReader(options, allowance, unread)
+    network = Network(root.findall("road"), allowance, unread)
+    content = Content(reader.meshes(network))
+    content.unit_m = 1.0
+    content.up_axis = "z"
+    content.classes = CLASSES
+    content.notes = _notes(header, unread)
+    return content
+
+
+class _RoadReader:
+    """Makes meshes of the roads of a file."""
+
+    def __init__(self, options: ReadOptions, allowance: Allowance, unread: UnreadElements) -> None:
+        self._options = options
+        self._allowance = allowance
+        self._unread = unread
+        self._pieces: Pieces = defaultdict(list)
+        self._sag_m = options.sag_m or SAG_M
+
+    def meshes(self, network: Network) -> list[SceneMesh]:
+        """Return the meshes of all objects."""
+        sections_of_roads = [lane_sections(road, self._unread) for road in network.roads]
+        sections = [
+            (road, section)
+            for road, road_sections in zip(network.roads, sections_of_roads, strict=True)
+            for section in road_sections
+        ]
+        for road, section in sections:
+            section.place_stations(network, road, self._sag_m, self._allowance)
+        frames = network.frames(
+            [road for road, _ in sections], [section.stations for _, section in sections]
+        )
+        start = 0
+        for road, section in sections:
+            stop = start + len(section.stations)
+            self._add_section(road, SectionSurface(road, section, frames.take(slice(start, stop))))
+            start = stop
+        objects = ObjectBuilder(network, self._sag_m, self._allowance, self._unread)
+        signals = SignalBuilder(network, self._unread)
+        for road, road_sections in zip(network.roads, sections_of_roads, strict=True):
+            for name, piece in objects.pieces(road, road_sections):
+                self._add(name, piece)
+            for name, piece in signals.pieces(road, road_sections):
+                self._add(name, piece)
+        self._drop_degenerate()
+        return [
+            mesh
+            for name, pieces in self._pieces.items()
+            for mesh in join_pieces(name, pieces, self._allowance)
+        ]
+
+    def _add_section(self, road: Road, surface: SectionSurface) -> None:
+        """Add the lanes and marks of a lane section."""
+        for strip in (*surface.strips, *surface.kerbs):
+            lane = strip.lane
+            material = CONCRETE if strip.is_kerb else _material(lane)
+            points = strip.points.reshape(-1, 3)
+            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_kerb:
+                sink_m = _SINK_OF_NONE_M if lane.type == "none" else _SINK_M
+                points = points - np.array([0, 0, sink_m])
+            piece = Piece(points, strip.faces, material=material)
+            self._add(f"{lane.type} lane {road.name}/{lane.number}", piece)
+        for quads in painted_quads(surface, self._allowance, self._unread):
+            piece = Piece(quads.points, quads.faces, material=f"{PAINT} {quads.colour}")
+            self._add(f"road mark {road.name}", piece)
+
+    def _add(self, name: str, piece: Piece) -> None:
+        """Add triangles to an object, with colours and materials if asked for."""
+        if not len(piece.faces):
+            return
+        colours = None
+        if self._options.colours:
+            colours = Colours.plain(colour_of(piece.material), len(piece.faces))
+        material = piece.material if self._options.materials else ""
+        self._pieces[name].append(piece._replace(colours=colours, material=material))
+
+    def _drop_degenerate(self) -> None:
+        """Drop triangles without an area, such as of lanes whose width shrinks to zero."""
+        pieces = [piece for pieces in self._pieces.values() for piece in pieces]
+        corners = [piece.vertices[piece.faces[:, k]] for k in range(3) for piece in pieces]
+        if not corners:
+            return
+        a, b, c = np.concatenate(corners).reshape(3, -1, 3)
+        areas = np.cross(b - a, c - a)
+        has_area = np.asarray(areas.any(axis=1))
+        if has_area.all():
+            return
+        stop = 0
+        for name, object_pieces in self._pieces.items():
+            remaining = []
+            for piece in object_pieces:
+                start = stop
+                stop += len(piece.faces)
+                mask = has_area[start:stop]
+                if mask.all():
+                    remaining.append(piece)
+                elif mask.any():
+                    rows = np.flatnonzero(mask)
+                    colours = None if piece.colours is None else piece.colours.take(rows)
+                    remaining.append(piece._replace(faces=piece.faces[rows], colours=colours))
+            self._pieces[name] = remaining
+
+
+def _material(lane: Lane) -> str:
+    """Return the material of a lane."""
+    stated = lane.element.find("material")
+    return material_of_lane(lane.type, None if stated is None else stated.get("surface"))
+
+
+def _notes(header: Element | None, unread: UnreadElements) -> list[str]:
+    """Return notes on the coordinate system of a file, and on the elements that are not read."""
+    notes = []
+    if header is not None:
+        notes = _reference_notes(header)
+    listed = str(unread)
+    if listed:
+        notes.append(f"is read without {listed}")
+    return notes
+
+
+def _reference_notes(header: Element) -> list[str]:
+    """Return notes on the coordinate system and the offset that a header states."""
+    text = " ".join((header.findtext("geoReference") or "").split())
+    epsg = _epsg(text)
+    offset = header.find("offset")
+    shift = [0.0] * 4
+    if offset is not None:
+        shift = [number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
+    system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
+    if any(shift):
+        x, y, z, heading = shift
+        turn = f" and <file.rotation_deg=[0, 0, {np.degrees(heading):.9g}]>" if heading else ""
+        where = system if text else "its coordinate system"
+        return [
+            f"has an offset, which is not applied: <file.translation=[{x:.12g}, {y:.12g}, {z:.9g}]>"
+            f"{turn} moves it into {where}"
+        ]
+    if epsg:
+        return [f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS"]
+    if text:
+        return [f"is in {system}, which is not used"]
+    return []
+
+
+def _epsg(text: str) -> int | None:
+    """Return the EPSG code of a definition of PROJ, or None: codes, and UTM zones of WGS 84."""
+    code = _EPSG.search(text)
+    if code:
+        return int(code[1])
+    zone = _UTM.search(text)
+    if zone and 1 <= int(zone[1]) <= 60 and re.search(r"\+(datum|ellps)=WGS84\b", text):
+        return (32700 if "+south" in text else 32600) + int(zone[1])
+    return None

@@ -1,0 +1,293 @@
+"""Reference lines of roads in plan: lines, arcs, spirals and cubics, all roads in one table.
+
+Lines, arcs and spirals are curves whose curvature changes linearly (clothoids). They are integrated
+by Gauss and Legendre's quadrature with five points over pieces that turn by half a radian or less:
+the error is below 1e-12 of a piece. Cubics are sampled, and their parameter is found by arc length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+from math import ceil
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.elementary import sin_cos
+from lidarsim.base.vectors import hypot
+from lidarsim.scene.files.scene_graph import MeshFileError
+
+from .elements import number, positive
+
+_MAX_TURN = 0.5  # rad of a piece of a clothoid
+_CUBIC_PIECES = 16  # of a cubic geometry, in which stations are placed separately
+_CUBIC_SAMPLES = 64  # of each of these pieces, for arc lengths
+_MIN_SPEED = 1e-3  # least ratio of speeds along a cubic's parameter; slower cubics turn back
+_LEAST_M = 1e-9  # geometries that are shorter are left out
+# Gauss and Legendre's quadrature with five points on 0 to 1.
+_NODES = np.array([-0.9061798459386640, -0.5384693101056831, 0.0]) / 2 + 0.5
+_NODES = np.append(_NODES, 1 - _NODES[1::-1])
+_WEIGHTS = np.array([0.2369268850561891, 0.4786286704993665, 0.5688888888888889]) / 2
+_WEIGHTS = np.append(_WEIGHTS, _WEIGHTS[1::-1])
+
+
+class PlanPoints(NamedTuple):
+    """Points of reference lines in plan."""
+
+    x: Floats  # (k,), m
+    y: Floats  # (k,), m
+    cosines: Floats  # (k,): of headings
+    sines: Floats  # (k,): of headings
+
+
+class _Clothoid(NamedTuple):
+    """A piece of a line, an arc or a spiral."""
+
+    start: float  # distance of the table, m
+    x: float
+    y: float
+    heading: float  # rad
+    curvature: float  # at the start, 1/m
+    growth: float  # of the curvature, 1/m²
+
+
+class _Cubic(NamedTuple):
+    """A geometry of the kinds poly3 and paramPoly3, sampled by arc length."""
+
+    start: float  # distance of the table, m
+    x: float
+    y: float
+    cosine: float  # of the heading at the start
+    sine: float
+    distances: Floats  # (m,): of the samples from the start, m
+    parameters: Floats  # (m,): of the samples
+    u: Floats  # (4,): coefficients along the heading
+    v: Floats  # (4,): coefficients to the left
+
+
+class PlanTable:
+    """Reference lines of all roads of a file, one after another along a common distance.
+
+    Roads are added with `add`, and evaluated together after `finish`.
+    """
+
+    def __init__(self, allowance: Allowance) -> None:
+        self._allowance = allowance
+        self._clothoids: list[_Clothoid] = []
+        self._cubics: list[_Cubic] = []
+        self._bends: list[tuple[float, float]] = []  # start and largest curvature of each piece
+        self._table = np.zeros((0, 6))
+        self._starts = np.zeros(0)  # (p,): of all pieces
+        self._kinds = np.zeros(0, np.int64)  # (p,): row of `_cubics`; -1 for a clothoid
+        self._bend_table = np.zeros((0, 2))
+
+    def add(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
+        """Add the geometries of a road that starts at a distance; return their starts on the road.
+
+        The last geometry ends with the road, of `length` metres.
+        """
+        starts = [positive(geometry, "s") for geometry in geometries]
+        first = len(self._bends)
+        for geometry, start, stop in zip(geometries, starts, [*starts[1:], length], strict=True):
+            if stop - start > _LEAST_M:
+                self._add_geometry(geometry, offset + start, stop - start)
+        return np.array([start for start, _ in self._bends[first:]]) - offset
+
+    def finish(self) -> None:
+        """Make the tables for evaluation."""
+        clothoid_starts = [piece.start for piece in self._clothoids]
+        starts = np.array(clothoid_starts + [piece.start for piece in self._cubics])
+        order = np.argsort(starts, kind="stable")
+        kinds = np.concatenate(
+            [np.full(len(clothoid_starts), -1, np.int64), np.arange(len(self._cubics))]
+        )
+        self._starts = starts[order]
+        self._kinds = kinds[order]
+        self._table = np.full((len(starts), 6), 0.0)
+        clothoids = np.fromiter(chain.from_iterable(self._clothoids), np.float64).reshape(-1, 6)
+        self._table[self._kinds < 0] = clothoids[np.argsort(clothoids[:, 0], kind="stable")]
+        bends = np.fromiter(chain.from_iterable(self._bends), np.float64).reshape(-1, 2)
+        self._bend_table = bends[np.argsort(bends[:, 0], kind="stable")]
+
+    def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
+        """Return the largest curvatures in intervals (k,), each within a piece, 1/m."""
+        rows = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
+        return np.asarray(self._bend_table[np.maximum(rows, 0), 1])
+
+    def points(self, distances: Floats) -> PlanPoints:
+        """Return points at distances (k,) of the table."""
+        rows = np.maximum(np.searchsorted(self._starts, distances, "right") - 1, 0)
+        points = self._clothoid_points(distances, rows)
+        kinds = self._kinds[rows]
+        for kind in np.unique(kinds[kinds >= 0]).tolist():
+            mask = kinds == kind
+            cubic_points = _cubic_points(self._cubics[kind], distances[mask])
+            for array, values in zip(points, cubic_points, strict=True):
+                array[mask] = values
+        return points
+
+    def _clothoid_points(self, distances: Floats, rows: Ints) -> PlanPoints:
+        """Return points on clothoids; of rows of cubics, anything."""
+        start, x, y, heading, curvature, growth = self._table[rows].T
+        along = distances - start
+        sines, cosines = sin_cos(heading + (curvature + growth / 2 * along) * along)
+        x = x + cosines * along
+        y = y + sines * along
+        curved = np.flatnonzero((curvature != 0) | (growth != 0))
+        steps = along[curved, None] * _NODES
+        turned = curvature[curved, None] + growth[curved, None] / 2 * steps
+        node_sines, node_cosines = sin_cos(heading[curved, None] + turned * steps)
+        # Sums of five products in a fixed order have the same bits on every processor.
+        for array, origin, parts in (
+            (x, self._table[rows[curved], 1], node_cosines * _WEIGHTS),
+            (y, self._table[rows[curved], 2], node_sines * _WEIGHTS),
+        ):
+            mean = ((parts[:, 0] + parts[:, 4]) + (parts[:, 1] + parts[:, 3])) + parts[:, 2]
+            array[curved] = origin + mean * along[curved]
+        return PlanPoints(x, y, cosines, sines)
+
+    def _add_geometry(self, geometry: Element, start: float, length: float) -> None:
+        """Add a geometry of a length, which may differ from the length that the geometry states."""
+        shape = next((child for child in geometry if child.tag in _SHAPES), None)
+        if shape is None:
+            tags = ", ".join(child.tag for child in geometry) or "nothing"
+            raise MeshFileError(
+                f"has a <geometry> of {tags[:40]}, not line, arc, spiral, poly3 or paramPoly3: "
+                "correct it"
+            )
+        stated_length = positive(geometry, "length")
+        if shape.tag in ("poly3", "paramPoly3"):
+            self._add_cubic(geometry, shape, start, stated_length)
+            return
+        curvature = 0.0
+        growth = 0.0
+        if shape.tag == "arc":
+            curvature = number(shape, "curvature")
+        elif shape.tag == "spiral":
+            curvature = number(shape, "curvStart", 0.0)
+            growth = (number(shape, "curvEnd", 0.0) - curvature) / max(stated_length, _LEAST_M)
+        self._add_clothoid(
+            _Clothoid(start, *_origin(geometry), curvature=curvature, growth=growth), length
+        )
+
+    def _add_clothoid(self, clothoid: _Clothoid, length: float) -> None:
+        """Add a clothoid in pieces that turn by `_MAX_TURN` or less."""
+        last = clothoid.curvature + clothoid.growth * length
+        turn = max(abs(clothoid.curvature), abs(last)) * length
+        self._allowance.take(int(min(turn / _MAX_TURN, 1e15)) * 500)
+        count = max(1, ceil(turn / _MAX_TURN))
+        piece = clothoid
+        for k in range(count):
+            following = clothoid.curvature + clothoid.growth * length * (k + 1) / count
+            self._clothoids.append(piece)
+            self._bends.append((piece.start, max(abs(piece.curvature), abs(following))))
+            if k + 1 < count:
+                piece = _next_piece(piece, length / count, following)
+
+    def _add_cubic(self, geometry: Element, shape: Element, start: float, length: float) -> None:
+        """Add a geometry of a cubic."""
+        u, v = _coefficients(shape)
+        # Without pRange, parameters are normalized (ASAM OpenDRIVE 1.4 to 1.8).
+        is_normalized = shape.tag == "paramPoly3" and shape.get("pRange") != "arcLength"
+        count = 1 + _CUBIC_SAMPLES * _CUBIC_PIECES
+        parameters = np.linspace(0, 1.0 if is_normalized else length, count)
+        speeds = hypot(_slope(u, parameters), _slope(v, parameters))
+        lengths = np.diff(parameters) * (speeds[1:] + speeds[:-1]) / 2
+        distances = np.append(0, np.add.accumulate(lengths))
+        if not (0 < distances[-1] < np.inf and speeds.min() > _MIN_SPEED * speeds.max()):
+            raise MeshFileError(f"has a <{shape.tag}> that has no length or stops: correct it")
+        if is_normalized:  # the end of the parameters is the end of the length
+            distances = distances * (length / distances[-1])
+        x, y, heading = _origin(geometry)
+        sine, cosine = (float(value) for value in sin_cos(heading))
+        self._cubics.append(_Cubic(start, x, y, cosine, sine, distances, parameters, u, v))
+        bends = _curvatures(u, v, parameters)
+        for first in range(0, count - 1, _CUBIC_SAMPLES):
+            if distances[first] < length:
+                bend = float(bends[first : first + _CUBIC_SAMPLES + 1].max())
+                self._bends.append((start + float(distances[first]), bend))
+
+
+_SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
+
+
+def _origin(geometry: Element) -> tuple[float, float, float]:
+    """Return x, y and heading of the start of a geometry."""
+    return number(geometry, "x"), number(geometry, "y"), number(geometry, "hdg")
+
+
+def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
+    """Return the piece that follows a piece of a clothoid after a step, with its curvature."""
+    table = np.array([piece])
+    heading = piece.heading + (piece.curvature + piece.growth / 2 * step) * step
+    steps = step * _NODES
+    sines, cosines = sin_cos(table[0, 3] + (piece.curvature + piece.growth / 2 * steps) * steps)
+    x = piece.x + step * sum((cosines * _WEIGHTS).tolist())
+    y = piece.y + step * sum((sines * _WEIGHTS).tolist())
+    return _Clothoid(piece.start + step, x, y, heading, curvature, piece.growth)
+
+
+def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
+    """Return points of a cubic at distances (k,) of the table."""
+    along = distances - cubic.start
+    parameters = _parameters(cubic, along)
+    u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
+    du, dv = (_slope(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
+    speed = hypot(du, dv)
+    cosines = (du * cubic.cosine - dv * cubic.sine) / speed
+    sines = (du * cubic.sine + dv * cubic.cosine) / speed
+    beyond = np.maximum(along - cubic.distances[-1], 0)  # straight on after the end
+    x = cubic.x + u * cubic.cosine - v * cubic.sine + beyond * cosines
+    y = cubic.y + u * cubic.sine + v * cubic.cosine + beyond * sines
+    return PlanPoints(x, y, cosines, sines)
+
+
+def _parameters(cubic: _Cubic, along: Floats) -> Floats:
+    """Return the parameters of a cubic at distances (k,) from its start; its end beyond."""
+    rows = np.searchsorted(cubic.distances, along, "right") - 1
+    rows = np.clip(rows, 0, len(cubic.distances) - 2)
+    gaps = cubic.distances[rows + 1] - cubic.distances[rows]
+    share = np.clip((along - cubic.distances[rows]) / gaps, 0, 1)
+    steps = cubic.parameters[rows + 1] - cubic.parameters[rows]
+    return np.asarray(cubic.parameters[rows] + share * steps)
+
+
+def _coefficients(shape: Element) -> tuple[Floats, Floats]:
+    """Return the coefficients (4,) of a cubic along the heading, and to the left."""
+    if shape.tag == "poly3":
+        u = [0.0, 1.0, 0.0, 0.0]
+        v = [number(shape, name, 0.0) for name in "abcd"]
+    else:
+        u = [number(shape, f"{name}U", 0.0) for name in "abcd"]
+        v = [number(shape, f"{name}V", 0.0) for name in "abcd"]
+    return np.array(u), np.array(v)
+
+
+def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
+    """Return the curvatures of a cubic at parameters, without sign, 1/m."""
+    du = _slope(u, p)
+    dv = _slope(v, p)
+    speeds = hypot(du, dv)
+    return np.abs(du * _bend(v, p) - dv * _bend(u, p)) / (speeds * speeds * speeds)
+
+
+def _value(coefficients: Floats, p: Floats) -> Floats:
+    """Return the values of a cubic at parameters."""
+    a, b, c, d = coefficients
+    return np.asarray(((d * p + c) * p + b) * p + a)
+
+
+def _slope(coefficients: Floats, p: Floats) -> Floats:
+    """Return the first derivatives of a cubic at parameters."""
+    _, b, c, d = coefficients
+    return np.asarray((3 * d * p + 2 * c) * p + b)
+
+
+def _bend(coefficients: Floats, p: Floats) -> Floats:
+    """Return the second derivatives of a cubic at parameters."""
+    _, _, c, d = coefficients
+    return np.asarray(2 * c + 6 * d * p)

@@ -1,0 +1,230 @@
+"""Roads of OpenDRIVE: reference lines in space, cross sections, and coordinates along roads.
+
+Sources: ASAM OpenDRIVE 1.8.1 (2024), sections 7 to 11; crossfall and poly3: VIRES OpenDRIVE 1.4H.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from operator import itemgetter
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.elementary import sin_cos
+from lidarsim.base.vectors import length
+from lidarsim.scene.files.scene_graph import MeshFileError
+
+from .cubics import Cubics
+from .elements import MAX_SHOWN, UnreadElements, number, positive
+from .plan_view import PlanTable
+
+MAX_ROAD_M = 1e7  # longest road
+_GAP_M = 1.0  # between roads in the table of reference lines
+_MAX_MISSING = 0.01  # of the length of a road, which its geometry may lack
+_CROSSFALL_SIDES = {"left": (1,), "right": (-1,), "both": (1, -1)}
+_KNOWN = (
+    "type", "planView", "elevationProfile", "lateralProfile", "lanes", "objects", "signals",
+    "surface",
+)  # fmt: skip
+
+
+class Frames(NamedTuple):
+    """Frames of roads at stations: a point is origin + t * side + h * up."""
+
+    origins: Floats  # (k, 3), m
+    along: Floats  # (k, 3): unit vectors along the reference line
+    side: Floats  # (k, 3): unit vectors to the left, of the banked road
+    up: Floats  # (k, 3): unit vectors, upright on both
+    level_side: Floats  # (k, 3): horizontal unit vectors to the left
+
+    def take(self, rows: slice) -> Frames:
+        """Return the frames of selected stations."""
+        return Frames(*(array[rows] for array in self))
+
+
+class Road:
+    """A road: its profiles along the reference line, and its elements.
+
+    Parameters
+    ----------
+    element
+        The <road>.
+    unread
+        Count of elements that are not read.
+    """
+
+    def __init__(self, element: Element, unread: UnreadElements) -> None:
+        self.element = element
+        self.name = (element.get("id") or "")[:MAX_SHOWN]
+        self.length = positive(element, "length")
+        if self.length > MAX_ROAD_M:
+            raise MeshFileError(
+                f"has a road {self.name!r} of {self.length:g} m: correct its length"
+            )
+        self.in_junction = (element.get("junction") or "-1") != "-1"
+        self.offset = 0.0  # of the road in the table of reference lines, m
+        self.geometry_starts = np.zeros(0)  # (g,), of pieces of geometry, m
+        self.elevation = Cubics.read(element.iterfind("elevationProfile/elevation"))
+        self.superelevation = Cubics.read(element.iterfind("lateralProfile/superelevation"))
+        self.lane_offset = Cubics.read(element.iterfind("lanes/laneOffset"))
+        self.crossfalls = {
+            side: Cubics.read(
+                entry
+                for entry in element.iterfind("lateralProfile/crossfall")
+                if side in _CROSSFALL_SIDES.get(entry.get("side", "both"), ())
+            )
+            for side in (1, -1)
+        }
+        unread.check(element, _KNOWN)
+        for surface in element.iterfind("surface"):
+            unread.check(surface, ())
+        for profile in element.iterfind("lateralProfile"):
+            unread.check(profile, ("superelevation", "crossfall", "shape"))
+
+    def place(self, table: PlanTable, offset: float) -> float:
+        """Add the reference line to a table at an offset; return the offset of the next road.
+
+        MeshFileError if the geometry does not reach the length of the road.
+        """
+        geometries = self.element.findall("planView/geometry")
+        if not geometries:
+            raise MeshFileError(f"has a road {self.name!r} without geometry: correct it")
+        geometries.sort(key=lambda geometry: number(geometry, "s"))
+        last = geometries[-1]
+        end = positive(last, "s") + positive(last, "length")
+        if self.length - end > _MAX_MISSING * self.length:
+            raise MeshFileError(
+                f"has a road {self.name!r} of {self.length:,.9g} m, whose geometry ends at "
+                f"{end:,.9g} m: correct its length, or add geometry"
+            )
+        self.offset = offset
+        self.geometry_starts = table.add(geometries, offset, self.length)
+        if not len(self.geometry_starts) and self.length > 0:
+            raise MeshFileError(f"has a road {self.name!r} without geometry: correct it")
+        return offset + self.length + _GAP_M
+
+    @cached_property
+    def shapes(self) -> LateralShapes | None:
+        """Lateral shapes of the road; None without any."""
+        elements = self.element.findall("lateralProfile/shape")
+        return LateralShapes(elements) if elements else None
+
+    @property
+    def curved_across(self) -> bool:
+        """Whether cross sections of lanes are curved or broken."""
+        return self.shapes is not None or any(map(len, self.crossfalls.values()))
+
+    @cached_property
+    def breaks(self) -> Floats:
+        """Distances (b,) at which polynomials of the road change, m."""
+        profiles = (
+            self.elevation, self.superelevation, self.lane_offset, *self.crossfalls.values()
+        )  # fmt: skip
+        starts = [self.geometry_starts, *(cubics.starts for cubics in profiles if len(cubics))]
+        if self.shapes is not None:
+            starts.append(self.shapes.stations)
+        return np.concatenate(starts)
+
+    def heights(self, distances: Floats, t: Floats) -> Floats:
+        """Return heights above the banked plane of crossfall and shapes, for t (..., k), m."""
+        heights = np.zeros_like(t)
+        for side, crossfall in self.crossfalls.items():
+            if len(crossfall):
+                sines, cosines = sin_cos(crossfall.values(distances))
+                heights -= np.maximum(side * t, 0) * (sines / cosines)
+        if self.shapes is not None:
+            heights += self.shapes.heights(distances, t)
+        return heights
+
+
+class LateralShapes:
+    """Heights across a road: cubics of t at stations, between which heights are interpolated."""
+
+    def __init__(self, elements: Sequence[Element]) -> None:
+        groups: dict[float, list[list[float]]] = {}
+        for element in elements:
+            row = [number(element, name, 0.0) for name in ("t", *"abcd")]
+            groups.setdefault(number(element, "s"), []).append(row)
+        self.stations: Floats = np.array(sorted(groups))  # (m,)
+        # Cubics of each station in ascending order; those that lack are never reached.
+        count = max(map(len, groups.values()))
+        table = np.zeros((len(groups), count, 5))
+        table[..., 0] = np.inf
+        for profile, s in zip(table, self.stations.tolist(), strict=True):
+            profile[: len(groups[s])] = sorted(groups[s], key=itemgetter(0))
+        self._starts: Floats = table[..., 0]  # (m, r), m
+        self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
+
+    def heights(self, distances: Floats, t: Floats) -> Floats:
+        """Return heights at distances (k,) and t (..., k), m."""
+        last = len(self.stations) - 1
+        rows = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
+        following = np.minimum(rows + 1, last)
+        gaps = np.maximum(self.stations[following] - self.stations[rows], 1e-9)
+        share = np.clip((distances - self.stations[rows]) / gaps, 0, 1)
+        lower = self._profiles(rows, t)
+        return np.asarray(lower + share * (self._profiles(following, t) - lower))
+
+    def _profiles(self, rows: Ints, t: Floats) -> Floats:
+        """Return the heights of the stations `rows` (k,) at t (..., k), m."""
+        pieces = np.maximum((self._starts[rows] <= t[..., None]).sum(axis=-1) - 1, 0)
+        a, b, c, d = self._coefficients[:, rows, pieces]
+        x = np.maximum(t - self._starts[rows, pieces], 0)
+        return np.asarray(((d * x + c) * x + b) * x + a)
+
+
+class Network:
+    """The roads of a file, and their reference lines in one table.
+
+    Parameters
+    ----------
+    elements
+        The <road> of a file.
+    """
+
+    def __init__(
+        self, elements: Sequence[Element], allowance: Allowance, unread: UnreadElements
+    ) -> None:
+        self._table = PlanTable(allowance)
+        self.roads = [Road(element, unread) for element in elements]
+        offset = 0.0
+        for road in self.roads:
+            offset = road.place(self._table, offset)
+        self._table.finish()
+
+    def max_curvatures(self, road: Road, starts: Floats, stops: Floats) -> Floats:
+        """Return the largest curvatures of a reference line in intervals (k,), 1/m."""
+        return self._table.max_curvatures(road.offset + starts, road.offset + stops)
+
+    def frames(self, roads: Sequence[Road], distances: Sequence[Floats]) -> Frames:
+        """Return the frames of roads at distances (k,) of each, one after another."""
+        positions = np.concatenate(
+            [road.offset + s for road, s in zip(roads, distances, strict=True)]
+        )
+        pairs = [*zip(roads, distances, strict=True)]
+        points = self._table.points(positions)
+        heights = np.concatenate([road.elevation.values(s) for road, s in pairs])
+        slopes = np.concatenate([road.elevation.slopes(s) for road, s in pairs])
+        roll = np.concatenate([road.superelevation.values(s) for road, s in pairs])
+        zero = np.zeros_like(heights)
+        origins = np.stack([points.x, points.y, heights], axis=1)
+        along = np.stack([points.cosines, points.sines, slopes], axis=1)
+        along /= length(along)[:, None]
+        level_side = np.stack([-points.sines, points.cosines, zero], axis=1)
+        upright = np.cross(along, level_side)
+        if not roll.any():
+            return Frames(origins, along, level_side, upright, level_side)
+        sines, cosines = (values[:, None] for values in sin_cos(roll))
+        side = level_side * cosines + upright * sines
+        return Frames(origins, along, side, upright * cosines - level_side * sines, level_side)
+
+    def points(self, road: Road, distances: Floats, t: Floats, h: Floats | float = 0.0) -> Floats:
+        """Return points (k, 3) of a road at distances, t and heights (k,) above its plane."""
+        frames = self.frames([road], [distances])
+        lift = np.broadcast_to(h, distances.shape)[:, None]
+        return np.asarray(frames.origins + t[:, None] * frames.side + lift * frames.up)

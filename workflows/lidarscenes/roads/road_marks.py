@@ -1,0 +1,257 @@
+"""Road marks on the borders of lanes, as quadrangles just above the lanes' triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats, Ints
+
+from .elements import UnreadElements, number, positive
+from .lanes import Lane, SectionSurface
+
+LIFT_M = 0.003  # of marks above the road: thickness of thermoplastic marks
+DASH_M = 3.0  # dashes of broken marks that state no lengths
+SPACE_M = 6.0  # gaps between these dashes
+WIDTH_M = 0.12  # of marks that state no width
+_DOT_M = 0.1  # length of Botts' dots
+_DOT_SPACE_M = 1.2
+# Lines of marks from right to left; True for a broken line.
+_LINES = {
+    "solid": (False,),
+    "broken": (True,),
+    "solid solid": (False, False),
+    "solid broken": (False, True),
+    "broken solid": (True, False),
+    "broken broken": (True, True),
+}
+_UNPAINTED = ("none", "curb", "edge", "grass", "custom")
+_BYTES_PER_DASH = 600
+_KNOWN = ("type", "explicit")
+
+
+class _Line(NamedTuple):
+    """A painted line of a mark, from `starts` to `stops` along the road."""
+
+    starts: Floats  # (d,): of dashes, ascending, m
+    stops: Floats  # (d,), m
+    shift: float  # to the left of the border, m
+    width: float  # m
+    colour: str
+
+
+class PaintedQuads(NamedTuple):
+    """Road marks of a colour."""
+
+    colour: str
+    points: Floats  # (v, 3), m
+    faces: Ints  # (f, 3)
+
+
+def painted_quads(
+    surface: SectionSurface, allowance: Allowance, unread: UnreadElements
+) -> list[PaintedQuads]:
+    """Return the road marks of a lane section, by colours."""
+    section = surface.section
+    lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
+    knots = [
+        _knots_of(line, section.stations, surface.borders[lane.number])
+        for lane in lanes
+        for line in _lines_of(lane, section.start, section.stop, allowance, unread)
+    ]
+    knots = [entry for entry in knots if len(entry.quads)]
+    if not knots:
+        return []
+    points = _points_of(surface, knots)
+    rows_of_colours: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
+    offset = 0
+    for entry in knots:
+        rows_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
+        offset += len(entry.distances)
+    return [
+        PaintedQuads(colour, points, _quads(np.concatenate(rows), offset))
+        for colour, rows in rows_of_colours.items()
+    ]
+
+
+def _quads(rows: Ints, count: int) -> Ints:
+    """Return triangles (f, 3) between cross sections and the following.
+
+    `rows` are the cross sections' right points; their left points follow after `count`.
+    """
+    left = rows + count
+    return np.concatenate(
+        [
+            np.stack([rows, rows + 1, left + 1], axis=1),
+            np.stack([rows, left + 1, left], axis=1),
+        ]
+    )
+
+
+class _Knots(NamedTuple):
+    """Cross sections of a painted line."""
+
+    distances: Floats  # (q,): ascending, m
+    stations: Ints  # (q,): of the section, each the last before a cross section
+    shares: Floats  # (q,): of the way to the following station
+    first_t: Floats  # (q,): of the middle of the line at `stations`, m
+    second_t: Floats  # (q,): at the following stations, m
+    width: float  # m
+    quads: Ints  # (p,): cross sections at which quadrangles start
+    colour: str
+
+
+def _knots_of(line: _Line, stations: Floats, border: Floats) -> _Knots:
+    """Return the cross sections of a line: ends of dashes, and stations within them."""
+    middle = border + line.shift
+    if len(line.starts) == 1 and line.starts[0] <= stations[0] and line.stops[0] >= stations[-1]:
+        rows = np.arange(len(stations) - 1)
+        knots = np.append(rows, rows[-1])
+        last = np.append(np.zeros(len(rows)), 1.0)
+        following = middle[knots + 1]
+        return _Knots(
+            stations, knots, last, middle[knots], following, line.width, rows, line.colour
+        )
+    distances = np.sort(np.concatenate([line.starts, line.stops, stations]))
+    distances = distances[np.append(True, np.diff(distances) > 0)]
+    middles = (distances[1:] + distances[:-1]) / 2
+    dash = np.searchsorted(line.starts, middles, "right") - 1
+    painted = (dash >= 0) & (middles < line.stops[np.maximum(dash, 0)])
+    rows = np.clip(np.searchsorted(stations, distances, "right") - 1, 0, len(stations) - 2)
+    shares = (distances - stations[rows]) / (stations[rows + 1] - stations[rows])
+    return _Knots(
+        distances,
+        rows,
+        np.clip(shares, 0, 1),
+        middle[rows],
+        middle[rows + 1],
+        line.width,
+        np.flatnonzero(painted),
+        line.colour,
+    )
+
+
+def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
+    """Return the right edges of lines, then the left edges, on the lanes' triangles, (2q, 3)."""
+    rows = np.concatenate([entry.stations for entry in knots])
+    shares = np.concatenate([entry.shares for entry in knots])
+    first_t = np.concatenate([entry.first_t for entry in knots])
+    second_t = np.concatenate([entry.second_t for entry in knots])
+    half = np.concatenate([np.full(len(entry.distances), entry.width / 2) for entry in knots])
+    count = len(rows)
+    corners = surface.points(
+        np.concatenate([rows, rows, rows + 1, rows + 1]),
+        np.concatenate([first_t - half, first_t + half, second_t - half, second_t + half]),
+    )
+    both_shares = np.concatenate([shares, shares])[:, None]
+    points = corners[: 2 * count] + both_shares * (corners[2 * count :] - corners[: 2 * count])
+    up = surface.frames.up[np.concatenate([rows, rows])]
+    return np.asarray(points + LIFT_M * up)
+
+
+def _lines_of(
+    lane: Lane, start: float, stop: float, allowance: Allowance, unread: UnreadElements
+) -> Iterator[_Line]:
+    """Yield the painted lines of a lane between distances on its road."""
+    marks = lane.element.findall("roadMark")
+    if all(mark.get("type", "none") in _UNPAINTED for mark in marks):
+        return
+    starts = [start + number(mark, "sOffset", 0.0) for mark in marks]
+    order = sorted(range(len(marks)), key=starts.__getitem__)
+    stops = [*(min(starts[k], stop) for k in order), stop][1:]
+    for k, mark_stop in zip(order, stops, strict=True):
+        mark = marks[k]
+        unread.check(mark, _KNOWN)
+        if mark_stop > starts[k] and mark.get("type", "none") not in _UNPAINTED:
+            lines = _lines_of_mark(mark, starts[k], mark_stop, lane.side, allowance)
+            yield from (line for line in lines if len(line.starts) and line.width > 0)
+
+
+def _lines_of_mark(
+    mark: Element, start: float, stop: float, side: int, allowance: Allowance
+) -> list[_Line]:
+    """Return the lines of a mark: explicit lines, the lines of its type, or lines by its name."""
+    colour = _colour(mark, "white")
+    width = positive(mark, "width", 0.0) or WIDTH_M
+    explicit = mark.findall("explicit/line")
+    if explicit:
+        return [_explicit_line(line, start, stop, width, colour) for line in explicit]
+    typed = mark.find("type")
+    if typed is not None and typed.find("line") is not None:
+        width = positive(typed, "width", 0.0) or width
+        return [
+            _typed_line(line, start, stop, width, colour, allowance)
+            for line in typed.iterfind("line")
+        ]
+    name = mark.get("type", "")
+    if name == "botts dots":
+        dots = _dashes(start, stop, _DOT_M, _DOT_SPACE_M, allowance)
+        return [_Line(*dots, 0.0, _DOT_M, colour)]
+    # Of lanes, the lines of a name run from the inside out; of the middle, from left to right.
+    broken = _LINES.get(name, (False,))
+    shifts = [2 * width * (k - (len(broken) - 1) / 2) for k in range(len(broken))]
+    direction = 1 if side > 0 else -1
+    return [
+        _Line(
+            *_dashes(start, stop, DASH_M, SPACE_M if is_broken else 0.0, allowance),
+            direction * shift,
+            width,
+            colour,
+        )
+        for is_broken, shift in zip(broken, shifts, strict=True)
+    ]
+
+
+def _explicit_line(line: Element, start: float, stop: float, width: float, colour: str) -> _Line:
+    """Return a single line of a mark."""
+    first = start + number(line, "sOffset", 0.0)
+    last = min(first + positive(line, "length", 0.0), stop)
+    starts = np.array([first] if last > first else [])
+    return _Line(
+        starts,
+        np.array([last] if last > first else []),
+        number(line, "tOffset", 0.0),
+        positive(line, "width", 0.0) or width,
+        colour,
+    )
+
+
+def _typed_line(
+    line: Element, start: float, stop: float, width: float, colour: str, allowance: Allowance
+) -> _Line:
+    """Return a line of the type of a mark, which repeats its length and space."""
+    first = start + max(0.0, number(line, "sOffset", 0.0))
+    dashes = _dashes(
+        first, stop, positive(line, "length", 0.0), positive(line, "space", 0.0), allowance
+    )
+    return _Line(
+        *dashes,
+        number(line, "tOffset", 0.0),
+        positive(line, "width", 0.0) or width,
+        _colour(line, colour),
+    )
+
+
+def _dashes(
+    start: float, stop: float, length: float, space: float, allowance: Allowance
+) -> tuple[Floats, Floats]:
+    """Return starts and stops (d,) of dashes; a single dash without space or length."""
+    if not start < stop:
+        return np.zeros(0), np.zeros(0)
+    if space <= 0 or length <= 0:
+        return np.array([start]), np.array([stop])
+    count = (stop - start) / (length + space)
+    allowance.take(int(min(count, 1e15)) * _BYTES_PER_DASH)
+    starts = start + (length + space) * np.arange(int(count) + 1)
+    starts = starts[starts < stop]
+    return np.asarray(starts, np.float64), np.asarray(np.minimum(starts + length, stop))
+
+
+def _colour(element: Element, default: str) -> str:
+    """Return the colour of a mark or line; the standard colour is white."""
+    colour = element.get("color") or default
+    return "white" if colour == "standard" else colour[:20]
