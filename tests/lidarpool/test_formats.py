@@ -47,7 +47,7 @@ from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
 from lidarpool.export.las import wkt
-from lidarpool.export.ros import START_NS
+from lidarpool.export.frames import START_NS
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns

@@ -37,6 +37,7 @@ from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, pl
 
 from . import reading
 from .boxes import Boxes
+from .frames import CARRIER, INSTRUMENTS, WORLD, frame_names, points_topic, survey_start_ns
 from .laser_scan import ScanRays
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
@@ -46,12 +47,6 @@ UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
 _SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
-# frames
-WORLD = "map"
-CARRIER = "base_link"
-_INSTRUMENTS = "imu", "gnss"
-# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
-START_NS = 1_000_000_000_000_000_000
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
 _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
@@ -200,7 +195,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: PointLayout, types: Any)
     columns = {column.name for column in cloud.table if column.name != "class" or sweeps.classes}
     row = layout.row([name for name, (_, needs) in _EXTRA.items() if needs <= columns])
     sweep_messages = _SweepMessages(_Messages(types), sweeps, layout, row)
-    start_ns = _start_ns(sweeps)
+    start_ns = survey_start_ns(sweeps)
     measured = sweep_messages.make.instrument_messages(sweeps, start_ns)
     waiting = next(measured, None)
     yield from sweep_messages.static_messages(columns)
@@ -231,11 +226,11 @@ class _SweepMessages:
             for name, (kind, offset, *_) in (row.fields or {}).items()
         ]
         self._frames = _frames(sweeps)
-        self._actors = self._frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
+        self._actors = self._frames[len(sweeps.sensors) : -len(INSTRUMENTS)]
         poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         # Carrier and actors: frame and poses.
         self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
-        self._start_ns = _start_ns(sweeps)
+        self._start_ns = survey_start_ns(sweeps)
 
     def static_messages(self, columns: set[str]) -> Iterator[Sent]:
         """Yield the messages that are sent once; `columns` are the names of the cloud's columns."""
@@ -363,7 +358,7 @@ class Reader(reading.Reader):
         """Return the PointCloud2 of a sweep; ValueError if the bag lacks the message."""
         topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
         connections = [opened for opened in self._bag.connections if opened.topic == topic]
-        time_ns = _start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
+        time_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
         record = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
         if record is None:  # rosbags 0.11.2 misses some messages by their time
             records = self._bag.messages(connections)
@@ -392,18 +387,13 @@ class Reader(reading.Reader):
 
 def _frames(sweeps: Sweeps) -> list[str]:
     """Return the frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
-    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2:]
+    return frame_names(sweeps.sensors, sweeps.actors)
 
 
 def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
     """Return the topic of the points of a sweep."""
     sensor = sweeps.sensor[sweep]
-    return f"/{frames[sensor]}/points" if sweeps.sensors[sensor] else "/points"
-
-
-def _start_ns(sweeps: Sweeps) -> int:
-    return START_NS if sweeps.start_ns is None else sweeps.start_ns
+    return points_topic(sweeps.sensors[sensor], frames[sensor])
 
 
 def _rows(
