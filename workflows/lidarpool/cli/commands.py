@@ -31,6 +31,7 @@ from lidarsim.base.words import plural
 from ..base.logs import set_logs
 from ..base.shard import ALL
 from . import shared_options as shared
+from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
 
@@ -165,7 +166,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
-        *(view, plot, export, compare, fit),
+        *(view, play, plot, export, compare, fit),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import ClassVar
@@ -18,6 +18,7 @@ from ..sensor import Sensor
 from ..sensor.packet_settings import Identifier, PacketSettings
 from ..sweeps.instruments import Instruments
 from ..sweeps.sweeps import Sweeps
+from .service import Destination, Service
 from .shots import Shots, settings_of
 
 # Plug-ins are subclasses of `PacketEncoder`; the name of a plug-in is the `format` of data files.
@@ -119,6 +120,16 @@ class PacketEncoder(ABC):
     def files(self) -> Mapping[str, bytes]:
         """Return files that readers need beside the packets, {suffix: content}."""
         return {}
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service | None:
+        """Return what answers the maker's software for a live sensor, or None for no service.
+
+        `address` is where it listens, HOST:PORT; "" for the maker's port on the loopback interface.
+        The other parameters are those of `Service`.
+        """
+        return None
 
     @property
     def firing_interval_ns(self) -> int:

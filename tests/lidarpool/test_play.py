@@ -1,0 +1,119 @@
+"""The command `play`: sources and schedule, through a bridge that keeps what it is sent."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarpool import LidarError
+from lidarpool.cli.commands import cli
+from lidarpool.export.formats import Format
+from lidarpool.playback import bridge as bridges
+from lidarpool.playback.bridge import Bridge, BridgeEntry
+from lidarpool.playback.schedule import MadeAhead
+from lidarpool.playback.sources import open_source
+
+SCENARIO = """
+sensor: {model: velodyne/vlp16, rate_hz: 20}
+scene: {preset: seed}
+poses: [[0, 0, 1]]
+steps: 108
+"""
+
+
+class Kept(Bridge):
+    """Keeps the sweeps that it is sent, and when."""
+
+    format = Format("pcap")
+    sent: list = []  # noqa: RUF012 - the test reads it
+
+    description = "nowhere"
+
+    def send(self, sweep, points, shift_ns):
+        late_ns = time.monotonic_ns() - self.schedule.deadline_ns(self.due_ns(sweep) + shift_ns)
+        self.sent.append((sweep, points, shift_ns, late_ns))
+        if len(self.sent) == 5:
+            raise KeyboardInterrupt
+
+    def finish(self):
+        return f"{len(self.sent)} sweeps"
+
+    def __exit__(self, *error):
+        self.sent.append("closed")
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    monkeypatch.setitem(bridges.BRIDGES, "kept", BridgeEntry(f"{__name__}:Kept"))
+    monkeypatch.setattr(Kept, "sent", [])
+    return Kept.sent
+
+
+def play(*arguments):
+    return CliRunner().invoke(cli, ["play", *map(str, arguments)])
+
+
+def test_sweeps_of_a_scenario_and_its_result_leave_at_their_times(kept, tmp_path):
+    scenario = tmp_path / "s.yaml"
+    scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
+    outcome = play(scenario, "--as", "kept", "--rate", 2)
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.stdout == "ready: nowhere; Ctrl-C stops\n3 sweeps\n"
+    *cast, closed = kept
+    assert closed == "closed"
+    assert [sweep for sweep, *_ in cast] == [0, 1, 2]
+    assert all(0 <= late_ns < 0.5e9 for *_, late_ns in cast)
+    assert all("reflectivity" in points.columns for _, points, *_ in cast)
+
+
+def test_a_loop_goes_on_in_time_until_ctrl_c(kept, tmp_path):
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    outcome = play(tmp_path / "s.yaml", "--as", "kept", "--loop", "--rate", 4)
+    assert outcome.exit_code == 1  # click's word for an interrupt
+    *sent, closed = kept
+    assert closed == "closed"
+    assert [sweep for sweep, *_ in sent] == [0, 1, 2, 0, 1]
+    shifts_ns = [shift_ns for _, _, shift_ns, _ in sent]
+    assert shifts_ns[:3] == [0, 0, 0]
+    assert shifts_ns[3:] == pytest.approx([150e6, 150e6], rel=1e-3)
+
+
+def test_a_result_gives_the_points_of_its_scenario(tmp_path):
+    scenario = tmp_path / "s.yaml"
+    scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
+    outcome = CliRunner().invoke(
+        cli, ["run", str(scenario), "--out", str(tmp_path / "out"), "--no-plan", "--only", "cloud"]
+    )
+    assert outcome.exit_code == 0, outcome.output
+    with open_source(tmp_path / "out") as recorded, open_source(scenario, Kept.format) as cast:
+        for (sweep, points), (same_sweep, same_points) in zip(recorded, cast, strict=True):
+            assert sweep == same_sweep
+            assert np.allclose(points.positions, same_points.positions, atol=1e-5)
+            assert np.array_equal(points["ray"], same_points["ray"])
+
+
+def test_what_cannot_be_played_is_refused_in_a_line(tmp_path):
+    (tmp_path / "a.pcap").write_bytes(b"")
+    needs_packets = pytest.raises(LidarError, match="holds packets: play it with --as packets")
+    with needs_packets, open_source(tmp_path / "a.pcap"):
+        pass
+    lacks_cloud = pytest.raises(LidarError, match=r"holds no cloud\.ply: give a scenario")
+    with lacks_cloud, open_source(tmp_path):
+        pass
+    with pytest.raises(LidarError, match=r"'foxglov' is no bridge: use packets"):
+        bridges.bridge_class("foxglov")
+
+
+def test_an_error_of_what_is_made_ahead_comes_at_its_place():
+    def items():
+        yield 1
+        raise LidarError("no more")
+
+    with MadeAhead(items(), 4) as made_ahead:
+        ahead = iter(made_ahead)
+        assert next(ahead) == 1
+        with pytest.raises(LidarError, match="no more"):
+            next(ahead)

@@ -1,0 +1,120 @@
+"""Bridges: where played sweeps go, by the protocol of `--as`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import ClassVar, NamedTuple, Self
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import did_you_mean
+from lidarsim.columns.cloud import Cloud
+from lidarsim.sweeps.sweeps import Sweeps
+
+from ..export.formats import Format
+from .schedule import Schedule
+
+
+@dataclass(frozen=True)
+class BridgeOptions:
+    """Options of the command that bridges share, or that some bridges have."""
+
+    to: tuple[str, ...] = ()  # addresses; empty for that of the bridge, on the loopback interface
+    settings: dict[str, str] = field(default_factory=dict)  # {option of some bridges: value}
+
+
+class Bridge(ABC):
+    """Sends sweeps to receivers; a context manager that opens and closes what it sends by.
+
+    A subclass checks its options when it is made, and raises LidarError, in one line, for what it
+    cannot send.
+
+    Parameters
+    ----------
+    sweeps
+        The sweeps that will be sent.
+    schedule
+        Their times; it starts before the first `send`.
+    options
+        Options of the command.
+    note
+        Prints a note for the user.
+    """
+
+    format: ClassVar[Format | None] = None  # of clouds that have the columns that the bridge sends
+    settings: ClassVar[tuple[str, ...]] = ()  # options of the command beside `to`
+
+    def __init__(
+        self,
+        sweeps: Sweeps,
+        schedule: Schedule,
+        options: BridgeOptions,
+        note: Callable[[str], None],
+    ) -> None:
+        self.sweeps = sweeps
+        self.schedule = schedule
+        self.options = options
+        self.note = note
+
+    @property
+    @abstractmethod
+    def description(self) -> str:
+        """The address where receivers find the sweeps, for the line that says «ready»."""
+
+    def due_ns(self, sweep: int) -> float:
+        """Return when a sweep is sent, nanoseconds since the survey's start: after its last firing.
+
+        A bridge that spreads a sweep over its time gets the sweep earlier.
+        """
+        return float(self.sweeps.ends_ns[sweep])
+
+    @abstractmethod
+    def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
+        """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
+
+    def finish(self) -> str:
+        """Send what is left after the last sweep; return a summary for the user, or nothing."""
+        return ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abstractmethod
+    def __exit__(self, *error: object) -> None:
+        """Close all connections, and end all threads and processes."""
+
+
+class BridgeEntry(NamedTuple):
+    """Where a bridge is implemented, and the extra that installs its packages."""
+
+    target: str  # module and class
+    extra: str = ""
+
+
+# {name for --as: the bridge}
+BRIDGES = {
+    "packets": BridgeEntry("lidarpool.playback.packets:PacketsBridge"),
+}
+
+
+def bridge_class(name: str) -> type[Bridge]:
+    """Return the class of a bridge.
+
+    LidarError if there is no bridge of that name, or its packages are not installed.
+    """
+    if name not in BRIDGES:
+        names = ", ".join(BRIDGES)
+        raise LidarError(f"{name!r} is no bridge: use {names}.{did_you_mean(name, BRIDGES)}")
+    entry = BRIDGES[name]
+    module, _, attribute = entry.target.partition(":")
+    try:
+        bridge: type[Bridge] = getattr(import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        if not entry.extra or (error.name or "").startswith("lidar"):
+            raise
+        raise LidarError(
+            f'--as {name} needs {error.name}: pip install "lidarpool[{entry.extra}]".'
+        ) from error
+    return bridge
