@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scenario.build import Job
+    from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [
     "Actor",
@@ -67,6 +68,7 @@ __all__ = [
     "Fault",
     "Fit",
     "Follower",
+    "Foxglove",
     "Gnss",
     "Imu",
     "Job",
@@ -80,6 +82,7 @@ __all__ = [
     "Plan",
     "Planning",
     "Pose",
+    "Rerun",
     "Result",
     "Returns",
     "Robot",
@@ -130,6 +133,7 @@ _MODULES = {
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),
+    ".viewers.scanner_view": ("Foxglove", "Rerun"),
     "lidarscenes.robots.robot": ("Robot",),
     "lidarscenes.robots.urdf": ("load_robot",),
 }

@@ -13,7 +13,9 @@ from . import shared_options as options
 
 @click.command()
 @click.argument("source", metavar="SOURCE", type=options.StoragePath())
-@click.option("--as", "bridge_name", metavar="BRIDGE", required=True, help="packets.")
+@click.option(
+    "--as", "bridge_name", metavar="BRIDGE", required=True, help="packets, foxglove or rerun."
+)
 @click.option(
     "--to", metavar="ADDRESS", multiple=True, help="Where to send, by default on this machine."
 )
@@ -50,6 +52,7 @@ def play(
         open_source(source, kind.format) as played,
         kind(played.sweeps, schedule, BridgeOptions(to), terminal.tell) as bridge,
     ):
+        bridge.show_content(played.content())
         click.echo(f"ready: {bridge.description}; Ctrl-C stops")
         play_sweeps(played, bridge, schedule, terminal.tell, loop=loop)
         if summary := bridge.finish():

@@ -33,7 +33,7 @@ from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.ray_image import Image
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, SweepPoses, Sweeps
 
 from . import reading
 from .boxes import Boxes

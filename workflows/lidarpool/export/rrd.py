@@ -15,7 +15,7 @@ from lidarview.picture_file import PictureContent
 from lidarview.render.colouring import TURBO
 
 from .frames import CARRIER, START_NS, WORLD
-from .shown_sweeps import ActorBoxes, ShownSweep, SweepSequence, Surroundings
+from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 
 APPLICATION = "lidarpool"
 SURVEY_TIME = "survey"  # timeline: since the survey's start
@@ -93,7 +93,11 @@ class RerunLog:
         for name, positions in surroundings.trajectories.items():
             self._log_static(f"{WORLD}/trajectories/{name}", self._line(positions, _BLUE))
         if surroundings.path is not None:
-            self._log_static(f"{WORLD}/path", self._line(surroundings.path, _GREEN))
+            self.show_path(surroundings.path)
+
+    def show_path(self, path: Floats) -> None:
+        """Log a planned path, (w, 3), metres, world coordinates."""
+        self._log_static(f"{WORLD}/path", self._line(path, _GREEN))
 
     def show_sweep(self, shown: ShownSweep) -> None:
         """Log the points of a sweep, its frames and its boxes of actors."""
@@ -101,17 +105,17 @@ class RerunLog:
         self._recording.set_time(SURVEY_TIME, duration=since_ns)
         if self._start_ns != START_NS:
             self._recording.set_time(UTC_TIME, timestamp=np.datetime64(shown.start_ns, "ns"))
+        paths = {WORLD: WORLD}  # {frame: path of its entity}
         for transform in shown.transforms:
-            if transform.parent == WORLD and transform.name != CARRIER:
+            if transform.parent == WORLD and transform.name not in (CARRIER, shown.frame):
                 continue  # of an actor, whose box has a pose of its own
-            is_carrier = transform.parent == WORLD
-            path = f"{WORLD}/{CARRIER}" + ("" if is_carrier else f"/{transform.name}")
-            position = transform.position - self._origin if is_carrier else transform.position
+            path = paths[transform.name] = f"{paths[transform.parent]}/{transform.name}"
+            in_world = transform.parent == WORLD
+            position = transform.position - self._origin if in_world else transform.position
             pose = rr.Transform3D(
                 translation=position, quaternion=rr.Quaternion(xyzw=transform.quaternion)
             )
             self._recording.log(path, pose)
-        points = f"{WORLD}/{CARRIER}/{shown.frame}/points"
         class_ids = None
         colours: Bytes | None = None
         if self._has_classes and "class" in shown.columns and "red" not in shown.columns:
@@ -124,7 +128,7 @@ class RerunLog:
             radii=rr.Radius.ui_points(_POINT_PIXELS),
             class_ids=class_ids,
         )
-        self._recording.log(points, cloud, rr.AnyValues(**shown.columns))
+        self._recording.log(f"{paths[shown.frame]}/points", cloud, rr.AnyValues(**shown.columns))
         if shown.boxes is not None:
             self._recording.log(f"{WORLD}/actors", self._boxes(shown.boxes))
 

@@ -211,4 +211,3 @@ def sendable(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
         name: values.astype(_SENT_TYPES.get(values.dtype.str[1:], values.dtype), copy=False)
         for name, values in numbers.items()
     }
-

@@ -12,6 +12,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.words import did_you_mean
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent
 
 from ..export.formats import Format
 from .schedule import Schedule
@@ -70,6 +71,9 @@ class Bridge(ABC):
         """
         return float(self.sweeps.ends_ns[sweep])
 
+    def show_content(self, content: PictureContent | None) -> None:  # noqa: B027
+        """Show scene and planned path before the first sweep; most receivers have no use for it."""
+
     @abstractmethod
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
         """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
@@ -96,6 +100,8 @@ class BridgeEntry(NamedTuple):
 # {name for --as: the bridge}
 BRIDGES = {
     "packets": BridgeEntry("lidarpool.playback.packets:PacketsBridge"),
+    "foxglove": BridgeEntry("lidarpool.playback.viewer_bridges:FoxgloveBridge", "live"),
+    "rerun": BridgeEntry("lidarpool.playback.viewer_bridges:RerunBridge", "rerun"),
 }
 
 

@@ -19,6 +19,7 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent
 
 from ..export.folder import local_result
 from ..export.formats import Format
@@ -42,6 +43,8 @@ class Played:
 
     sweeps: Sweeps
     points: Callable[[int], Cloud]  # of the sweep of a number; casts the sweep of a scenario
+    # Returns scene and planned path; None for a result without them.
+    content: Callable[[], PictureContent | None] = lambda: None
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
@@ -84,7 +87,7 @@ def open_source(source: Path | Storage, needs: Format | None = None) -> Iterator
                 )
             yield _cast(scenario_job(source, needs), stack)
             return
-        files = (CLOUD, SWEEPS_FILE, *INSTRUMENT_FILES)
+        files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
         folder = stack.enter_context(local_result(source, files))
         yield _recorded(folder, source)
 
@@ -99,7 +102,12 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
             )
     sweeps = Sweeps.load(folder / SWEEPS_FILE)
     cloud = CloudFile(folder / CLOUD)
-    return Played(sweeps, lambda sweep: next(sweeps.points(cloud, sweep, sweep + 1)))
+    has_pictures = (folder / PICTURE_FILE).exists()
+    return Played(
+        sweeps,
+        lambda sweep: next(sweeps.points(cloud, sweep, sweep + 1)),
+        lambda: PictureContent.load(folder / PICTURE_FILE) if has_pictures else None,
+    )
 
 
 def scenario_job(path: Path, needs: Format | None = None) -> Job:
@@ -137,4 +145,4 @@ def _cast(job: Job, stack: ExitStack) -> Played:
         part = columns_of([*rig.cast(start, stop)])
         return part.cloud(table, survey.precision_m, origin)
 
-    return Played(sweeps, cast)
+    return Played(sweeps, cast, lambda: PictureContent.before_casting(job.scene, survey)[0])

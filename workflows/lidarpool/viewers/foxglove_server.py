@@ -32,6 +32,7 @@ _NUMBER_TYPES = {
     "f4": messages.PackedElementFieldNumericType.Float32,
     "f8": messages.PackedElementFieldNumericType.Float64,
 }
+_FRAMES = "/tf"
 _GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=1.0)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
@@ -53,7 +54,7 @@ class FoxgloveServer(Viewer):
     Parameters
     ----------
     to
-        ADDRESS:PORT to listen on; 127.0.0.1:8765 by default.
+        ADDRESS:PORT to listen on; by default 127.0.0.1:8765, or another port if it is in use.
     title
         Name of the source of data in Foxglove.
     sends_time
@@ -68,13 +69,13 @@ class FoxgloveServer(Viewer):
     def __init__(
         self, to: str | None = None, title: str = "lidarpool", *, sends_time: bool = False
     ) -> None:
-        address = Address.parse(to, PORT)
-        address.check_free()
+        address = Address.choose(to, PORT)
         # The server logs malformed requests of clients as warnings.
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._context = foxglove.Context()
         self._channels: dict[str, Any] = {}  # {topic: channel}
         self._latest: dict[str, tuple[Any, int]] = {}  # {topic: message, time in nanoseconds}
+        self._frames: dict[str, Any] = {}  # {name: last transform}
         self._sends_time = sends_time
         self._start_ns = 0  # of the last sweep
         try:
@@ -118,8 +119,11 @@ class FoxgloveServer(Viewer):
             ]
             self._send_entities("/trajectories", entities)
         if surroundings.path is not None:
-            path = _entity("path", lines=[_line(surroundings.path, _GREEN)])
-            self._send_entities("/path", [path])
+            self.show_path(surroundings.path)
+
+    def show_path(self, path: Floats) -> None:
+        """Show a planned path, (w, 3), metres, world coordinates."""
+        self._send_entities("/path", [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
         """Show the points of a sweep, its frames and its boxes of actors; return at once."""
@@ -127,9 +131,12 @@ class FoxgloveServer(Viewer):
         if self._sends_time:
             self._server.broadcast_time(shown.start_ns)
         stamp = _timestamp(shown.start_ns)
-        transforms = [_transform(transform, stamp) for transform in shown.transforms]
-        frames = messages.FrameTransforms(transforms=transforms)
-        self._send("/tf", channels.FrameTransformsChannel, frames, shown.start_ns)
+        transforms = {t.name: _transform(t, stamp) for t in shown.transforms}
+        frames = messages.FrameTransforms(transforms=[*transforms.values()])
+        self._send(_FRAMES, channels.FrameTransformsChannel, frames, shown.start_ns)
+        self._frames |= transforms
+        all_frames = messages.FrameTransforms(transforms=[*self._frames.values()])
+        self._latest[_FRAMES] = all_frames, shown.start_ns
         self._send(shown.topic, channels.PointCloudChannel, _point_cloud(shown), shown.start_ns)
         if shown.boxes is not None:
             actors = _actors(shown.boxes, stamp)
@@ -145,9 +152,9 @@ class FoxgloveServer(Viewer):
 
     def _send(self, topic: str, kind: Callable[..., Any], message: Any, time_ns: int) -> None:
         """Send a message to all subscribers of a topic."""
-        self._latest[topic] = message, time_ns
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
+        self._latest[topic] = message, time_ns  # `_send_again` may run from now on
         self._channels[topic].log(message, log_time=time_ns)
 
     def _send_again(self, topic: str) -> None:
@@ -182,9 +189,7 @@ def packed_points(shown: ShownSweep) -> Records:
 def _point_cloud(shown: ShownSweep) -> Any:
     rows = packed_points(shown)
     fields = [
-        messages.PackedElementField(
-            name=name, offset=offset, type=_NUMBER_TYPES[kind.str[1:]]
-        )
+        messages.PackedElementField(name=name, offset=offset, type=_NUMBER_TYPES[kind.str[1:]])
         for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
     ]
     return messages.PointCloud(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 
 import rerun as rr
 
+from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 
 from ..export.rrd import APPLICATION, RerunLog
@@ -23,7 +27,8 @@ class RerunServer(Viewer):
     Parameters
     ----------
     to
-        ADDRESS:PORT to listen on, 127.0.0.1:9876 by default; the page has the port after it.
+        ADDRESS:PORT to listen on, the page of the viewer on the port after it; by default
+        127.0.0.1:9876, or another port if it is in use.
     title
         Name of the recording in Rerun.
 
@@ -34,10 +39,8 @@ class RerunServer(Viewer):
     """
 
     def __init__(self, to: str | None = None, title: str = "lidarpool") -> None:
-        address = Address.parse(to, PORT)
+        address = Address.choose(to, PORT, count=2)
         page = Address(address.host, address.port + 1)
-        for place in (address, page):
-            place.check_free()
         # `RecordingStream.serve_grpc` would listen on all interfaces.
         command = ["--serve-web", "--bind", address.host, "--port", f"{address.port}"]
         command += ["--web-viewer-port", f"{page.port}", "--hide-welcome-screen"]
@@ -49,7 +52,7 @@ class RerunServer(Viewer):
         )
         self._recording = rr.RecordingStream(APPLICATION)
         try:
-            address.wait(_READY_S, lambda: self._process.poll() is None)
+            address.wait_until_open(_READY_S, lambda: self._process.poll() is None)
             source = f"rerun+http://{address}/proxy"
             self._recording.connect_grpc(source)
         except LidarError:
@@ -63,6 +66,10 @@ class RerunServer(Viewer):
         """Show scene, trajectories and path in place of earlier ones."""
         self._log.show_surroundings(surroundings)
 
+    def show_path(self, path: Floats) -> None:
+        """Show a planned path, (w, 3), metres, world coordinates."""
+        self._log.show_path(path)
+
     def show_sweep(self, shown: ShownSweep) -> None:
         """Show the points of a sweep, its frames and its boxes of actors; return at once."""
         self._log.show_sweep(shown)
@@ -70,5 +77,6 @@ class RerunServer(Viewer):
     def close(self) -> None:
         """Send what waits, and end the server."""
         self._recording.disconnect()
-        self._process.terminate()
+        with suppress(ProcessLookupError):  # it has ended by itself
+            os.killpg(self._process.pid, signal.SIGTERM)  # the program is a child of the module
         self._process.wait()

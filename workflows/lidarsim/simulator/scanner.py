@@ -189,6 +189,21 @@ class Scanner:
         """World coordinates of the scene's local origin, metres: (3,)."""
         return self._rig.scene.origin
 
+    @property
+    def scene(self) -> Scene:
+        """The scene, with actors and instances where they were moved."""
+        return self._rig.scene
+
+    @property
+    def mounted(self) -> Mounted:
+        """The sensor, with its name and its pose on the carrier."""
+        return self._rig.survey.carried[0]
+
+    @property
+    def coordinates(self) -> str:
+        """Coordinates of the points of sweeps: "world" or "sensor"."""
+        return self._rig.survey.coordinates
+
     @checked
     def span_s(
         self, number: SweepNumber = 0, *, start_s: StartSeconds = None
