@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -158,12 +159,7 @@ def export(
                 )
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
-
-        def content() -> PictureContent | None:
-            """Return scene and planned path, if the result has any."""
-            pictures = source / PICTURE_FILE
-            return PictureContent.load(pictures) if pictures.exists() else None
-
+        pictures = partial(PictureContent.load_from, source)
         # Formats that have the option; if no format has the option, all, which refuse it.
         compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
             *formats
@@ -188,7 +184,7 @@ def export(
             try:
                 for chosen in chosen_formats:
                     file = folder / chosen.row.file
-                    chosen.write(file, cloud, sweeps, overwrite=overwrite, content=content)
+                    chosen.write(file, cloud, sweeps, overwrite=overwrite, content=pictures)
                     written.append(click.format_filename(send(folder / chosen.row.file, target)))
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)

@@ -238,8 +238,8 @@ def save_cloud(
 ) -> list[str]:
     """Write points in the format of the path's ending, completely or not at all.
 
-    The same points give the same bytes, except in .rrd. About a million points are in memory at a time, or
-    those of the largest sweep.
+    The same points give the same bytes, except in .rrd. About a million points are in memory at a
+    time, or those of the largest sweep.
 
     Parameters
     ----------

@@ -68,6 +68,8 @@ class Surroundings:
     path: Floats | None = None  # (w, 3): corners of the planned path, metres, world coordinates
     classes: Mapping[int, str] = field(default_factory=dict)  # {number: name}
     start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
+    topics: Sequence[str] = ()  # of the points of sweeps that will follow
+    has_actors: bool = False  # True if these sweeps have boxes
 
     @property
     def origin(self) -> Floats:
@@ -94,7 +96,13 @@ class Surroundings:
             surroundings = cls(trajectories=trajectories)
         else:
             surroundings = cls.from_content(content, trajectories)
-        return replace(surroundings, classes=sweeps.classes, start_ns=survey_start_ns(sweeps))
+        return replace(
+            surroundings,
+            classes=sweeps.classes,
+            start_ns=survey_start_ns(sweeps),
+            topics=[*map(points_topic, sweeps.sensors, frames)],
+            has_actors=bool(sweeps.actors),
+        )
 
     @classmethod
     def from_content(
@@ -168,11 +176,6 @@ class SweepSequence:
             Transform(CARRIER, self._frames[number], *mount) for number, mount in enumerate(mounts)
         ]
 
-    @property
-    def topics(self) -> list[str]:
-        """Topics of the points of all sensors."""
-        return [*map(points_topic, self.sweeps.sensors, self._frames)]
-
     def show(self, sweep: int, points: Cloud) -> ShownSweep:
         """Return the shown sweep of a number with its points."""
         sweeps = self.sweeps
@@ -180,7 +183,7 @@ class SweepSequence:
         return ShownSweep(
             start_ns=self.start_ns + round(sweeps.begins_ns[sweep]),
             stamp_ns=self.start_ns + sweeps.stamp_ns(sweep),
-            topic=self.topics[sensor],
+            topic=points_topic(sweeps.sensors[sensor], self._frames[sensor]),
             frame=self._frames[sensor],
             positions=sweeps.compensated(sweep, points).astype(np.float32),
             columns=sendable(sweeps.columns_compensated(sweep, points)),

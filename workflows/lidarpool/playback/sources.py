@@ -102,11 +102,10 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
             )
     sweeps = Sweeps.load(folder / SWEEPS_FILE)
     cloud = CloudFile(folder / CLOUD)
-    has_pictures = (folder / PICTURE_FILE).exists()
     return Played(
         sweeps,
         lambda sweep: next(sweeps.points(cloud, sweep, sweep + 1)),
-        lambda: PictureContent.load(folder / PICTURE_FILE) if has_pictures else None,
+        lambda: PictureContent.load_from(folder),
     )
 
 

@@ -33,6 +33,7 @@ _NUMBER_TYPES = {
     "f8": messages.PackedElementFieldNumericType.Float64,
 }
 _FRAMES = "/tf"
+_ACTORS = "/actors"
 _GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=1.0)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
@@ -109,6 +110,11 @@ class FoxgloveServer(Viewer):
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
         """Show scene, trajectories and path in place of earlier ones."""
+        self._channel(_FRAMES, channels.FrameTransformsChannel)
+        for topic in surroundings.topics:  # clients subscribe before the first sweep
+            self._channel(topic, channels.PointCloudChannel)
+        if surroundings.has_actors:
+            self._channel(_ACTORS, channels.SceneUpdateChannel)
         if surroundings.surface is not None:
             triangles = [*_triangles(surroundings.surface)]
             self._send_entities("/scene", [_entity("scene", triangles=triangles)])
@@ -140,7 +146,7 @@ class FoxgloveServer(Viewer):
         self._send(shown.topic, channels.PointCloudChannel, _point_cloud(shown), shown.start_ns)
         if shown.boxes is not None:
             actors = _actors(shown.boxes, stamp)
-            self._send("/actors", channels.SceneUpdateChannel, actors, shown.start_ns)
+            self._send(_ACTORS, channels.SceneUpdateChannel, actors, shown.start_ns)
 
     def close(self) -> None:
         """Disconnect all clients."""
@@ -152,10 +158,15 @@ class FoxgloveServer(Viewer):
 
     def _send(self, topic: str, kind: Callable[..., Any], message: Any, time_ns: int) -> None:
         """Send a message to all subscribers of a topic."""
+        channel = self._channel(topic, kind)
+        self._latest[topic] = message, time_ns
+        channel.log(message, log_time=time_ns)
+
+    def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
+        """Return the channel of a topic, of which clients hear when it is made."""
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
-        self._latest[topic] = message, time_ns  # `_send_again` may run from now on
-        self._channels[topic].log(message, log_time=time_ns)
+        return self._channels[topic]
 
     def _send_again(self, topic: str) -> None:
         """Send the last message of a topic again, to all subscribers."""

@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import Actor
 from lidarsim.sensor import Pose, Trajectory
@@ -35,15 +36,25 @@ class ScannerView:
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         self._viewer = viewer
         self._scanner = scanner
-        surroundings = Surroundings(Surface.from_scene(scanner.scene), start_ns=time.time_ns())
+        name = scanner.mounted.name
+        surroundings = Surroundings(
+            Surface.from_scene(scanner.scene),
+            start_ns=time.time_ns(),
+            topics=[points_topic(name, frame_names([name], [])[0])],
+            has_actors=bool(scanner.scene.actors),
+        )
         viewer.show_surroundings(surroundings)
         click.echo(viewer.description, err=True)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._scanner!r}>"
 
     @property
     def description(self) -> str:
         """One line for users: what to open."""
         return self._viewer.description
 
+    @checked
     def show(
         self,
         cloud: Cloud,
@@ -99,6 +110,7 @@ class Foxglove(ScannerView):
         If foxglove-sdk is missing (`pip install "lidarpool[live]"`), or the address cannot be used.
     """
 
+    @checked
     def __init__(self, scanner: Scanner, to: str | None = None) -> None:
         super().__init__(open_viewer("foxglove", to), scanner)
 
@@ -110,6 +122,7 @@ class Rerun(ScannerView):
     the page on the next port. It needs rerun-sdk (`pip install "lidarpool[rerun]"`).
     """
 
+    @checked
     def __init__(self, scanner: Scanner, to: str | None = None) -> None:
         super().__init__(open_viewer("rerun", to), scanner)
 

@@ -104,9 +104,14 @@ class FoxgloveClient:
     """Subscribes to all topics, and keeps what comes; a context manager."""
 
     def __init__(self, port, protocol="foxglove.sdk.v1"):
-        self.socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None, proxy=None
+        self._connection = connect(
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[protocol],
+            max_size=None,
+            proxy=None,
+            close_timeout=0.2,
         )
+        self.socket = self._connection.__enter__()
         self.channels = {}  # {id: (topic, name of the schema, schemas)}
         self.messages = []  # (topic, time in nanoseconds, message)
         self.times_ns = []  # of the server's clock
@@ -117,7 +122,7 @@ class FoxgloveClient:
         return self
 
     def __exit__(self, *error):
-        self.socket.close()
+        self._connection.__exit__(*error)
 
     def receive(self, is_complete=lambda client: False, timeout_s=10):
         """Receive until a condition holds, or nothing comes for a time."""
