@@ -356,7 +356,7 @@ def test_a_run_shows_its_finished_sweeps_and_its_path(room, monkeypatch):
         columns=["time", "intensity"],
         keep_every=1,
     )
-    planning = Planning((-8, -8), (8, 8), [(0, 0)], [1.0])
+    planning = Planning((-8, -8), (8, 8), [(0, 0)], [1.0], trials=2)
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster) as client,
