@@ -16,7 +16,7 @@ pytest.importorskip("rerun", reason="needs rerun-sdk, 500 MB")
 
 from rerun.chunk import RrdReader
 
-from lidarpool import Cloud
+from lidarpool import Cloud, LidarError
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.formats import Format, save_cloud
 from lidarpool.playback.sources import open_source
@@ -135,6 +135,21 @@ def test_coordinates_of_maps_keep_their_precision(scanned, tmp_path):
     origin = [rows["/__properties/origin", axis][0][1][0] for axis in "xyz"]
     assert origin == [430_000, 5_810_000, 0]
     check(rows, on_map, clouds, np.array(origin))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no limits of files")
+def test_a_full_disk_is_one_line_and_leaves_nothing(scanned, tmp_path):
+    import resource
+
+    sweeps, points, _ = scanned
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+    try:
+        with pytest.raises(LidarError, match="cannot be written"):
+            Format("rrd").write(tmp_path / "cloud.rrd", Cloud.joined(points), sweeps)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_a_server_on_loopback_ends_with_ctrl_c(tmp_path):

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
 import numpy as np
 import rerun as rr
@@ -20,6 +26,7 @@ from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 APPLICATION = "lidarpool"
 SURVEY_TIME = "survey"  # timeline: since the survey's start
 UTC_TIME = "utc"  # timeline of surveys with a date
+_PIPE_BYTES = 1 << 20
 _POINT_PIXELS = 1.5
 _LINE_PIXELS = 1.5
 _GREY = (150, 150, 150)
@@ -42,15 +49,58 @@ def write_rrd(
     float32 in Rerun, so those in the world are relative to the scene's local origin, which the
     recording's property `origin` holds. Rerun's own identifiers make the bytes of each file unique.
     """
+    with _recording_to(path) as recording:
+        log = RerunLog(recording)
+        log.show_surroundings(Surroundings.from_sweeps(sweeps, content))
+        sequence = SweepSequence(sweeps)
+        for sweep, points in enumerate(sweeps.points(cloud)):
+            log.show_sweep(sequence.show(sweep, points))
+
+
+@contextmanager
+def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
+    """Yield a recording that is written to a file; OSError if the file cannot be written.
+
+    Rerun's own writer logs the error of a full disk, and waits for ever: it writes to a pipe, from
+    which a thread writes to the file.
+    """
     recording = rr.RecordingStream(APPLICATION)
-    recording.save(path)
-    log = RerunLog(recording)
-    log.show_surroundings(Surroundings.from_sweeps(sweeps, content))
-    sequence = SweepSequence(sweeps)
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        log.show_sweep(sequence.show(sweep, points))
-    recording.flush()
-    recording.disconnect()
+    if not hasattr(os, "mkfifo"):  # Windows
+        recording.save(path)
+        yield recording
+        recording.disconnect()
+        return
+    with (
+        TemporaryDirectory(prefix="lidarpool-") as folder,
+        ThreadPoolExecutor(1, "rrd") as thread,  # waits for the thread
+        path.open("wb") as file,
+    ):
+        pipe = Path(folder, "pipe")
+        os.mkfifo(pipe)
+        source = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)  # else opening waits for a writer
+        os.set_blocking(source, True)
+        recording.save(pipe)
+        copying = thread.submit(_copy, source, file)
+        try:
+            yield recording
+        finally:
+            recording.disconnect()  # the end of the pipe
+        copying.result()
+
+
+def _copy(source: int, file: BinaryIO) -> None:
+    """Copy a pipe to a file; after an error, read on to the end, so that no writer waits."""
+    error: OSError | None = None
+    with open(source, "rb", buffering=0) as pipe:
+        while data := pipe.read(_PIPE_BYTES):
+            if error is None:
+                try:
+                    file.write(data)
+                    file.flush()
+                except OSError as caught:
+                    error = caught
+    if error is not None:
+        raise error
 
 
 class RerunLog:
