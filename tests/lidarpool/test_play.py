@@ -38,8 +38,7 @@ class Kept(Bridge):
         if len(self.sent) == 5:
             raise KeyboardInterrupt
 
-    def finish(self):
-        return f"{len(self.sent)} sweeps"
+    summary = "kept"
 
     def __exit__(self, *error):
         self.sent.append("closed")
@@ -61,7 +60,7 @@ def test_sweeps_of_a_scenario_and_its_result_leave_at_their_times(kept, tmp_path
     scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
     outcome = play(scenario, "--as", "kept", "--rate", 2)
     assert outcome.exit_code == 0, outcome.output
-    assert outcome.stdout == "ready: nowhere; Ctrl-C stops\n3 sweeps\n"
+    assert outcome.stdout == "ready: nowhere; Ctrl-C stops\nkept\n"
     *cast, closed = kept
     assert closed == "closed"
     assert [sweep for sweep, *_ in cast] == [0, 1, 2]

@@ -92,7 +92,7 @@ def bridge(played):
     sweeps, _, content = played
     options = BridgeOptions(("127.0.0.1:0",))
     with bridge_class("foxglove")(sweeps, Schedule(), options, print) as opened:
-        opened.show_content(content)
+        opened.show_content(lambda: content)
         yield opened
 
 

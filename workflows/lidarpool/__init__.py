@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lidarsim.columns.table import Column
     from lidarsim.follower import Follower
     from lidarsim.mujoco import MujocoScanner
+    from lidarsim.packets.sweep_packets import Packets
     from lidarsim.scene.actors import Actor
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from .export.open3d_cloud import to_open3d
     from .export.ply import read_cloud
     from .plan import Plan, Planning
+    from .playback.live import play
     from .report.merging import merge
     from .run.pipeline.messages import ScanFrame
     from .run.run_result import CampaignRun
@@ -79,6 +81,7 @@ __all__ = [
     "Navigation",
     "Noise",
     "Optics",
+    "Packets",
     "Plan",
     "Planning",
     "Pose",
@@ -104,6 +107,7 @@ __all__ = [
     "load_sensor",
     "load_trajectory",
     "merge",
+    "play",
     "read_cloud",
     "remove_run",
     "save_cloud",
@@ -127,6 +131,7 @@ _MODULES = {
     ".export.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),
     ".plan": ("Plan", "Planning"),
+    ".playback.live": ("play",),
     ".report.merging": ("merge",),
     ".compare.comparison": ("Comparison", "compare"),
     ".compare.fit": ("Fit", "fit"),

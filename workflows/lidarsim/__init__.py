@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .columns.table import Column
     from .follower import Follower
     from .mujoco import MujocoScanner
+    from .packets.sweep_packets import Packets
     from .scene.actors import Actor
     from .scene.scene import Scene
     from .scene.scene_instances import SceneInstance
@@ -57,6 +58,7 @@ __all__ = [
     "Navigation",
     "Noise",
     "Optics",
+    "Packets",
     "Pose",
     "Returns",
     "ScanSpec",
@@ -81,6 +83,7 @@ _MODULES = {
     "columns.table": ("Column",),
     "follower": ("Follower",),
     "mujoco": ("MujocoScanner",),
+    "packets.sweep_packets": ("Packets",),
     "scene.actors": ("Actor",),
     "scene.scene": ("Scene",),
     "scene.scene_instances": ("SceneInstance",),

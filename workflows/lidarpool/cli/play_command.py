@@ -1,8 +1,13 @@
-"""The command `play`: results and scenarios as live sensors."""
+"""The command `play`: results, scenarios and recordings as live sensors."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,50 +15,124 @@ from lidarsim.base.storage import Storage
 
 from . import shared_options as options
 
+_PACKETS = "packets"
+_NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: time to prepare
+
 
 @click.command()
 @click.argument("source", metavar="SOURCE", type=options.StoragePath())
 @click.option(
-    "--as", "bridge_name", metavar="BRIDGE", required=True, help="packets, foxglove or rerun."
+    "--as",
+    "bridge_name",
+    metavar="BRIDGE",
+    required=True,
+    help="packets: as the sensor sends; foxglove, rerun: for viewers.",
 )
 @click.option(
-    "--to", metavar="ADDRESS", multiple=True, help="Where to send, by default on this machine."
+    "--to",
+    metavar="[NAME=]ADDRESS",
+    multiple=True,
+    help="packets: where to send, HOST or HOST:PORT, for a sensor of several NAME=HOST:PORT; "
+    "viewers: where to listen.  [default: 127.0.0.1]",
 )
 @options.flag("--loop", help="Play again and again until Ctrl-C; times go on.")
 @click.option(
-    "--rate", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True,
+    "--rate",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
     help="Speed: 0.5 takes twice as long.",
-)  # fmt: skip
+)
+@options.flag("--now", help="Stamps of today's clock, not of the survey's start.")
+@click.option(
+    "--api",
+    metavar="[NAME=]ADDRESS",
+    multiple=True,
+    help="packets: where the sensor's own interface listens, HOST or HOST:PORT.  "
+    "[default: 127.0.0.1, port 80 or a free one]",
+)
+@options.new_file("--lateness", help="packets: how late they were, as JSON.")
 def play(
-    source: Path | Storage, bridge_name: str, to: tuple[str, ...], loop: bool, rate: float
+    source: Path | Storage,
+    bridge_name: str,
+    to: tuple[str, ...],
+    loop: bool,
+    rate: float,
+    now: bool,
+    **settings: Any,
 ) -> None:
     """Play a result or scenario as its sensors would send it, at its own time.
 
-    SOURCE: the folder of a result, or a scenario, campaign or mesh file, whose sweeps are cast as
-    they are due.
+    SOURCE: the folder of a result; a scenario, campaign or mesh file, whose sweeps are cast as they
+    are due; or packets in a .pcap file.
 
     \b
     Examples:
       lidarpool play drive --as packets
-      lidarpool play drive.yaml --as packets --loop
+      lidarpool play drive.yaml --as packets --loop --now
+      lidarpool play drive.yaml --as packets --to roof=127.0.0.1:2368 --to rear=127.0.0.1:2468
+      lidarpool play packets/lidar.pcap --as packets --rate 0.5
+      lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..playback.bridge import BridgeOptions, bridge_class
     from ..playback.player import play_sweeps
     from ..playback.schedule import Schedule
-    from ..playback.sources import open_source
+    from ..playback.sources import RECORDING, open_source
     from .terminal import Terminal
 
     keep_freed_memory()
     terminal = Terminal()
     kind = bridge_class(bridge_name)
+    given = {name: value for name, value in settings.items() if value not in (None, ())}
+    if unknown := [name for name in given if name not in kind.settings]:
+        raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
-    with (
-        open_source(source, kind.format) as played,
-        kind(played.sweeps, schedule, BridgeOptions(to), terminal.tell) as bridge,
-    ):
-        bridge.show_content(played.content())
-        click.echo(f"ready: {bridge.description}; Ctrl-C stops")
-        play_sweeps(played, bridge, schedule, terminal.tell, loop=loop)
-        if summary := bridge.finish():
-            click.echo(summary)
+    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix == RECORDING:
+        if now:
+            raise click.UsageError("--now: the stamps of recorded packets are in them.")
+        _play_recording(source, to, schedule, given, loop=loop)
+        return
+    with ExitStack() as stack:
+        with terminal.status("reading the source", logged=False):
+            played = stack.enter_context(open_source(source, kind.format))
+        sweeps = played.sweeps
+        start_at_ns = 0
+        if now:
+            start_at_ns = time.time_ns() + _NOW_NS
+            sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
+        bridge_options = BridgeOptions(to, played.period_ns if loop else 0, given)
+        bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
+        with _summarized(lambda: bridge.summary), bridge:
+            bridge.show_content(played.content)
+            click.echo(f"ready: {bridge.description}; Ctrl-C stops")
+            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
+
+
+def _play_recording(
+    path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
+) -> None:
+    """Play a recording of packets."""
+    from ..playback.recording import Recording, play_recording, recorded_streams
+    from ..playback.transmitter import Transmitter
+    from .terminal import Terminal
+
+    recording = Recording(path)
+    streams = recorded_streams(recording, to, settings.get("api", ()))
+    transmitter = Transmitter(streams, Terminal().tell)
+    with _summarized(lambda: transmitter.summary(settings.get("lateness"))), transmitter:
+        click.echo(f"ready: {transmitter.description}; Ctrl-C stops")
+        play_recording(recording, transmitter, schedule, loop=loop)
+
+
+@contextmanager
+def _summarized(summary: Callable[[], str]) -> Iterator[None]:
+    """Print a summary once the body has ended, also by Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if words := summary():
+            error.add_note(words)
+        raise
+    if words := summary():
+        click.echo(words)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import did_you_mean
@@ -23,7 +23,8 @@ class BridgeOptions:
     """Options of the command that bridges share, or that some bridges have."""
 
     to: tuple[str, ...] = ()  # addresses; empty for that of the bridge, on the loopback interface
-    settings: dict[str, str] = field(default_factory=dict)  # {option of some bridges: value}
+    period_ns: int = 0  # of --loop, see `Played.period_ns`; 0 to play once
+    settings: Mapping[str, Any] = field(default_factory=dict)  # {option of some bridges: value}
 
 
 class Bridge(ABC):
@@ -39,13 +40,14 @@ class Bridge(ABC):
     schedule
         Their times; it starts before the first `send`.
     options
-        Options of the command.
+        Options of the command; `settings` are those that the class names.
     note
         Prints a note for the user.
     """
 
     format: ClassVar[Format | None] = None  # of clouds that have the columns that the bridge sends
     settings: ClassVar[tuple[str, ...]] = ()  # options of the command beside `to`
+    lead_ns: ClassVar[float] = 0.0  # how long before `due_ns` the bridge gets a sweep
 
     def __init__(
         self,
@@ -67,19 +69,31 @@ class Bridge(ABC):
     def due_ns(self, sweep: int) -> float:
         """Return when a sweep is sent, nanoseconds since the survey's start: after its last firing.
 
-        A bridge that spreads a sweep over its time gets the sweep earlier.
+        A bridge that spreads a sweep over its time overrides this, and gets it `lead_ns` before.
         """
         return float(self.sweeps.ends_ns[sweep])
 
-    def show_content(self, content: PictureContent | None) -> None:  # noqa: B027
-        """Show scene and planned path before the first sweep; most receivers have no use for it."""
+    def prepare(self, sweep: int, points: Cloud) -> None:  # noqa: B027 - most need nothing
+        """Do what takes long the first time, such as compiling, before the schedule starts.
+
+        `sweep` is the first sweep of a sensor, which `send` gets later.
+        """
+
+    def show_content(  # noqa: B027 - most receivers have no use for a scene
+        self, content: Callable[[], PictureContent | None]
+    ) -> None:
+        """Show scene and planned path before the first sweep; `content` returns both."""
 
     @abstractmethod
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
         """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
 
-    def finish(self) -> str:
-        """Send what is left after the last sweep; return a summary for the user, or nothing."""
+    def finish(self) -> None:  # noqa: B027 - messages are sent at once
+        """Send what is left after the last sweep, and wait until all is sent."""
+
+    @property
+    def summary(self) -> str:
+        """What was sent, for the user, once the context has ended; or nothing."""
         return ""
 
     def __enter__(self) -> Self:

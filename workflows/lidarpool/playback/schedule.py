@@ -12,6 +12,12 @@ from lidarsim.base.arrays import Ints
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1
+# How late a sweep may be before the user reads that casting falls behind, seconds.
+BEHIND_S = 0.005
+BEHIND = (
+    "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
+    "(--rate)."
+)
 
 
 class Schedule:
@@ -42,13 +48,13 @@ class Schedule:
         """Return times of the survey (n,) by the clock, nanoseconds: (n,)."""
         return (self.deadline_ns(0.0) + times_ns / self.rate).astype("<i8")
 
-    def wait_until(self, time_ns: float) -> float:
-        """Sleep until a time of the survey; return by how much it is over, seconds."""
-        late_s = (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
-        if late_s < 0:
-            time.sleep(-late_s)
-            return 0.0
-        return late_s
+    def late_s(self, time_ns: float) -> float:
+        """Return by how much a time of the survey is over, seconds; negative before that time."""
+        return (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
+
+    def wait_until(self, time_ns: float) -> None:
+        """Sleep until a time of the survey, if that is not over."""
+        time.sleep(max(0.0, -self.late_s(time_ns)))
 
 
 class MadeAhead(Generic[Item]):

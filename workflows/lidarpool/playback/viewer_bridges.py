@@ -44,9 +44,9 @@ class ViewerBridge(Bridge):
         """What to open, for the line that says «ready»."""
         return self._viewer.description
 
-    def show_content(self, content: PictureContent | None) -> None:
+    def show_content(self, content: Callable[[], PictureContent | None]) -> None:
         """Show trajectories, and the scene and the path of the pictures' content."""
-        self._viewer.show_surroundings(Surroundings.from_sweeps(self.sweeps, content))
+        self._viewer.show_surroundings(Surroundings.from_sweeps(self.sweeps, content()))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
         """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""

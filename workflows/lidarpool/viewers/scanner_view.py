@@ -36,7 +36,7 @@ class ScannerView:
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         self._viewer = viewer
         self._scanner = scanner
-        name = scanner.mounted.name
+        name = scanner.survey.carried[0].name
         surroundings = Surroundings(
             Surface.from_scene(scanner.scene),
             start_ns=time.time_ns(),
@@ -130,11 +130,11 @@ class Rerun(ScannerView):
 def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
     """Return a sweep that a scanner has scanned from a pose or along a trajectory."""
     scene = scanner.scene
-    mounted = scanner.mounted
+    (mounted,) = scanner.survey.carried
     carrier = _pose_at(pose, time_ns)
     sensor = carrier.compose(mounted.mount)
     positions = cloud.positions.astype(np.float64)
-    if scanner.coordinates == "world":
+    if scanner.survey.coordinates == "world":
         positions = (positions - (scene.origin + sensor.position)) @ sensor.rotation_matrix
     frame, *actor_frames = frame_names([mounted.name], [actor.name for actor in scene.actors])
     transforms = [

@@ -98,6 +98,9 @@ class PacketEncoder(ABC):
     optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
     address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
     destination: ClassVar[str] = "255.255.255.255"
+    default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
+    # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
+    told_apart: ClassVar[bool] = False
 
     def __init__(self, source: PacketSource) -> None:
         self.source = source
@@ -126,10 +129,15 @@ class PacketEncoder(ABC):
     ) -> Service | None:
         """Return what answers the maker's software for a live sensor, or None for no service.
 
-        `address` is where it listens, HOST:PORT; "" for the maker's port on the loopback interface.
-        The other parameters are those of `Service`.
+        `address` is where it listens: HOST for the maker's port, or HOST:PORT. The other parameters
+        are those of `Service`.
         """
         return None
+
+    @property
+    def ports(self) -> Mapping[str, int]:
+        """Ports of all kinds of packets, that of the returns first: {kind: port}."""
+        return {**self.default_ports, **self.source.settings.ports}
 
     @property
     def firing_interval_ns(self) -> int:

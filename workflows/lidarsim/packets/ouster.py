@@ -7,10 +7,10 @@ parsing.cpp, packet.cpp, xyzlut.cpp and metadata.cpp; recordings that come with 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..sensor.trajectory import matrices
 from ..sweeps.instruments import IMU_FILE
 from .encoders import Datagrams, PacketEncoder, PacketSource
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
+from .service import Destination, Service
 from .shots import Shots
 
 LIDAR_PORT = 7502
@@ -243,6 +244,8 @@ class OusterEncoder(PacketEncoder):
     optional_identifiers = ("profile",)
     address = "192.168.1.200"
     destination = "192.168.1.100"
+    default_ports: ClassVar[Mapping[str, int]] = {"lidar": LIDAR_PORT, "imu": IMU_PORT}
+    told_apart = True
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -327,6 +330,15 @@ class OusterEncoder(PacketEncoder):
         """Return the metadata of the sensor as JSON, in the layout of its HTTP interface."""
         return {".json": (json.dumps(self.metadata(), indent=1) + "\n").encode()}
 
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service:
+        """Return the sensor's configuration interface, see `PacketEncoder.service`."""
+        from .ouster_api import OusterApi
+
+        ports = self.port("lidar", LIDAR_PORT), self.port("imu", IMU_PORT)
+        return OusterApi(address, destination, send_to, self.metadata(), ports)
+
     def _rest_of_packets(self) -> list[Datagrams]:
         """Return the packet of columns that wait for further columns, and forget them."""
         rest = self._rest
@@ -402,7 +414,7 @@ class OusterEncoder(PacketEncoder):
             "sensor_info": {
                 "build_date": "2024-03-01T00:00:00Z",
                 "build_rev": "v3.1.0",
-                "image_rev": "lidarpool",
+                "image_rev": "lidarpool-simulated-v3.1.0",  # clients read the version
                 "initialization_id": _INITIALIZATION_ID,
                 "prod_line": self.text("product_line"),
                 "prod_pn": "lidarpool",

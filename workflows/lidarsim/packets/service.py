@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Self
 
 
@@ -13,7 +13,8 @@ class Destination:
     """Where the datagrams of a live sensor go."""
 
     host: str  # IPv4 address
-    ports: dict[int, int]  # {port of `Datagrams`: port at the host}; a port that is missing stays
+    # {port of `Datagrams`: port of the host}: other ports stay; datagrams to port 0 are not sent.
+    ports: Mapping[int, int] = field(default_factory=dict)
 
 
 class Service(ABC):

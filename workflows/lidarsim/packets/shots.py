@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -74,11 +74,27 @@ class Shots:
             If the sensor has no packets, the points lack a column or are not in order, or the rays
             of the survey are unknown.
         """
-        sensor = fired_of(sweeps).sensors[sweeps.sensor[sweep]]
+        names = tuple(columns)
+        settings_of(fired_of(sweeps).sensors[sweeps.sensor[sweep]])
+        check_columns(points.columns, names)
+        shots = cls.from_image(Image.from_points(sweeps, sweep, points), points, names)
+        faults = sweeps.faults_in(sweep)
+        return replace(
+            shots,
+            stamps_ns=shots.starts_ns + sum(fault.jumps_ns(shots.starts_ns) for fault in faults),
+            dropped=_dropped(sweeps, sweep, shots.firings, shots.starts_ns),
+        )
+
+    @classmethod
+    def from_image(cls, image: Image, points: Cloud, columns: Iterable[str] = ()) -> Shots:
+        """Return the shots of the points of an image, without faults.
+
+        LidarError if the sensor has no packets, or the points lack a column.
+        """
+        sensor = image.sensor
         lasers = settings_of(sensor).lasers
         names = tuple(columns)
         check_columns(points.columns, names)
-        image = Image.from_points(sweeps, sweep, points)
 
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
             """Return values (n,) of points as an array (r, n, c)."""
@@ -89,15 +105,22 @@ class Shots:
 
         starts = image.begin_ns + sensor.begins_ns(image.firings)
         starts_ns = np.rint(starts).astype(np.int64)
-        faults = sweeps.faults_in(sweep)
         return cls(
             firings=image.firings,
             starts_ns=starts_ns,
-            stamps_ns=starts_ns + sum(fault.jumps_ns(starts_ns) for fault in faults),
+            stamps_ns=starts_ns,
             azimuths=sensor.head.azimuths(image.firings),
-            dropped=_dropped(sweeps, sweep, image.firings, starts_ns),
+            dropped=np.zeros(len(image.firings), np.bool_),
             range_m=in_laser_order(points["range"].astype(np.float32, copy=False), np.nan),
             columns={name: in_laser_order(points[name], 0) for name in names},
+        )
+
+    def later(self, shift_ns: int) -> Shots:
+        """Return the shots with later times and stamps, as of a survey that is repeated."""
+        if not shift_ns:
+            return self
+        return replace(
+            self, starts_ns=self.starts_ns + shift_ns, stamps_ns=self.stamps_ns + shift_ns
         )
 
 

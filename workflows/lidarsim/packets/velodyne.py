@@ -6,10 +6,14 @@ timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
 import numpy as np
 
 from ..base.arrays import AnyArray, Bools, Ints
 from .encoders import Datagrams, PacketEncoder, PacketSource
+from .service import Destination, Service
 from .shots import CarryOver, Shots
 from .velodyne_position import POSITION_PORT, PositionPackets
 
@@ -43,6 +47,7 @@ class VelodyneEncoder(PacketEncoder):
     """
 
     identifiers = ("product", "unit_m")
+    default_ports: ClassVar[Mapping[str, int]] = {"data": DATA_PORT, "position": POSITION_PORT}
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -77,6 +82,23 @@ class VelodyneEncoder(PacketEncoder):
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor sends no packet before its blocks are full."""
         return []
+
+    def service(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> Service:
+        """Return the sensor's web interface, see `PacketEncoder.service`."""
+        from .velodyne_api import VelodyneApi, VelodyneState
+
+        source = self.source
+        state = VelodyneState(
+            model=source.sensor.model,
+            serial=source.name or "lidarpool",
+            returns=source.mode.title(),
+            rpm=round(60 * source.sensor.head.rate_hz),  # type: ignore[attr-defined]
+            pps_state="Locked" if source.dated else "Absent",
+        )
+        ports = self.port("data", DATA_PORT), self.port("position", POSITION_PORT)
+        return VelodyneApi(address, destination, send_to, state, ports)
 
     def _data(self, shots: Shots) -> Datagrams:
         """Return the data packets of shots that fill packets."""

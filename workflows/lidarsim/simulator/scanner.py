@@ -185,6 +185,11 @@ class Scanner:
         return self._rig.backend
 
     @property
+    def survey(self) -> Survey:
+        """Survey of a step, with the sensor, columns, returns and noise of the scanner."""
+        return self._rig.survey
+
+    @property
     def origin(self) -> Floats:
         """World coordinates of the scene's local origin, metres: (3,)."""
         return self._rig.scene.origin
@@ -193,16 +198,6 @@ class Scanner:
     def scene(self) -> Scene:
         """The scene, with actors and instances where they were moved."""
         return self._rig.scene
-
-    @property
-    def mounted(self) -> Mounted:
-        """The sensor, with its name and its pose on the carrier."""
-        return self._rig.survey.carried[0]
-
-    @property
-    def coordinates(self) -> str:
-        """Coordinates of the points of sweeps: "world" or "sensor"."""
-        return self._rig.survey.coordinates
 
     @checked
     def span_s(

@@ -35,26 +35,50 @@ class Image:
         fired = fired_of(sweeps)
         number = int(sweeps.sensor[sweep])
         sensor = fired.sensors[number]
-        scans = np.arange(*sweeps.scans[sweep : sweep + 2])
-        steps = range(fired.steps[sweep], fired.steps[sweep] + len(scans))
+        first_scan, stop_scan = sweeps.scans[sweep : sweep + 2].tolist()
+        first_step = int(fired.steps[sweep])
+        steps = range(first_step, first_step + stop_scan - first_scan)
+        first_firing = np.array(sensor.firings(first_step)[:1])
+        lead_ns = float(sensor.begins_ns(first_firing)[0]) + sensor.lead_ns
+        begin_ns = round(sweeps.begins_ns[sweep] - lead_ns)
+        return cls.from_steps(sensor, steps, first_scan, begin_ns, fired.returns[number], points)
+
+    @classmethod
+    def from_steps(
+        cls,
+        sensor: Sensor,
+        steps: range,
+        first_scan: int,
+        begin_ns: float,
+        returns: int,
+        points: Cloud,
+    ) -> Image:
+        """Return the pixels of the points of consecutive time steps of a sensor.
+
+        `first_scan` is the scan of the first step, `begin_ns` the start of the station, and a pulse
+        has up to `returns`. LidarError if the points are not in order, or of other steps.
+        """
         bounds = np.array([sensor.firings(step) for step in steps])
         firings = np.arange(bounds[0, 0], bounds[-1, 1])
-        lead_ns = float(sensor.begins_ns(firings[:1])[0]) + sensor.lead_ns
+        step = points["scan"] - first_scan
+        if len(step) and not 0 <= step.min() <= step.max() < len(steps):
+            raise LidarError(MIXED_UP)
         ray = points["ray"].astype(np.int64)
-        ray += (bounds[points["scan"] - scans[0], 0] - firings[0]) * sensor.channels
+        ray += (bounds[step, 0] - firings[0]) * sensor.channels
         if (np.diff(ray) < 0).any() or (len(ray) and ray[-1] >= len(firings) * sensor.channels):
             raise LidarError(MIXED_UP)
         column, row = np.divmod(ray, sensor.channels)
         plane = _return_indices(ray)
+        scans = np.arange(first_scan, first_scan + len(steps), dtype=np.int32)
         return cls(
             sensor,
             firings,
-            np.repeat(scans.astype(np.int32), np.diff(bounds, axis=1)[:, 0]),
-            round(sweeps.begins_ns[sweep] - lead_ns),
+            np.repeat(scans, np.diff(bounds, axis=1)[:, 0]),
+            begin_ns,
             plane,
             row,
             column,
-            planes=max(fired.returns[number], int(plane.max(initial=0)) + 1),
+            planes=max(returns, int(plane.max(initial=0)) + 1),
         )
 
     def filled(self, values: AnyArray) -> AnyArray:

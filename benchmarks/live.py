@@ -1,0 +1,135 @@
+"""Live packets, beside their schedule: `python -m benchmarks.live [--minutes 10] [--json FILE]`.
+
+An OS1-64 with 20 cars that move, and a VLP-16 with 100, each alone, with 7 sub-rays, rain and noise
+of ranges, in a city of 100,000 triangles, to a receiver on the loopback interface. The receiver, a
+process of its own, counts the packets and how late they arrive after their stamps; the process that
+sends says how late it was after the schedule, which starts when the first sweeps are cast.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpool import Actor, Noise, Packets, Returns, Scanner, Track, load_sensor, play
+from lidarscenes.procedural.city import city
+from lidarsim.scene.actors import box
+
+from . import live_receiver
+
+POSITION = (0.0, 0.0, 1.9)
+# Sensor, maker, cars and port by name.
+CASES = {
+    "OS1-64, 20 actors": ("ouster/os1-64", "ouster", 20, 17_502),
+    "VLP-16, 100 actors": ("velodyne/vlp16", "velodyne", 100, 12_368),
+}
+LIMITS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 1000)
+
+
+def cars(count: int, seconds: float, seed: int = 7) -> list[Actor]:
+    """Make cars that drive on circles around the sensor, at 10 m/s."""
+    random = np.random.default_rng(seed)
+    times_s = np.arange(0, seconds + 3, 0.5)
+    mesh = box("Car", (4.5, 1.8, 1.5))
+    actors = []
+    for radius_m, start in zip(
+        random.uniform(5, 60, count), random.uniform(0, 2 * np.pi, count), strict=True
+    ):
+        angle = start + 10 / radius_m * times_s
+        positions = radius_m * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        yaw = angle + np.pi / 2
+        quaternions = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+        actors.append(Actor(mesh, Track(times_s, positions, quaternions)))
+    return actors
+
+
+def measure(
+    sensor: str, maker: str, actors: int, port: int, *, seconds: float, triangles: int
+) -> dict[str, Any]:
+    """Play a sensor for some seconds; return what was sent and received, and how late."""
+    lidar = load_sensor(sensor)
+    packets = Packets(lidar)
+    scanner = Scanner(
+        city(triangles).with_actors(cars(actors, seconds)),
+        lidar,
+        columns=packets.columns,
+        returns=Returns(subrays=7),
+        noise=Noise(range_m=0.02, detection_range_m=100.0),
+        rain_mm_h=10.0,
+    )
+    first, *others = packets.encoder.ports.values()
+    ports = [port, *(port + other - first for other in others)]
+    script = Path(live_receiver.__file__)
+    with subprocess.Popen(
+        [sys.executable, str(script), maker, *map(str, ports)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as receiver:
+        assert receiver.stdout is not None
+        receiver.stdout.readline()  # ready
+        notes: list[str] = []
+        lateness = play(
+            scanner,
+            POSITION,
+            to=f"127.0.0.1:{port}",
+            duration_s=seconds,
+            ready=print,
+            note=notes.append,
+        )
+        output, _ = receiver.communicate()
+    received = json.loads(output)
+    late_ms = np.array(received["late_ms"])
+    counts = np.searchsorted(late_ms, LIMITS_MS, "right")
+    return {
+        "seconds": seconds,
+        "sent": lateness.to_json(),
+        "received": received["received"],
+        "lost": lateness.sent - received["received"],
+        "later_than_5_ms": 1 - lateness.share_within(5),
+        "arrived_later_than_5_ms": float((late_ms > 5).mean()),
+        "arrived_within": dict(zip(map(str, LIMITS_MS), counts.tolist(), strict=True)),
+        "notes": notes,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
+    """Print the histograms of lateness."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--only", choices=[*CASES], nargs="*", default=[*CASES])
+    parser.add_argument("--triangles", type=int, default=100_000, help="of the city")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    figures = {}
+    for name in options.only:
+        sensor, maker, actors, port = CASES[name]
+        figures[name] = row = measure(
+            sensor,
+            maker,
+            actors,
+            port,
+            seconds=60 * options.minutes,
+            triangles=options.triangles,
+        )
+        print(
+            f"{name}: {row['sent']['sent']:,} packets sent in {row['seconds']:g} s, {row['lost']} "
+            f"lost; {row['later_than_5_ms']:.3%} sent and {row['arrived_later_than_5_ms']:.3%} "
+            f"arrived later than 5 ms, the latest sent after {row['sent']['latest_ms']:.1f} ms"
+        )
+        print("  sent", row["sent"]["lateness"])
+        for note in row["notes"]:
+            print(f"  note: {note}")
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1))
+    return figures
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""The receiver of `benchmarks.live`: counts datagrams, and how late they are, until stdin ends.
+
+A datagram's lateness is its arrival less its stamp, beside the least of all. It is a process of its
+own, as a driver is, and prints a line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import struct
+import sys
+import time
+from contextlib import suppress
+
+BUFFER_BYTES = 32 << 20
+SILENT_S = 0.5  # after the end
+_BUFFER_FORCED = 33  # SO_RCVBUFFORCE, for which a process needs rights
+HOUR_NS = 3_600_000_000_000
+
+
+def velodyne_ns(payload: bytes) -> int:
+    """Return the stamp of a data packet of Velodyne, nanoseconds past the hour."""
+    return 1000 * int(struct.unpack_from("<I", payload, 1200)[0])
+
+
+def ouster_ns(payload: bytes) -> int:
+    """Return the stamp of the first column of a lidar packet of Ouster, ns past an hour."""
+    return int(struct.unpack_from("<Q", payload, 32)[0]) % HOUR_NS
+
+
+STAMPS = {"velodyne": velodyne_ns, "ouster": ouster_ns}
+
+
+def open_socket(port: int) -> socket.socket:
+    """Return a socket with a large buffer at a port of the loopback interface."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    with suppress(OSError):
+        opened.setsockopt(socket.SOL_SOCKET, _BUFFER_FORCED, BUFFER_BYTES)
+    opened.bind(("127.0.0.1", port))
+    return opened
+
+
+def main(maker: str, *ports: str) -> None:
+    """Receive at ports, that of the returns first, until stdin ends and all is silent."""
+    sockets = [open_socket(int(port)) for port in ports]
+    stamp_ns = STAMPS[maker]
+    offsets_ns = []
+    received = 0
+    sources: list[object] = [*sockets, sys.stdin]
+    print("ready", flush=True)
+    ended = False
+    while True:
+        readable, _, _ = select.select(sources, [], [], SILENT_S if ended else None)
+        if ended and not readable:
+            break
+        for source in readable:
+            if source is sys.stdin:
+                ended = True
+                sources.remove(sys.stdin)
+                continue
+            payload = source.recv(65_535)
+            now_ns = time.monotonic_ns()
+            received += 1
+            if source is sockets[0]:
+                offsets_ns.append((now_ns - stamp_ns(payload)) % HOUR_NS)
+    first_ns = offsets_ns[0] if offsets_ns else 0
+    # The offsets are about equal, and may lie on both sides of the hour.
+    offsets_ns = [
+        (offset - first_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2 for offset in offsets_ns
+    ]
+    least_ns = min(offsets_ns, default=0)
+    late_ms = sorted((offset - least_ns) / 1e6 for offset in offsets_ns)
+    print(json.dumps({"received": received, "late_ms": late_ms}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

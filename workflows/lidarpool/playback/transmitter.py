@@ -1,0 +1,189 @@
+"""Where packets go: the addresses of sensors, the process that sends, and what answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.words import did_you_mean
+from lidarsim.packets.encoders import PacketEncoder
+from lidarsim.packets.send import LOOPBACK, Address, Lateness, Sender, check_reachable
+from lidarsim.packets.service import Destination, Service
+
+# Returns the service of a sensor: see `PacketEncoder.service`.
+MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """The datagrams of a sensor: where they go, and where the sensor's interface listens."""
+
+    name: str
+    model: str
+    kinds: Mapping[str, int]  # {kind of datagrams: port}, that of the returns first
+    make_service: MakeService
+    told_apart: bool = False  # see `PacketEncoder`
+    destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
+    address: Address = field(default_factory=lambda: Address(LOOPBACK))  # of the interface
+    api_given: bool = False  # whether a user gives the address of the interface
+
+    @property
+    def source_address(self) -> str:
+        """The address that datagrams come from: the interface's; empty for any."""
+        to_this_machine = Address(self.destination.host).is_loopback
+        return self.address.host if to_this_machine or not self.address.is_loopback else ""
+
+    @property
+    def ports(self) -> list[int]:
+        """Ports of the receiver, that of the returns first."""
+        return list(self.destination.ports.values())
+
+    def describe(self) -> str:
+        """Return where the datagrams go, for the user."""
+        words = f"{self.model} sends to {self.destination.host}"
+        ports = " and ".join(map(str, self.ports))
+        return f"{words}, port {ports}" if ports else words
+
+    def to(self, receiver: Address) -> Stream:
+        """Return the stream to a receiver; LidarError if its datagrams cannot go there.
+
+        A port is that of the returns; other kinds of datagrams move by as much.
+        """
+        first = next(iter(self.kinds.values()), 0)
+        shift = 0 if receiver.port is None else receiver.port - first
+        numbers = {port: port + shift for port in self.kinds.values()}
+        if beyond := [port for port in numbers.values() if not 0 < port < 1 << 16]:
+            raise LidarError(
+                f"--to {receiver}: other packets of {self.name} would go to port {beyond[0]}: give "
+                f"a port nearer to {first}."
+            )
+        check_reachable(Address(receiver.host, numbers.get(first)))
+        return replace(self, destination=Destination(receiver.host, numbers))
+
+
+def sensor_streams(
+    encoders: Sequence[PacketEncoder], to: Sequence[str], api: Sequence[str]
+) -> list[Stream]:
+    """Return the streams of sensors, see `streams_to`."""
+    streams = [
+        Stream(
+            encoder.source.name or "lidar",
+            encoder.source.sensor.model,
+            encoder.ports,
+            encoder.service,
+            encoder.told_apart,
+        )
+        for encoder in encoders
+    ]
+    return streams_to(streams, to, api)
+
+
+def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
+    """Return streams to the addresses that a user gives, as [NAME=]HOST[:PORT].
+
+    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default.
+
+    LidarError if an address cannot be used, or receivers could not tell two sensors apart.
+    """
+    names = [stream.name for stream in streams]
+    receivers = _by_sensor(to, names, "--to")
+    interfaces = _by_sensor(api, names, "--api")
+    placed: list[Stream] = []
+    for number, stream in enumerate(streams):
+        name = stream.name
+        moved = replace(
+            stream.to(receivers.get(name, Address(LOOPBACK))),
+            address=interfaces.get(name, Address(f"127.0.0.{number + 1}")),
+            api_given=name in interfaces,
+        )
+        for other in placed:
+            _check_apart(other, moved)
+        placed.append(moved)
+    return placed
+
+
+def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[str, Address]:
+    """Return the address of each sensor by its name; an address without a name is for all."""
+    addresses: dict[str, Address] = {}
+    for text in texts:
+        name, separator, address = text.rpartition("=")
+        if separator and name not in names:
+            raise LidarError(
+                f"{option} {text}: there is no sensor {name!r}; there are {', '.join(names)}."
+                f"{did_you_mean(name, names)}"
+            )
+        parsed = Address.parse(address)
+        for sensor in [name] if separator else names:
+            addresses[sensor] = parsed
+    return addresses
+
+
+def _check_apart(stream: Stream, other: Stream) -> None:
+    """Raise LidarError if receivers could not tell two sensors apart."""
+    shared = {*stream.ports} & {*other.ports}
+    host = stream.destination.host
+    if host != other.destination.host or not shared:
+        return
+    if stream.told_apart and stream.source_address != other.source_address:
+        return
+    port = min(stream.ports[0], 60_000)
+    raise LidarError(
+        f"{stream.name} and {other.name} both send to {host}:{min(shared)}: give each a port, as "
+        f"in --to {stream.name}={host}:{port} --to {other.name}={host}:{port + 100}."
+    )
+
+
+class Transmitter:
+    """The process that sends the datagrams of streams, and their services: a context manager."""
+
+    def __init__(self, streams: Sequence[Stream], note: Callable[[str], None]) -> None:
+        self.sender = Sender(note)
+        self._streams = streams
+        self._services: list[str] = []  # descriptions
+        self._stack = ExitStack()
+
+    @property
+    def description(self) -> str:
+        """Where the datagrams go, and what answers."""
+        return "; ".join([*(stream.describe() for stream in self._streams), *self._services])
+
+    def summary(self, file: Path | None = None) -> str:
+        """Return what was sent, and how late, once the context has ended; also into a JSON file."""
+        lateness: Lateness = self.sender.lateness
+        if file is not None:
+            with explained(f"{file} cannot be written"):
+                text = json.dumps(lateness.to_json(), indent=1) + "\n"
+                file.write_text(text, encoding="utf-8")
+        return f"{lateness}."
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            stack.enter_context(self.sender)
+            for number, stream in enumerate(self._streams):
+                redirect = partial(self._redirect, number)
+                service = stream.make_service(str(stream.address), stream.destination, redirect)
+                if service is not None:
+                    stack.enter_context(service)
+                    self._services.append(service.description)
+                elif stream.api_given:
+                    raise LidarError(
+                        f"--api: {stream.model} has no interface that listens: leave it out."
+                    )
+                self.sender.redirect(number, stream.destination, stream.source_address)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.__exit__(None, None, None)
+
+    def _redirect(self, number: int, destination: Destination) -> None:
+        """Send the datagrams of a stream elsewhere, for its service."""
+        stream = replace(self._streams[number], destination=destination)
+        with suppress(LidarError):  # the next packets raise it
+            self.sender.redirect(number, destination, stream.source_address)

@@ -1,0 +1,306 @@
+"""Sends datagrams at their times from a process of its own, and checks where they may go."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from ipaddress import AddressValueError, IPv4Address, IPv6Address
+from pathlib import Path
+from typing import IO, Any, Self
+
+import numpy as np
+
+from ..base.arrays import Bytes, Ints
+from ..base.errors import LidarError
+from .encoders import Datagrams
+from .sender_process import DATAGRAM, END, HEADER, ROUTE
+from .service import Destination
+
+LOOPBACK = "127.0.0.1"
+_RECORD = np.dtype(
+    [("kind", "<u2"), ("sensor", "<u2"), ("port", "<u4"), ("size", "<u4"), ("due_ns", "<i8")]
+)
+_ENDS_WITHIN_S = 10.0  # of the process after SIGTERM
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """What was sent, and how late after the schedule."""
+
+    sent: int = 0
+    limits_ms: tuple[float, ...] = ()  # upper limits of the bins
+    counts: tuple[int, ...] = ()  # of datagrams in each bin, and of later datagrams
+    latest_ms: float = 0.0
+    failures: Mapping[str, int] = field(default_factory=dict)  # {error: datagrams not sent}
+
+    def share_within(self, limit_ms: float) -> float:
+        """Return the share of datagrams that were at most as late as a limit of the bins."""
+        stop = self.limits_ms.index(limit_ms) + 1
+        return sum(self.counts[:stop]) / max(1, self.sent)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        bins = {f"<= {limit:g} ms": count for limit, count in zip(self.limits_ms, self.counts)}  # noqa: B905 - counts are one more
+        bins["later"] = self.counts[-1] if self.counts else 0
+        return {
+            "sent": self.sent,
+            "lateness": bins,
+            "latest_ms": self.latest_ms,
+            "not_sent": dict(self.failures),
+        }
+
+    def __str__(self) -> str:
+        if not self.sent and not self.failures:
+            return "no packets were sent"
+        words = f"{self.sent:,} packets sent"
+        if self.sent:
+            words += (
+                f", {100 * self.share_within(5):.2f} % of them within 5 ms of their time, the "
+                f"latest after {self.latest_ms:.1f} ms"
+            )
+        for reason, count in self.failures.items():
+            words += f"; {count:,} not sent: {reason}"
+        return words
+
+
+class Sender:
+    """Sends datagrams of sensors, by number, at their times: a context manager.
+
+    The process ends with the context, and when this process ends in any other way.
+
+    Parameters
+    ----------
+    note
+        Prints a note for the user.
+    """
+
+    def __init__(self, note: Callable[[str], None] = lambda words: None) -> None:
+        self._note = note
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()  # services redirect from threads of their own
+        self._reported = b""  # of a line that has not fully arrived
+        self._lateness = Lateness()
+
+    def __enter__(self) -> Self:
+        script = Path(__file__).with_name("sender_process.py")
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", str(script)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C in a terminal must not end it before this process
+        )
+        assert self._process.stdout is not None
+        os.read(self._process.stdout.fileno(), 1 << 16)  # that it is ready: starting takes 0.1 s
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        process = self._process
+        assert process is not None
+        if process.poll() is None:
+            process.terminate()
+        self._wait()
+        self._process = None
+
+    def redirect(self, sensor: int, destination: Destination, source: str = "") -> None:
+        """Send the later datagrams of a sensor to a destination.
+
+        `source` is the address of this machine that they come from; empty for any.
+        """
+        values = {"host": destination.host, "ports": destination.ports, "source": source}
+        body = json.dumps(values).encode()
+        self._write(HEADER.pack(ROUTE, sensor, 0, len(body), 0) + body)
+
+    def send(
+        self, sensor: int, groups: Sequence[Datagrams], deadlines_ns: Callable[[Ints], Ints]
+    ) -> None:
+        """Hand datagrams over, which are sent at `deadlines_ns(due_ns)` by `time.monotonic_ns`.
+
+        Waits while very many datagrams wait for their times. LidarError if the process has ended.
+        """
+        groups = [group for group in groups if len(group)]
+        self._hear()
+        if groups:
+            dues_ns = [deadlines_ns(group.due_ns) for group in groups]
+            records = [
+                _records(sensor, group, due_ns)
+                for group, due_ns in zip(groups, dues_ns, strict=True)
+            ]
+            self._write(_in_order(records, np.concatenate(dues_ns)).data)
+
+    def finish(self) -> Lateness:
+        """Wait until all datagrams are sent; return how late they were."""
+        self._write(HEADER.pack(END, 0, 0, 0, 0))
+        self._wait(None)
+        return self._lateness
+
+    @property
+    def lateness(self) -> Lateness:
+        """How late datagrams were, known after the end."""
+        return self._lateness
+
+    def _write(self, content: bytes | memoryview) -> None:
+        """Write to the process; LidarError if it has ended."""
+        assert self._process is not None
+        file = self._process.stdin
+        assert file is not None
+        try:
+            with self._lock:
+                file.write(content)
+                file.flush()
+        except (BrokenPipeError, ValueError) as error:
+            raise LidarError("The process that sends packets has ended: play again.") from error
+
+    def _hear(self) -> None:
+        """Note what the process reports, without waiting."""
+        assert self._process is not None
+        file = self._process.stdout
+        assert file is not None
+        while select.select([file], [], [], 0)[0]:
+            content = os.read(file.fileno(), 1 << 16)
+            if not content:
+                return
+            self._note_lines(content)
+
+    def _note_lines(self, content: bytes) -> None:
+        *lines, self._reported = (self._reported + content).split(b"\n")
+        for line in lines:
+            values = json.loads(line)
+            if "failure" in values:
+                self._note(f"packets to {values['to']} are not sent: {values['failure']}.")
+                continue
+            self._lateness = Lateness(
+                values["sent"],
+                tuple(values["lateness_ms"]),
+                tuple(values["counts"]),
+                values["latest_ms"],
+                values["failures"],
+            )
+
+    def _wait(self, timeout_s: float | None = _ENDS_WITHIN_S) -> None:
+        """Wait for the end of the process, which is killed if it takes too long."""
+        assert self._process is not None
+        process = self._process
+        if process.stdin is None or process.stdin.closed:
+            return
+        try:
+            process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        self._hear()
+        _close(process.stdin)
+        _close(process.stdout)
+
+
+def _close(file: IO[bytes] | None) -> None:
+    """Close a pipe, whose buffered bytes have no reader any more."""
+    assert file is not None
+    try:
+        file.close()
+    except BrokenPipeError:
+        return
+
+
+def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
+    """Return datagrams with the headers of their records: (n, bytes)."""
+    count, size = group.payloads.shape
+    headers = np.zeros(count, _RECORD)
+    headers["kind"] = DATAGRAM
+    headers["sensor"] = sensor
+    headers["port"] = group.port
+    headers["size"] = size
+    headers["due_ns"] = due_ns
+    return np.concatenate([headers.view(np.uint8).reshape(count, -1), group.payloads], axis=1)
+
+
+def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
+    """Return the records (n, bytes) of all groups as one array, in the order of their times."""
+    if len(records) == 1:
+        return np.ascontiguousarray(records[0]).reshape(-1)
+    sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in records])
+    order = np.argsort(due_ns, kind="stable")
+    ends = np.empty(len(order), np.int64)
+    ends[order] = np.cumsum(sizes[order])
+    content = np.empty(int(sizes.sum()), np.uint8)
+    first = 0
+    for rows in records:
+        starts = ends[first : first + len(rows)] - rows.shape[1]
+        content[starts[:, None] + np.arange(rows.shape[1])] = rows
+        first = first + len(rows)
+    return content
+
+
+@dataclass(frozen=True)
+class Address:
+    """An address that a user gives: HOST or HOST:PORT, of IPv4."""
+
+    host: str  # as numbers
+    port: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """Return the address of a text; LidarError for other text, IPv6 and multicast."""
+        host, separator, number = text.rpartition(":")
+        if not separator:
+            host, number = text, ""
+        if ":" in host or _is_ipv6(text):
+            raise LidarError(f"{text} is of IPv6: give an IPv4 address, such as {LOOPBACK}:2368.")
+        if separator and not (number.isdecimal() and 0 < int(number) < 1 << 16):
+            raise LidarError(f"{text!r} is no address: give HOST or HOST:PORT, ports to 65535.")
+        try:
+            address = IPv4Address(host)
+        except AddressValueError:
+            address = _resolved(host, text)
+        if address.is_multicast or address.is_unspecified:
+            kind = "a multicast address" if address.is_multicast else "no address of a receiver"
+            raise LidarError(f"{text} is {kind}: give the address of one receiver.")
+        return cls(str(address), int(number) if separator else None)
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether the address is of this machine alone."""
+        return IPv4Address(self.host).is_loopback
+
+    def with_port(self, port: int) -> Address:
+        """Return the address with a port, if it has none."""
+        return self if self.port is not None else replace(self, port=port)
+
+    def __str__(self) -> str:
+        return self.host if self.port is None else f"{self.host}:{self.port}"
+
+
+def _is_ipv6(text: str) -> bool:
+    try:
+        IPv6Address(text.strip("[]"))
+    except AddressValueError:
+        return False
+    return True
+
+
+def _resolved(host: str, text: str) -> IPv4Address:
+    """Return the IPv4 address of a name; LidarError if the name has none."""
+    try:
+        entries = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no name"
+        raise LidarError(f"{text}: {host!r} has no IPv4 address ({reason}).") from error
+    return IPv4Address(entries[0][4][0])
+
+
+def check_reachable(address: Address) -> None:
+    """Raise LidarError if no datagrams can be sent to an address, such as without a network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        try:
+            probe.connect((address.host, address.port or 9))
+        except OSError as error:
+            raise LidarError(
+                f"{address} cannot be reached from this machine: {error.strerror}."
+            ) from error

@@ -1,0 +1,202 @@
+"""The process that sends datagrams at their times: reads records from stdin, and reports on stdout.
+
+Run as a script by `send.Sender`. It imports nothing but the standard library, so that it starts in
+milliseconds, and shares no lock with the process that casts: a thread beside the casting was 8 to
+300 ms late.
+
+Each record begins with `HEADER`: its kind, the number of the sensor, the port, the size of the
+content, and a time. A record DATAGRAM is sent at its time by the clock of `time.monotonic_ns`; its
+content is the payload. A record ROUTE says where later datagrams of a sensor go, as JSON. After the
+record END the process sends what is left; without END, the end of stdin ends the process at once,
+as the process that casts is gone.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from bisect import bisect_left
+from contextlib import suppress
+from struct import Struct
+from typing import Any, NoReturn
+
+HEADER = Struct("<HHIIq")  # kind, sensor, port, size, time
+DATAGRAM, ROUTE, END = range(3)
+# Upper limits of lateness, milliseconds; later datagrams are in a last bin.
+BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+# A sensor whose datagrams are late catches up at most this much faster, so that the receiver, whose
+# buffers hold only some datagrams, loses none.
+_CATCH_UP = 2
+_READ_BYTES = 1 << 16  # at a time, between datagrams
+_MAX_WAITING_BYTES = 256 << 20
+_PRIORITY = -10  # of the process, where it may have one
+
+
+class Stop(Exception):  # noqa: N818 - not an error
+    """SIGTERM: no further datagrams are sent."""
+
+
+class Route:
+    """Where the datagrams of a sensor go, and when the last of them was sent."""
+
+    def __init__(self) -> None:
+        self.host = ""
+        self.ports: dict[int, int] = {}  # {port of a datagram: port of the host}; 0: not sent
+        self._source = ""  # address that datagrams come from; empty for any
+        self.socket = _open_socket("")
+        self._due_ns = 0
+        self._sent_ns = 0
+
+    def change(self, values: dict[str, Any]) -> None:
+        """Change where the datagrams go, and where they come from."""
+        self.host = values["host"]
+        self.ports = {int(port): number for port, number in values["ports"].items()}
+        if values["source"] != self._source:
+            self.socket.close()
+            self.socket = _open_socket(values["source"])
+            self._source = values["source"]
+
+    def earliest_ns(self, due_ns: int) -> int:
+        """Return when a datagram may be sent: at its time, or later if the last was late."""
+        return max(due_ns, self._sent_ns + (due_ns - self._due_ns) // _CATCH_UP)
+
+    def mark_sent(self, due_ns: int) -> int:
+        """Take note that a datagram is sent now; return by how much it is late, nanoseconds."""
+        self._due_ns = due_ns
+        self._sent_ns = time.monotonic_ns()
+        return self._sent_ns - due_ns
+
+
+def _open_socket(source: str) -> socket.socket:
+    """Return a socket that sends from an address, or from any if the address is not here."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    if source:
+        with suppress(OSError):
+            opened.bind((source, 0))
+    return opened
+
+
+class Outbox:
+    """Datagrams that wait for their times, and the record of what was sent."""
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[int, int, int, int, bytes]] = []  # a heap by time and order
+        self.waiting_bytes = 0
+        self.routes: dict[int, Route] = {}
+        self.ended = False
+        self._count = 0  # of datagrams so far
+        self._late = [0] * (len(BINS_MS) + 1)
+        self._max_late_ns = 0
+        self._sent = 0
+        self._failures: dict[str, int] = {}  # {error: datagrams that were not sent}
+        self._rest = b""  # of a record that has not fully arrived
+
+    def take(self, content: bytes) -> None:
+        """Take the records of further bytes of stdin."""
+        content = self._rest + content
+        start = 0
+        while len(content) - start >= HEADER.size:
+            kind, sensor, port, size, due_ns = HEADER.unpack_from(content, start)
+            stop = start + HEADER.size + size
+            if stop > len(content):
+                break
+            body = content[start + HEADER.size : stop]
+            start = stop
+            if kind == DATAGRAM:
+                self._count += 1
+                heapq.heappush(self.waiting, (due_ns, self._count, sensor, port, body))
+                self.waiting_bytes += size
+            elif kind == ROUTE:
+                self.routes.setdefault(sensor, Route()).change(json.loads(body))
+            else:
+                self.ended = True
+        self._rest = content[start:]
+
+    def next_ns(self) -> int | None:
+        """Return when the next datagram is sent; None if none waits."""
+        if not self.waiting:
+            return None
+        due_ns, _, sensor, _, _ = self.waiting[0]
+        return self.routes[sensor].earliest_ns(due_ns)
+
+    def send_next(self) -> None:
+        """Send the next datagram."""
+        due_ns, _, sensor, port, body = heapq.heappop(self.waiting)
+        self.waiting_bytes -= len(body)
+        route = self.routes[sensor]
+        late_ns = route.mark_sent(due_ns)
+        to_port = route.ports.get(port, port)
+        if not to_port:
+            return
+        try:
+            route.socket.sendto(body, (route.host, to_port))
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)
+            if reason not in self._failures:
+                report({"failure": reason, "to": f"{route.host}:{to_port}"})
+            self._failures[reason] = self._failures.get(reason, 0) + 1
+            return
+        self._sent += 1
+        self._max_late_ns = max(self._max_late_ns, late_ns)
+        late_ms = late_ns / 1e6
+        self._late[bisect_left(BINS_MS, late_ms)] += 1
+
+    def summary(self) -> dict[str, Any]:
+        """Return what was sent, how late, and what was not, as plain data for JSON."""
+        return {
+            "sent": self._sent,
+            "lateness_ms": [*BINS_MS],
+            "counts": self._late,
+            "latest_ms": self._max_late_ns / 1e6,
+            "failures": self._failures,
+        }
+
+
+def report(values: dict[str, Any]) -> None:
+    """Write a line for the process that casts, which may be gone."""
+    with suppress(OSError):
+        os.write(1, json.dumps(values).encode() + b"\n")
+
+
+def serve(outbox: Outbox) -> None:
+    """Send datagrams at their times, until all are sent after END."""
+    while not outbox.ended or outbox.waiting:
+        next_ns = outbox.next_ns()
+        wait_s = None if next_ns is None else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
+        is_full = outbox.ended or outbox.waiting_bytes > _MAX_WAITING_BYTES
+        readable, _, _ = select.select([] if is_full else [0], [], [], wait_s)
+        if next_ns is not None and time.monotonic_ns() >= next_ns:
+            outbox.send_next()
+        elif readable:
+            content = os.read(0, _READ_BYTES)
+            if not content:
+                sys.exit(1)
+            outbox.take(content)
+
+
+def main() -> None:
+    """Send until END, SIGTERM, or the end of stdin; report at the start and at the end."""
+
+    def stop(number: int, frame: object) -> NoReturn:
+        raise Stop
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
+    outbox = Outbox()
+    report({"ready": True})
+    with suppress(Stop):
+        serve(outbox)
+    report(outbox.summary())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""Packets of single sweeps, for programs that move the sensor themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..base.errors import LidarError
+from ..base.validation import checked
+from ..columns.cloud import Cloud
+from ..sensor import Mounted, Returns, Sensor, Survey
+from ..sensor.optics import TWO_RETURNS
+from ..sensor.survey import nanoseconds
+from ..sensor.trajectory import CENTRE
+from ..simulator import Scanner
+from ..simulator.scanner import StartSeconds, SweepNumber
+from ..sweeps.ray_image import Image
+from .encoders import START_NS, Datagrams, PacketEncoder, PacketSource, encoder_of
+from .shots import Shots, check_columns
+
+
+class Packets:
+    """The datagrams that a sensor sends, sweep by sweep, of clouds from `Scanner.sweep`.
+
+    The poses are the caller's, and may jump: packets hold ranges and angles, not poses. Shots that
+    fill no packet are sent with the next sweep. All sweeps are encoded in the order of their
+    numbers.
+
+    Parameters
+    ----------
+    sensor
+        The lidar, or the lidar `Mounted` on a carrier.
+    name
+        Name of the sensor, of which its serial number is made. A `Mounted` has a name already.
+    returns
+        Sub-rays of a beam, and the choice of its reported returns, as of the scanner.
+    start
+        Date and time of time 0 of the scanner, as in `Survey`; then stamps are of a clock that a
+        receiver sets, or that follows PTP.
+
+    Raises
+    ------
+    LidarError
+        If the sensor has no packets, or the packets cannot hold its returns.
+
+    Examples
+    --------
+    >>> from lidarpool import Packets, Pose, Scanner, Scene, load_sensor
+    >>> packets = Packets(load_sensor("velodyne/vlp16"))
+    >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=packets.columns)
+    >>> for number in range(2):
+    ...     sweep = scanner.sweep(Pose((0, 0, 1 + number)), number=number)
+    ...     data, positions = packets.encode(sweep, number=number)
+    ...     print(data.payloads.shape, data.port, data.due_ns[:2])
+    (75, 1206) 2368 [1327104 2654208]
+    (75, 1206) 2368 [100859904 102187008]
+    """
+
+    @checked
+    def __init__(
+        self,
+        sensor: Sensor | Mounted,
+        *,
+        name: str = "",
+        returns: Returns | None = None,
+        start: Any = None,
+    ) -> None:
+        if name and isinstance(sensor, Mounted):
+            raise LidarError(
+                f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
+                f"Mounted(sensor, name={name!r})."
+            )
+        mounted = sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)
+        survey = Survey(
+            sensors=[mounted],
+            poses=[CENTRE],
+            steps=1,
+            returns=returns,  # type: ignore[arg-type]
+            start=start,
+        )
+        self._prepare(survey)
+
+    @classmethod
+    def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
+        """Return the packets of a scanner's sensor; `start` as above."""
+        carried = scanner.survey.carried[0]
+        return cls(carried, returns=scanner.survey.returns_each[0], start=start)
+
+    def _prepare(self, survey: Survey) -> None:
+        """Make the encoder of the sensor of a survey."""
+        carried = survey.carried[0]
+        self._sensor = carried.sensor
+        self._returns = 2 if survey.returns_each[0].mode in TWO_RETURNS else 1
+        start_ns = START_NS if survey.start is None else nanoseconds(survey.start)
+        self.encoder: PacketEncoder = encoder_of(
+            PacketSource(
+                carried.sensor,
+                survey.returns_each[0].mode,
+                carried.name,
+                start_ns,
+                survey.start is not None,
+            )
+        )
+        self._next_number = 0
+
+    def __repr__(self) -> str:
+        return f"<Packets: {self._sensor.model}, next sweep {self._next_number}>"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns that the scanner's clouds must have."""
+        return ("ray", "range", *self.encoder.columns)
+
+    @checked
+    def encode(
+        self, sweep: Cloud, *, number: SweepNumber | None = None, start_s: StartSeconds = None
+    ) -> list[Datagrams]:
+        """Return the datagrams that a sweep fills, a group for each port.
+
+        Parameters
+        ----------
+        sweep
+            The cloud that `Scanner.sweep` has returned for this number and start.
+        number
+            Number of the revolution, or frame; by default one more than that of the last sweep, or
+            0. `Scanner.sweep` needs the same.
+        start_s
+            Start of the revolution, as in `Scanner.sweep`.
+
+        Raises
+        ------
+        LidarError
+            If the cloud lacks a column, or is of another sweep.
+        """
+        number = self._next_number if number is None else number
+        steps = self._sensor.steps_of_revolution(number)
+        check_columns(sweep.columns, self.encoder.columns)
+        scans = sweep["scan"]
+        if len(scans) and not (steps.start <= scans.min() and scans.max() < steps.stop):
+            raise LidarError(
+                f"The cloud is not of sweep {number}: give Scanner.sweep and Packets.encode the "
+                "same number."
+            )
+        late_ns = 0
+        if start_s is not None:
+            late_ns = round(start_s * 1e9 - self._sensor.revolution_start_ns(number))
+        image = Image.from_steps(self._sensor, steps, steps.start, late_ns, self._returns, sweep)
+        datagrams = self.encoder.encode(Shots.from_image(image, sweep, self.encoder.columns))
+        self._next_number = number + 1
+        return datagrams
+
+    def finish(self) -> list[Datagrams]:
+        """Return the datagrams of the shots that are left after the last sweep."""
+        return self.encoder.finish()
+
+    def files(self) -> Mapping[str, bytes]:
+        """Return the files that readers need beside the packets, {suffix: content}."""
+        return self.encoder.files()

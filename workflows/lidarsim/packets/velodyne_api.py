@@ -1,0 +1,148 @@
+"""The web interface of a live Velodyne: its state, and where its packets go.
+
+Sources: user manual of the VLP-16 (63-9243), «Web Interface» and «Sensor Control with curl»;
+the drivers that read it (Autoware's velodyne_monitor and nebula). What can be set is the receiver,
+and whether the laser is on; the simulated sensor does not change otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qsl
+
+from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
+from .service import Destination
+
+_PORTS = ("dport", "tport")  # of data and position packets
+
+
+@dataclass(frozen=True)
+class VelodyneState:
+    """What the web interface says of a sensor."""
+
+    model: str
+    serial: str
+    returns: str  # Strongest, Last or Dual
+    rpm: int
+    pps_state: str  # Locked or Absent
+
+
+class VelodyneApi(HttpService):
+    """Answers `cgi/status.json` and the like, and sets the receiver by `cgi/setting/host`.
+
+    Parameters
+    ----------
+    address, destination, send_to
+        As of `HttpService`.
+    state
+        What the interface says.
+    ports
+        Ports of the data and position packets.
+    """
+
+    name = "Velodyne's web interface"
+
+    def __init__(
+        self,
+        address: str,
+        destination: Destination,
+        send_to: Callable[[Destination], None],
+        state: VelodyneState,
+        ports: tuple[int, int],
+    ) -> None:
+        super().__init__(address, destination, send_to)
+        self._state = state
+        self._ports = ports
+        numbers = [destination.ports.get(port, port) for port in ports]
+        self._host = destination.host
+        self._host_ports = dict(zip(_PORTS, numbers, strict=True))
+        self._laser = "On"
+
+    def answer(self, request: Request) -> Answer:
+        """Return the answer to a request; RefusedError for what the sensor does not have."""
+        documents: dict[str, Callable[[], Mapping[str, Any]]] = {
+            "/cgi/info.json": self._info,
+            "/cgi/status.json": self._status,
+            "/cgi/settings.json": self._settings,
+            "/cgi/snapshot.hdl": lambda: {"config": self._settings(), "info": self._info()},
+        }
+        if request.method in ("GET", "HEAD") and request.path in documents:
+            return Answer(documents[request.path]())
+        if request.method != "POST" or not request.path.startswith("/cgi/"):
+            raise RefusedError(f"there is no {request.path}", HTTPStatus.NOT_FOUND)
+        values = dict(parse_qsl(request.body.decode("latin-1"), keep_blank_values=True))
+        if request.path == "/cgi/setting/host":
+            self._set_receiver(values)
+        elif request.path == "/cgi/setting":
+            self._set(values)
+        elif request.path != "/cgi/save":
+            raise RefusedError(f"{request.path} cannot be set", HTTPStatus.NOT_FOUND)
+        return Answer(status=HTTPStatus.NO_CONTENT)
+
+    def _info(self) -> Mapping[str, Any]:
+        return {
+            "mac_addr": "02-00-00-00-00-01",
+            "model": self._state.model,
+            "serial": self._state.serial,
+            "version": {"sensor": {"application": "lidarpool"}},
+        }
+
+    def _status(self) -> Mapping[str, Any]:
+        return {
+            "gps": {"pps_state": self._state.pps_state, "position": ""},
+            "motor": {"state": "On", "rpm": self._state.rpm, "lock": "Off", "phase": 0},
+            "laser": {"state": self._laser},
+        }
+
+    def _settings(self) -> Mapping[str, Any]:
+        return {
+            "returns": self._state.returns,
+            "rpm": str(self._state.rpm),
+            "laser": self._laser,
+            "fov": {"start": "0", "end": "359"},
+            "phaselock": {"enabled": "Off", "offset": "0"},
+            "host": {"addr": self._host, **{k: str(v) for k, v in self._host_ports.items()}},
+            "net": {"addr": self.host, "dhcp": "Off"},
+        }
+
+    def _set_receiver(self, values: Mapping[str, str]) -> None:
+        """Change the receiver of the packets."""
+        host = self._host
+        ports = dict(self._host_ports)
+        for name, value in values.items():
+            if name == "addr":
+                host = receiver_of(name, value)
+            elif name in ports:
+                ports[name] = receiver_port(name, int(value) if value.isdecimal() else value)
+            else:
+                raise RefusedError(f"the host has no {name}")
+        self._host = host
+        self._host_ports = ports
+        self._apply()
+
+    def _set(self, values: Mapping[str, str]) -> None:
+        """Switch the laser; RefusedError for what cannot be set."""
+        current = {"returns": self._state.returns, "rpm": str(self._state.rpm)}
+        laser = self._laser
+        for name, value in values.items():
+            if name == "laser" and value.title() in ("On", "Off"):
+                laser = value.title()
+            elif name not in current:
+                raise RefusedError(f"there is no setting {name}")
+            elif value != current[name]:
+                raise RefusedError(
+                    f"{name} is {current[name]} in this simulated sensor: set it in the scenario"
+                )
+        if laser != self._laser:
+            self._laser = laser
+            self._apply()
+
+    def _apply(self) -> None:
+        """Send the packets to the receiver, or nowhere without a laser."""
+        numbers = [0, 0] if self._laser == "Off" else [*self._host_ports.values()]
+        ports = dict(zip(self._ports, numbers, strict=True))
+        self.destination = Destination(self._host, ports)
+        self.send_to(self.destination)
