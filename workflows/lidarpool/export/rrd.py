@@ -41,7 +41,7 @@ _HEIGHT_LIMITS_M = (-3.0, 7.0)
 def write_rrd(
     path: Path, cloud: CloudLike, sweeps: Sweeps, content: PictureContent | None = None
 ) -> None:
-    """Write a recording of Rerun; scene and planned path are those of the pictures' content.
+    """Write a recording of Rerun, with scene and planned path of the pictures' content.
 
     Points are at `map/base_link/NAME/points`, in the sensor frame at the start of their sweep, with
     all columns; `map/base_link` and its sensors have their poses over time. The boxes of actors are

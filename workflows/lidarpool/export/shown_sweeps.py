@@ -81,7 +81,7 @@ class Surroundings:
 
     @classmethod
     def from_sweeps(cls, sweeps: Sweeps, content: PictureContent | None = None) -> Surroundings:
-        """Return the surroundings of sweeps; scene and path are those of the pictures' content."""
+        """Return the surroundings of sweeps, with scene and path of the pictures' content."""
         frames = frame_names(sweeps.sensors, sweeps.actors)
         positions_by_sensor = {
             frames[number]: sweeps.pose.positions[sweeps.sensor == number]
@@ -151,7 +151,7 @@ class ActorBoxes:
 
 @dataclass(frozen=True, eq=False)
 class ShownSweep:
-    """A sweep as viewers show it: points in the frame of the sensor when the sweep began."""
+    """A sweep for viewers: points in the frame of the sensor when the sweep began."""
 
     start_ns: int  # of the sweep, since 1970-01-01 UTC
     stamp_ns: int  # the same by the sensor's clock, which faults may have moved

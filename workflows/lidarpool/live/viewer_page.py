@@ -71,7 +71,7 @@ class ViewerPage(RunPage):
             self._survey.add(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Note a scan of the only job whose points, and those of earlier scans, are in storage."""
+        """Note a scan of the only job: its points, and points of earlier scans, are in storage."""
         if self._survey is not None:
             self._survey.finish_scan(frame.scan)
 
@@ -111,7 +111,7 @@ class ViewerPage(RunPage):
 
 @contextmanager
 def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
-    """Show a run in a viewer while the body runs, and say how to open it."""
+    """Show a run in a viewer while the body runs, and print how to open the viewer."""
     with open_viewer(name, title=title) as viewer:
         click.echo(f"live: {viewer.description}", err=True)
         page = ViewerPage(viewer)
@@ -145,7 +145,7 @@ class SweepReader:
         return Surroundings.from_sweeps(self.sequence.sweeps, content)
 
     def shown(self, sweep: int) -> ShownSweep:
-        """Return a sweep whose parts are in storage; LidarError if one cannot be read."""
+        """Return a sweep whose parts are in storage; LidarError if a part cannot be read."""
         start, stop = self.sequence.sweeps.scans[sweep : sweep + 2].tolist()
         with self._lock:
             parts = [
@@ -196,7 +196,7 @@ class SurveyFeed:
                     del self._waiting[1::2]
 
     def show_path(self) -> None:
-        """Show the planned path, if it has been found and is not shown."""
+        """Show the planned path once all trials have ended."""
         planning = self._under_way.job.planning
         if planning is None or self._has_path or not self._has_surroundings.is_set():
             return
@@ -218,7 +218,7 @@ class SurveyFeed:
             self._viewer.show_sweep(self._whole_cloud(result))
 
     def stop(self) -> None:
-        """End the thread, after the sweep that it is sending."""
+        """End the thread, after the sweep that is being sent."""
         self._ended.set()
         self._thread.join()
 

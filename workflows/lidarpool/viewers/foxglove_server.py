@@ -109,7 +109,7 @@ class FoxgloveServer(Viewer):
         return f"ds=foxglove-websocket&ds.url=ws://{self.address}"
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier ones."""
+        """Show scene, trajectories and path in place of earlier surroundings."""
         self._channel(_FRAMES, channels.FrameTransformsChannel)
         for topic in surroundings.topics:  # clients subscribe before the first sweep
             self._channel(topic, channels.PointCloudChannel)
@@ -163,7 +163,7 @@ class FoxgloveServer(Viewer):
         channel.log(message, log_time=time_ns)
 
     def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
-        """Return the channel of a topic, of which clients hear when it is made."""
+        """Return the channel of a topic; a new channel is advertised to clients."""
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
@@ -225,7 +225,7 @@ def _transform(transform: Transform, stamp: Any) -> Any:
 
 
 def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
-    """Return the boxes of the actors that are present; boxes of all others are deleted."""
+    """Return the boxes of the actors that are present; boxes of absent actors are deleted."""
     entities = []
     deletions = []
     for number, name in enumerate(boxes.names):
@@ -244,8 +244,8 @@ def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
             color=_WHITE,
             text=name,
         )
-        about = {"type": boxes.types[number], "points": f"{boxes.points[number]}"}
-        metadata = [messages.KeyValuePair(key=key, value=value) for key, value in about.items()]
+        details = {"type": boxes.types[number], "points": f"{boxes.points[number]}"}
+        metadata = [messages.KeyValuePair(key=key, value=value) for key, value in details.items()]
         entities.append(
             _entity(name, timestamp=stamp, cubes=[cube], texts=[text], metadata=metadata)
         )
@@ -253,7 +253,7 @@ def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
 
 
 def _triangles(surface: Surface) -> Iterable[Any]:
-    """Yield the triangles of a scene, one primitive for each colour."""
+    """Yield the triangles of a scene, a primitive for each colour."""
     pose = _pose(surface.origin)
     if surface.colours is None:
         yield _triangle_list(surface, slice(None), pose, _GREY)
@@ -293,7 +293,7 @@ def _line(positions: Floats, colour: Any) -> Any:
 
 
 def _entity(name: str, **primitives: Any) -> Any:
-    """Return an entity in the world, which stays until an entity of its name replaces it."""
+    """Return an entity in the world, which stays until an entity of the same name comes."""
     return messages.SceneEntity(id=name, frame_id=WORLD, frame_locked=True, **primitives)
 
 

@@ -63,7 +63,7 @@ class RerunServer(Viewer):
         self.description = f"Rerun: open http://{page}/?url={source} or run rerun {source}"
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier ones."""
+        """Show scene, trajectories and path in place of earlier surroundings."""
         self._log.show_surroundings(surroundings)
 
     def show_path(self, path: Floats) -> None:
@@ -75,7 +75,7 @@ class RerunServer(Viewer):
         self._log.show_sweep(shown)
 
     def close(self) -> None:
-        """Send what waits, and end the server."""
+        """Send waiting messages, and end the server."""
         self._recording.disconnect()
         with suppress(ProcessLookupError):  # it has ended by itself
             os.killpg(self._process.pid, signal.SIGTERM)  # the program is a child of the module

@@ -51,7 +51,7 @@ class ScannerView:
 
     @property
     def description(self) -> str:
-        """One line for users: what to open."""
+        """Line for users with the addresses to open."""
         return self._viewer.description
 
     @checked
@@ -143,8 +143,8 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
     ]
     poses = [_pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     for name, actor_pose in zip(actor_frames, poses, strict=False):
-        place = _position_and_quaternion(actor_pose, scene.origin)
-        transforms.append(Transform(WORLD, name, *place))
+        actor_in_world = _position_and_quaternion(actor_pose, scene.origin)
+        transforms.append(Transform(WORLD, name, *actor_in_world))
     now_ns = time.time_ns()
     return ShownSweep(
         start_ns=now_ns,
@@ -192,7 +192,7 @@ def _is_present(actor: Actor, time_ns: float) -> bool:
 
 
 def _pose_at(pose: Any, time_ns: float) -> Pose:
-    """Return a pose as it is, or the pose of a trajectory at a time."""
+    """Return a pose unchanged, or the pose of a trajectory at a time."""
     is_trajectory = hasattr(pose, "poses")
     return pose.pose(0, time_ns) if is_trajectory else pose_of("pose", pose)
 

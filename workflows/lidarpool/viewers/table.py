@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class ViewerRow(NamedTuple):
-    """A kind of viewers: where its class is, and what it needs."""
+    """A kind of viewers: its class and its packages."""
 
     target: str  # module and class, which is called with an address and a title
     package: str  # import package

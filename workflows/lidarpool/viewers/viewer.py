@@ -23,7 +23,7 @@ _PORTS_TRIED = 20
 
 
 class Viewer(ABC):
-    """A viewer that gets sweeps, and sends them to the programs that are connected.
+    """Sends sweeps to connected programs that show sweeps.
 
     A context manager. Programs that connect late get the surroundings, too.
     """
@@ -32,7 +32,7 @@ class Viewer(ABC):
 
     @abstractmethod
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier ones."""
+        """Show scene, trajectories and path in place of earlier surroundings."""
 
     @abstractmethod
     def show_path(self, path: Floats) -> None:
@@ -115,15 +115,15 @@ class Address(NamedTuple):
         return cls(host.strip("[]") or LOOPBACK, int(number) if number else port)
 
     def _check_free(self, count: int) -> None:
-        """Raise LidarError unless servers can listen on `count` ports from this one on."""
+        """Raise LidarError unless servers can listen on `count` ports, the first of which is `port`."""
         for port in range(self.port, self.port + count):
             try:
-                family, kind, protocol, _, place = socket.getaddrinfo(
+                family, kind, protocol, _, socket_address = socket.getaddrinfo(
                     self.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
                 )[0]
                 with socket.socket(family, kind, protocol) as listener:
                     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                    listener.bind(place)
+                    listener.bind(socket_address)
             except (OSError, OverflowError) as error:
                 reason = getattr(error, "strerror", None) or str(error)
                 raise LidarError(
