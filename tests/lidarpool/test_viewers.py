@@ -186,6 +186,17 @@ def test_who_comes_late_gets_the_last_message_of_each_topic(bridge, played):
 
 
 @needs_foxglove
+def test_another_scene_replaces_all_that_was_shown(bridge, played):
+    _, scanned, _ = played
+    bridge.send(*scanned[0], 0)
+    bridge.show_content(lambda: None)  # no scene
+    with FoxgloveClient(port_of(bridge.description)) as client:
+        client.receive(lambda client: client.of("/scene") and client.of("/actors"))
+    everything = {"deletions": [{"type": 1}]}
+    assert client.of("/scene") == client.of("/actors") == [everything]
+
+
+@needs_foxglove
 def test_slow_and_malformed_clients_do_not_matter(bridge, played, capfd):
     port = port_of(bridge.description)
     sweep, points = next(entry for entry in played[1] if len(entry[1]) > 5_000)

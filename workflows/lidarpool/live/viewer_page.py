@@ -188,7 +188,7 @@ class SurveyFeed:
         self._reader.add(receipts)
 
     def finish_scan(self, scan: int) -> None:
-        """Note that a scan and all scans before it are in storage."""
+        """Note that a scan and all earlier scans are in storage."""
         if scan in self._last_scans:
             with self._lock:
                 self._waiting.append(self._last_scans[scan])

@@ -34,6 +34,9 @@ _NUMBER_TYPES = {
 }
 _FRAMES = "/tf"
 _ACTORS = "/actors"
+_SCENE = "/scene"
+_TRAJECTORIES = "/trajectories"
+_PATH = "/path"
 _GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=1.0)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
@@ -110,6 +113,7 @@ class FoxgloveServer(Viewer):
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
         """Show scene, trajectories and path in place of earlier surroundings."""
+        self._clear()
         self._channel(_FRAMES, channels.FrameTransformsChannel)
         for topic in surroundings.topics:  # clients subscribe before the first sweep
             self._channel(topic, channels.PointCloudChannel)
@@ -117,19 +121,19 @@ class FoxgloveServer(Viewer):
             self._channel(_ACTORS, channels.SceneUpdateChannel)
         if surroundings.surface is not None:
             triangles = [*_triangles(surroundings.surface)]
-            self._send_entities("/scene", [_entity("scene", triangles=triangles)])
+            self._send_entities(_SCENE, [_entity("scene", triangles=triangles)])
         if surroundings.trajectories:
             entities = [
                 _entity(name, lines=[_line(positions, _BLUE)])
                 for name, positions in surroundings.trajectories.items()
             ]
-            self._send_entities("/trajectories", entities)
+            self._send_entities(_TRAJECTORIES, entities)
         if surroundings.path is not None:
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
         """Show a planned path, (w, 3), metres, world coordinates."""
-        self._send_entities("/path", [_entity("path", lines=[_line(path, _GREEN)])])
+        self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
         """Show the points of a sweep, its frames and its boxes of actors; return at once."""
@@ -151,6 +155,15 @@ class FoxgloveServer(Viewer):
     def close(self) -> None:
         """Disconnect all clients."""
         self._server.stop()
+
+    def _clear(self) -> None:
+        """Delete all entities, and forget all frames."""
+        everything = messages.SceneEntityDeletion(type=messages.SceneEntityDeletionType.All)
+        for topic in (_SCENE, _TRAJECTORIES, _PATH, _ACTORS):
+            if topic in self._latest:
+                update = messages.SceneUpdate(deletions=[everything])
+                self._send(topic, channels.SceneUpdateChannel, update, self._start_ns)
+        self._frames = {}
 
     def _send_entities(self, topic: str, entities: list[Any]) -> None:
         update = messages.SceneUpdate(entities=entities)

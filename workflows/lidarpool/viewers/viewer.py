@@ -115,7 +115,7 @@ class Address(NamedTuple):
         return cls(host.strip("[]") or LOOPBACK, int(number) if number else port)
 
     def _check_free(self, count: int) -> None:
-        """Raise LidarError unless servers can listen on `count` ports, the first of which is `port`."""
+        """Raise LidarError unless servers can listen on `count` ports from `port` on."""
         for port in range(self.port, self.port + count):
             try:
                 family, kind, protocol, _, socket_address = socket.getaddrinfo(
