@@ -30,6 +30,8 @@ _PIPE_BYTES = 1 << 20
 _POINT_PIXELS = 1.5
 _LINE_PIXELS = 1.5
 _GREY = (150, 150, 150)
+_WHITE = (255, 255, 255)
+_SCENE_ALPHA = 100  # of 255: points on a surface, and behind a wall, can be seen
 _ORANGE = (255, 153, 0)
 _BLUE = (51, 153, 255)
 _GREEN = (26, 204, 77)
@@ -126,18 +128,13 @@ class RerunLog:
             names = [rr.AnnotationInfo(*item) for item in surroundings.classes.items()]
             self._log_static(WORLD, rr.AnnotationContext(names))
         if (surface := surroundings.surface) is not None:
-            vertices = surface.vertices
-            faces = surface.faces
-            colours = None
-            if surface.colours is not None:  # of faces, and Rerun's are of vertices
-                vertices = vertices[faces].reshape(-1, 3)
-                colours = surface.colours.repeat(3, axis=0)
-                faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+            corners = surface.vertices[surface.faces]  # Rerun shades by the normals of vertices
+            colours = surface.colours
             mesh = rr.Mesh3D(
-                vertex_positions=vertices,
-                triangle_indices=faces.astype(np.uint32),
-                vertex_colors=colours,
-                albedo_factor=_GREY if colours is None else None,
+                vertex_positions=corners.reshape(-1, 3),
+                vertex_normals=_normals(corners).repeat(3, axis=0),
+                vertex_colors=None if colours is None else colours.repeat(3, axis=0),
+                albedo_factor=(*(_GREY if colours is None else _WHITE), _SCENE_ALPHA),
             )
             self._log_static(f"{WORLD}/scene", mesh)
         for name, positions in surroundings.trajectories.items():
@@ -166,19 +163,15 @@ class RerunLog:
                 translation=position, quaternion=rr.Quaternion(xyzw=transform.quaternion)
             )
             self._recording.log(path, pose)
-        class_ids = None
-        colours: Bytes | None = None
-        if self._has_classes and "class" in shown.columns and "red" not in shown.columns:
-            class_ids = shown.columns["class"]
-        else:
-            colours = _colours(shown.positions, dict(shown.columns))
+        columns = dict(shown.columns)
+        has_labels = self._has_classes and "class" in columns
         cloud = rr.Points3D(
             shown.positions,
-            colors=colours,
+            colors=_colours(shown.positions, columns),
             radii=rr.Radius.ui_points(_POINT_PIXELS),
-            class_ids=class_ids,
+            class_ids=columns["class"] if has_labels else None,  # names, since there are colours
         )
-        self._recording.log(f"{paths[shown.frame]}/points", cloud, rr.AnyValues(**shown.columns))
+        self._recording.log(f"{paths[shown.frame]}/points", cloud, rr.AnyValues(**columns))
         if shown.boxes is not None:
             self._recording.log(f"{WORLD}/actors", self._boxes(shown.boxes))
 
@@ -199,6 +192,14 @@ class RerunLog:
             labels=[boxes.names[row] for row in rows.tolist()],
             colors=[_ORANGE] * len(rows),
         )
+
+
+def _normals(corners: Floats32) -> Floats32:
+    """Return the unit normals (f, 3) of triangles (f, 3, 3); zero for triangles without area."""
+    a, b, c = corners.swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
 
 
 def _colours(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:

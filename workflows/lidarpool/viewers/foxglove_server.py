@@ -37,7 +37,8 @@ _ACTORS = "/actors"
 _SCENE = "/scene"
 _TRAJECTORIES = "/trajectories"
 _PATH = "/path"
-_GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=1.0)
+_SCENE_ALPHA = 0.4  # points on a surface, and behind a wall, can be seen
+_GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=_SCENE_ALPHA)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _BLUE = messages.Color(r=0.2, g=0.6, b=1.0, a=1.0)
@@ -280,7 +281,7 @@ def _triangles(surface: Surface) -> Iterable[Any]:
 
 def _colour(level: Bytes) -> Any:
     red, green, blue = (level / (2**_COLOUR_BITS - 1)).tolist()
-    return messages.Color(r=red, g=green, b=blue, a=1.0)
+    return messages.Color(r=red, g=green, b=blue, a=_SCENE_ALPHA)
 
 
 def _triangle_list(surface: Surface, rows: Any, pose: Any, colour: Any) -> Any:
