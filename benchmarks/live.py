@@ -51,7 +51,14 @@ def cars(count: int, seconds: float, seed: int = 7) -> list[Actor]:
 
 
 def measure(
-    sensor: str, maker: str, actors: int, port: int, *, seconds: float, triangles: int
+    sensor: str,
+    maker: str,
+    actors: int,
+    port: int,
+    *,
+    seconds: float,
+    triangles: int,
+    rate: float = 1.0,
 ) -> dict[str, Any]:
     """Play a sensor for some seconds; return what was sent and received, and how late."""
     lidar = load_sensor(sensor)
@@ -68,7 +75,7 @@ def measure(
     ports = [port, *(port + other - first for other in others)]
     script = Path(live_receiver.__file__)
     with subprocess.Popen(
-        [sys.executable, str(script), maker, *map(str, ports)],
+        [sys.executable, str(script), maker, str(rate), *map(str, ports)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as receiver:
@@ -80,6 +87,7 @@ def measure(
             POSITION,
             to=f"127.0.0.1:{port}",
             duration_s=seconds,
+            rate=rate,
             ready=print,
             note=notes.append,
         )
@@ -105,6 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--only", choices=[*CASES], nargs="*", default=[*CASES])
     parser.add_argument("--triangles", type=int, default=100_000, help="of the city")
+    parser.add_argument("--rate", type=float, default=1.0, help="0.1: ten times as slow")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     figures = {}
@@ -117,6 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
             port,
             seconds=60 * options.minutes,
             triangles=options.triangles,
+            rate=options.rate,
         )
         print(
             f"{name}: {row['sent']['sent']:,} packets sent in {row['seconds']:g} s, {row['lost']} "

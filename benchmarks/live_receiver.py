@@ -43,8 +43,12 @@ def open_socket(port: int) -> socket.socket:
     return opened
 
 
-def main(maker: str, *ports: str) -> None:
-    """Receive at ports, that of the returns first, until stdin ends and all is silent."""
+def main(maker: str, rate: str, *ports: str) -> None:
+    """Receive at ports, that of the returns first, until stdin ends and all is silent.
+
+    Stamps advance `rate` times as fast as the clock.
+    """
+    period_ns = HOUR_NS / float(rate)  # after which stamps repeat
     sockets = [open_socket(int(port)) for port in ports]
     stamp_ns = STAMPS[maker]
     offsets_ns = []
@@ -65,11 +69,11 @@ def main(maker: str, *ports: str) -> None:
             now_ns = time.monotonic_ns()
             received += 1
             if source is sockets[0]:
-                offsets_ns.append((now_ns - stamp_ns(payload)) % HOUR_NS)
+                offsets_ns.append((now_ns - stamp_ns(payload) / float(rate)) % period_ns)
     first_ns = offsets_ns[0] if offsets_ns else 0
     # The offsets are about equal, and may lie on both sides of the hour.
     offsets_ns = [
-        (offset - first_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2 for offset in offsets_ns
+        (offset - first_ns + period_ns / 2) % period_ns - period_ns / 2 for offset in offsets_ns
     ]
     least_ns = min(offsets_ns, default=0)
     late_ms = sorted((offset - least_ns) / 1e6 for offset in offsets_ns)

@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks import odometry, raycast, realism, scanner, trees
+from benchmarks import live, odometry, raycast, realism, scanner, trees
 
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
@@ -91,3 +91,12 @@ def test_odometry_without_kiss_icp_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr(odometry, "find_spec", lambda name: None)
     assert odometry.main(["--quick"]) == 1
     assert "pip install kiss-icp" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_live_packets_arrive(tmp_path):
+    figures = live.main(["--minutes", "0.005", "--rate", "0.2", "--triangles", "2000"])
+    assert [row["lost"] for row in figures.values()] == [0, 0]
+    assert [row["sent"]["sent"] for row in figures.values()] == [3 * 64, 226 + 16]
+    for row in figures.values():
+        assert sum(row["sent"]["lateness"].values()) == row["received"]

@@ -27,6 +27,7 @@ from lidarpool import (
     Pose,
     Returns,
     Scanner,
+    Scene,
     Track,
     load_sensor,
     play,
@@ -429,3 +430,74 @@ def test_the_interface_of_an_ouster_answers_for_a_recording(tmp_path):
     outcome = command("play", tmp_path / "a.pcap", "--as", "packets")
     assert outcome.exit_code == 0, outcome.output
     assert "a.pcap of 192.168.1.200 sends to 127.0.0.1, port 7502; Ouster's HTTP" in outcome.stdout
+
+
+@pytest.mark.parametrize("name", ["s.yaml", "a.pcap", "out"])
+def test_a_source_that_does_not_exist_is_refused(name, tmp_path):
+    outcome = command("play", tmp_path / name, "--as", "packets")
+    assert re.search(r"does not exist|cannot be read", str(outcome.exception))
+    assert isinstance(outcome.exception, LidarError)
+
+
+def test_a_file_for_lateness_that_cannot_be_written_is_refused_at_the_start(played, tmp_path):
+    file = tmp_path / "nowhere" / "late.json"
+    outcome = command("play", played / "out", "--as", "packets", "--lateness", file)
+    assert f"{file} cannot be written" in str(outcome.exception)
+    assert outcome.stdout == ""
+
+
+def test_ouster_sdk_connects_and_reads_the_sweeps(tmp_path, monkeypatch):
+    pytest.importorskip("ouster.sdk.core", reason="ouster-sdk needs an environment of its own")
+    from ouster.sdk import open_source as open_sensor
+
+    (tmp_path / "s.yaml").write_text(OUSTER)
+    with playing(tmp_path / "s.yaml", "--loop", "--rate", "0.5") as run:
+        ready = run.stdout.readline()
+        url = re.search(r"at (http://[\d.:]+)", ready)[1]
+        monkeypatch.setenv("http_proxy", url)
+        sensor = open_sensor("127.0.0.1", lidar_port=17_702)
+        assert sensor.sensor_info[0].config.udp_port_lidar == 17_702
+        scans = iter(sensor)
+        next(scans)  # from the middle of a sweep
+        frames = [next(scans)[0] for _ in range(3)]
+        sensor.close()
+        run.send_signal(signal.SIGINT)
+        run.communicate(timeout=60)
+    assert np.diff([frame.frame_id for frame in frames]).tolist() == [1, 1]
+    assert all(frame.complete() for frame in frames)
+    scanner = Scanner(Scene.seed(), load_sensor("ouster/os0-32"), columns=["range"])
+    cloud = scanner.sweep(Pose((0, 0, 1)), number=0)
+    for frame in frames:
+        assert np.count_nonzero(frame.field("RANGE")) == len(cloud)
+
+
+OUSTER = """
+sensor: ouster/os0-32
+scene: {preset: seed}
+poses: [[0, 0, 1]]
+steps: 180
+"""
+
+
+def test_samples_of_an_imu_leave_beside_the_returns(receiver, tmp_path):
+    (tmp_path / "s.yaml").write_text(
+        f"{OUSTER.replace('180', '36').replace('poses: [[0, 0, 1]]', DRIVE)}"
+    )
+    port = port_of(receiver) - 1  # of the returns; the IMU's is one more
+    to = f"127.0.0.1:{port}"
+    outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--to", to)
+    assert outcome.exit_code == 0, outcome.output
+    receiver.settimeout(1)
+    samples = received(receiver, 9)
+    stamps = np.array([struct.unpack_from("<Q", sample)[0] for sample in samples])
+    assert {len(sample) for sample in samples} == {48}
+    assert np.diff(stamps).tolist() == [10_000_000] * 8
+
+
+DRIVE = """
+trajectory:
+  points:
+    - {time_s: 0, position: [0, 0, 1]}
+    - {time_s: 1, position: [1, 0, 1]}
+navigation: {imu: {rate_hz: 100}}
+"""

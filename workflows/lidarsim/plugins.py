@@ -1,6 +1,7 @@
 """What plug-ins of mesh files and packets import; docs/how-to/plugins.md has examples."""
 
 from .packets.encoders import Datagrams, PacketEncoder, PacketSource
+from .packets.service import Destination, Service
 from .packets.shots import CarryOver, Shots
 from .scene.files.mesh_formats import MeshFormat
 from .scene.files.scene_graph import Content, MeshFileError, ReadOptions
@@ -10,11 +11,13 @@ __all__ = [
     "CarryOver",
     "Content",
     "Datagrams",
+    "Destination",
     "MeshFileError",
     "MeshFormat",
     "PacketEncoder",
     "PacketSource",
     "ReadOptions",
     "SceneMesh",
+    "Service",
     "Shots",
 ]

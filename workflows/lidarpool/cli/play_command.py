@@ -38,7 +38,7 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
 @options.flag("--loop", help="Play again and again until Ctrl-C; times go on.")
 @click.option(
     "--rate",
-    type=click.FloatRange(0, min_open=True),
+    type=click.FloatRange(0.001, 1000),
     default=1.0,
     show_default=True,
     help="Speed: 0.5 takes twice as long.",
@@ -88,7 +88,7 @@ def play(
     if unknown := [name for name in given if name not in kind.settings]:
         raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
-    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix == RECORDING:
+    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() == RECORDING:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
         _play_recording(source, to, schedule, given, loop=loop)
@@ -119,8 +119,8 @@ def _play_recording(
 
     recording = Recording(path)
     streams = recorded_streams(recording, to, settings.get("api", ()))
-    transmitter = Transmitter(streams, Terminal().tell)
-    with _summarized(lambda: transmitter.summary(settings.get("lateness"))), transmitter:
+    transmitter = Transmitter(streams, Terminal().tell, settings.get("lateness"))
+    with _summarized(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}; Ctrl-C stops")
         play_recording(recording, transmitter, schedule, loop=loop)
 

@@ -25,7 +25,7 @@ from .transmitter import Transmitter, sensor_streams
 _AHEAD = 4  # sweeps that are cast before they are due, of a trajectory that is known
 _START_NS = 20e6  # from the start of the schedule to the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
-Rate = Annotated[float, Field(gt=0)]
+Rate = Annotated[float, Field(ge=0.001, le=1000)]
 Seconds = Annotated[float | None, Field(gt=0)]
 
 

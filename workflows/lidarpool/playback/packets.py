@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Self
 
 from lidarsim.columns.cloud import Cloud
@@ -49,8 +48,7 @@ class PacketsBridge(Bridge):
         ]
         self._encoders = [encoder_of(source) for source in sources]
         streams = sensor_streams(self._encoders, options.to, options.settings.get("api", ()))
-        self._lateness_file: Path | None = options.settings.get("lateness")
-        self._transmitter = Transmitter(streams, note)
+        self._transmitter = Transmitter(streams, note, options.settings.get("lateness"))
 
     @property
     def description(self) -> str:
@@ -82,8 +80,8 @@ class PacketsBridge(Bridge):
 
     @property
     def summary(self) -> str:
-        """How many packets were sent, and how late; which is written to the file for it."""
-        return self._transmitter.summary(self._lateness_file)
+        """How many packets were sent, and how late."""
+        return self._transmitter.summary
 
     def __enter__(self) -> Self:
         self._transmitter.__enter__()

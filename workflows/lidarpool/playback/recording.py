@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.packets.encoders import Datagrams
 from lidarsim.packets.ouster_api import OusterApi
@@ -93,7 +93,7 @@ class Recording:
 
     def _datagrams(self) -> Iterator[RecordedDatagram]:
         """Yield all datagrams."""
-        with open_input(self.path) as file:
+        with explained(f"{self.path} cannot be read"), open_input(self.path) as file:
             magic = file.read(4)
             if magic == _PCAPNG:
                 raise LidarError(

@@ -78,6 +78,8 @@ def open_source(source: Path | Storage, needs: Format | None = None) -> Iterator
     LidarError
         If the source cannot be read, or has no sweeps.
     """
+    if isinstance(source, Path) and not source.exists():
+        raise LidarError(f"{source} does not exist: give a result, a scenario or a recording.")
     with ExitStack() as stack:
         if isinstance(source, Path) and source.is_file():
             if source.suffix.lower() == RECORDING:

@@ -13,7 +13,7 @@ from typing import Self
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.words import did_you_mean
 from lidarsim.packets.encoders import PacketEncoder
-from lidarsim.packets.send import LOOPBACK, Address, Lateness, Sender, check_reachable
+from lidarsim.packets.send import LOOPBACK, Address, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
 
 # Returns the service of a sensor: see `PacketEncoder.service`.
@@ -140,11 +140,17 @@ def _check_apart(stream: Stream, other: Stream) -> None:
 
 
 class Transmitter:
-    """The process that sends the datagrams of streams, and their services: a context manager."""
+    """The process that sends the datagrams of streams, and their services: a context manager.
 
-    def __init__(self, streams: Sequence[Stream], note: Callable[[str], None]) -> None:
+    How late they were is written to the file `lateness`, if it is given, as JSON.
+    """
+
+    def __init__(
+        self, streams: Sequence[Stream], note: Callable[[str], None], lateness: Path | None = None
+    ) -> None:
         self.sender = Sender(note)
         self._streams = streams
+        self._lateness_file = lateness
         self._services: list[str] = []  # descriptions
         self._stack = ExitStack()
 
@@ -153,16 +159,13 @@ class Transmitter:
         """Where the datagrams go, and what answers."""
         return "; ".join([*(stream.describe() for stream in self._streams), *self._services])
 
-    def summary(self, file: Path | None = None) -> str:
-        """Return what was sent, and how late, once the context has ended; also into a JSON file."""
-        lateness: Lateness = self.sender.lateness
-        if file is not None:
-            with explained(f"{file} cannot be written"):
-                text = json.dumps(lateness.to_json(), indent=1) + "\n"
-                file.write_text(text, encoding="utf-8")
-        return f"{lateness}."
+    @property
+    def summary(self) -> str:
+        """What was sent, and how late, once the context has ended."""
+        return f"{self.sender.lateness}."
 
     def __enter__(self) -> Self:
+        self._write_lateness()  # a file that cannot be written is refused before it matters
         with ExitStack() as stack:
             stack.enter_context(self.sender)
             for number, stream in enumerate(self._streams):
@@ -181,6 +184,15 @@ class Transmitter:
 
     def __exit__(self, *error: object) -> None:
         self._stack.__exit__(None, None, None)
+        self._write_lateness()
+
+    def _write_lateness(self) -> None:
+        """Write how late datagrams were; LidarError if the file cannot be written."""
+        file = self._lateness_file
+        if file is not None:
+            with explained(f"{file} cannot be written"):
+                text = json.dumps(self.sender.lateness.to_json(), indent=1) + "\n"
+                file.write_text(text, encoding="utf-8")
 
     def _redirect(self, number: int, destination: Destination) -> None:
         """Send the datagrams of a stream elsewhere, for its service."""

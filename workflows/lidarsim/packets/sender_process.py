@@ -35,7 +35,7 @@ BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _CATCH_UP = 2
 _READ_BYTES = 1 << 16  # at a time, between datagrams
 _MAX_WAITING_BYTES = 256 << 20
-_PRIORITY = -10  # of the process, where it may have one
+_NICENESS = -10
 
 
 class Stop(Exception):  # noqa: N818 - not an error
@@ -165,6 +165,19 @@ def report(values: dict[str, Any]) -> None:
         os.write(1, json.dumps(values).encode() + b"\n")
 
 
+def raise_priority() -> None:
+    """Run before other processes when a datagram is due, if this process may: it mostly sleeps.
+
+    With ten busy processes on two cores, 0.02 % of the datagrams were later than 5 ms by real-time
+    scheduling, 4 % by a niceness of -10, and 13 % without.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (OSError, AttributeError):  # no rights, or not Linux
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
+
+
 def serve(outbox: Outbox) -> None:
     """Send datagrams at their times, until all are sent after END."""
     while not outbox.ended or outbox.waiting:
@@ -189,8 +202,7 @@ def main() -> None:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
+    raise_priority()
     outbox = Outbox()
     report({"ready": True})
     with suppress(Stop):
