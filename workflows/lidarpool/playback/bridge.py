@@ -61,6 +61,10 @@ class Bridge(ABC):
         self.options = options
         self.note = note
 
+    @classmethod  # noqa: B027 - most need none
+    def check_installed(cls) -> None:
+        """Raise LidarError if a package is missing that is imported with the first bridge."""
+
     @property
     @abstractmethod
     def description(self) -> str:
@@ -137,4 +141,5 @@ def bridge_class(name: str) -> type[Bridge]:
         raise LidarError(
             f'--as {name} needs {error.name}: pip install "lidarpool[{entry.extra}]".'
         ) from error
+    bridge.check_installed()
     return bridge

@@ -11,7 +11,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from ..export.shown_sweeps import Surroundings, SweepSequence
-from ..viewers.viewer import Viewer, open_viewer
+from ..viewers.viewer import Viewer, check_installed, open_viewer
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 
@@ -35,6 +35,11 @@ class ViewerBridge(Bridge):
             )
         self._sequence = SweepSequence(sweeps)
         self._viewer = self._open(*options.to)
+
+    @classmethod
+    def check_installed(cls) -> None:
+        """Raise LidarError if the package of the viewer is missing."""
+        check_installed(cls.name)
 
     def _open(self, to: str | None = None) -> Viewer:
         return open_viewer(self.name, to)

@@ -68,12 +68,17 @@ def open_viewer(
     LidarError
         If the package of the viewer is missing, or the address cannot be used.
     """
+    check_installed(name)
+    module, _, kind = VIEWERS[name].target.partition(":")
+    viewer: Viewer = getattr(import_module(module), kind)(to, title, **options)
+    return viewer
+
+
+def check_installed(name: str) -> None:
+    """Raise LidarError if the package of a viewer is missing in this environment."""
     row = VIEWERS[name]
     if find_spec(row.package) is None:
         raise LidarError(f'{name} needs {row.distribution}: pip install "lidarpool[{row.extra}]".')
-    module, _, kind = row.target.partition(":")
-    viewer: Viewer = getattr(import_module(module), kind)(to, title, **options)
-    return viewer
 
 
 class Address(NamedTuple):
