@@ -134,6 +134,12 @@ class FoxgloveClient:
                 break
         return self
 
+    def settle(self):
+        """Wait until the server has taken all subscriptions: it answers a malformed one after."""
+        count = len(self.statuses)
+        self.socket.send('{"op": "subscribe"}')
+        return self.receive(lambda client: len(client.statuses) > count)
+
     def take(self, data):
         if isinstance(data, str):
             message = json.loads(data)

@@ -125,6 +125,7 @@ def test_sweeps_arrive_with_all_columns_where_they_were_measured(bridge, played)
     sweeps, scanned, content = played
     with FoxgloveClient(port_of(bridge.description)) as client:
         client.receive(lambda client: client.of("/trajectories") and client.of("/scene"))
+        client.settle()
         for sweep, points in scanned:
             bridge.send(sweep, points, 0)
         client.receive(lambda client: len(client.of("/actors")) == len(scanned))

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ import numpy as np
 
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
-from lidarview.picture_file import PictureContent
 from lidarview.viewer.view import wait_for_interrupt
 
 from ..columns.parts import read_part
@@ -27,6 +27,7 @@ from ..datasets.job_table import JobRow
 from ..export.frames import WORLD
 from ..export.shown_sweeps import (
     ShownSweep,
+    Surface,
     Surroundings,
     SweepSequence,
     Transform,
@@ -34,7 +35,6 @@ from ..export.shown_sweeps import (
     sendable,
 )
 from ..plan import best
-from ..report.picture_content import planning_picture
 from ..run.pipeline.messages import Receipt, ScanFrame
 from ..run.progress import Progress
 from ..run.run_page import RunPage
@@ -43,7 +43,7 @@ from ..run.store.job_under_way import JobUnderWay
 from ..viewers.viewer import Viewer, open_viewer
 from .cpu_share import CpuShare
 
-READING_SHARE = 0.1  # of a core
+READING_SHARE = 0.05  # of a core, for surroundings and sweeps
 MAX_WAITING = 64  # finished sweeps that wait to be read; of more, every second is left out
 LAST_S = 0.3  # to send waiting sweeps at the end of the run
 LOOK_EVERY_S = 5.0  # at most, for another job of a campaign
@@ -139,10 +139,10 @@ class SweepReader:
 
     def surroundings(self) -> Surroundings:
         """Return scene and trajectories of the job, which takes a moment for large scenes."""
-        job = self._job
-        planning = planning_picture(job.planning)
-        content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
-        return Surroundings.from_sweeps(self.sequence.sweeps, content)
+        surroundings = Surroundings.from_sweeps(self.sequence.sweeps)
+        if self._job.survey.coordinates != "world":
+            return surroundings
+        return replace(surroundings, surface=Surface.from_scene(self._job.scene))
 
     def shown(self, sweep: int) -> ShownSweep:
         """Return a sweep whose parts are in storage; LidarError if a part cannot be read."""
@@ -225,7 +225,8 @@ class SurveyFeed:
     # -- the thread ----------------------------------------------------------------------
 
     def _send_sweeps(self) -> None:
-        self._viewer.show_surroundings(self._reader.surroundings())
+        with self._share.use():
+            self._viewer.show_surroundings(self._reader.surroundings())
         self._has_surroundings.set()
         while not self._ended.wait(_WAIT_S):
             while self._waiting and self._share.due and not self._ended.is_set():
