@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scenario.build import Job
+    from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [
     "Actor",
@@ -69,6 +70,7 @@ __all__ = [
     "Fault",
     "Fit",
     "Follower",
+    "Foxglove",
     "Gnss",
     "Imu",
     "Job",
@@ -83,6 +85,7 @@ __all__ = [
     "Plan",
     "Planning",
     "Pose",
+    "Rerun",
     "Result",
     "Returns",
     "Robot",
@@ -135,6 +138,7 @@ _MODULES = {
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),
+    ".viewers.scanner_view": ("Foxglove", "Rerun"),
     "lidarscenes.robots.robot": ("Robot",),
     "lidarscenes.robots.urdf": ("load_robot",),
 }

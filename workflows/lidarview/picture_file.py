@@ -269,6 +269,12 @@ class PictureContent:
             return cls._from_arrays(archive)
 
     @classmethod
+    def load_from(cls, folder: Path) -> PictureContent | None:
+        """Read the file in the folder of a result; None if there is none."""
+        path = folder / PICTURE_FILE
+        return cls.load(path) if path.exists() else None
+
+    @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
         """Build the content from the arrays of a file; ValueError for another format."""
         if (version := int(arrays["format"])) != _FORMAT:

@@ -85,7 +85,8 @@ def simulate(
         Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     live
         Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
-        cell. `Result.view` shows the result afterwards.
+        cell. `Result.view` shows the result afterwards. "foxglove" and "rerun" show its sweeps in
+        Foxglove and Rerun.
     queue_capacity
         How many items stage 1 may be ahead of stage 2.
     collectors
@@ -196,7 +197,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             Replace a finished data set, too; with `fresh`, also if some of its jobs have failed.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
-            in the cell.
+            in the cell. "foxglove" and "rerun" show sweeps of jobs in Foxglove and Rerun.
         tls, wait_s, patience_s
             As for `simulate`.
 

@@ -30,6 +30,7 @@ from lidarsim.base.words import plural
 
 from ..base.logs import set_logs
 from ..base.shard import ALL
+from ..viewers.table import VIEWERS
 from . import shared_options as shared
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
@@ -43,16 +44,23 @@ if TYPE_CHECKING:
 PROGRAM = "lidarpool"
 PLUGINS = "lidarpool.commands"  # each is a click.Command
 
+_PAGE = "page"  # what --live without a value shows
+
 # Common options of `demo` and `run`; each is a field of RunOptions.
 _common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
-    shared.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
+    click.option(
+        "--live",
+        type=click.Choice([_PAGE, *VIEWERS]),
+        help="Show the run until Ctrl-C: on its page in the browser, in Foxglove or in Rerun; "
+        "--live alone shows the page.",
+    ),
     click.option(
         "--no-stay",
         "stay",
         flag_value=False,
         default=True,
-        help="With --live: end the page with the run.",
+        help="With --live: end the page, or viewer, with the run.",
     ),
     click.option(
         "--only", type=click.Choice(["cloud"]), help="Write the cloud and report.json, no page."
@@ -139,6 +147,22 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     return prepared
 
 
+class _LiveCommand(click.Command):
+    """A command whose option --live may stand alone, also before an argument."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the words of the command line."""
+        values = {_PAGE, *VIEWERS}
+        followers = [*args[1:], ""]
+        return super().parse_args(
+            ctx,
+            [
+                f"--live={_PAGE}" if word == "--live" and follower not in values else word
+                for word, follower in zip(args, followers, strict=True)
+            ],
+        )
+
+
 class _Commands(click.Group):
     """The commands of this package, and the commands of plug-ins."""
 
@@ -175,7 +199,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-@cli.command()
+@cli.command(cls=_LiveCommand)
 @shared.out
 @_common_options
 @_with_run_options
@@ -193,7 +217,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
 
 
-@cli.command()
+@cli.command(cls=_LiveCommand)
 @click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
 @shared.mesh_options
 @shared.out

@@ -27,14 +27,14 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
     "bridge_name",
     metavar="BRIDGE",
     required=True,
-    help="packets: as the sensor sends; ros2: topics of ROS 2.",
+    help="packets: as the sensor sends; ros2: topics of ROS 2; foxglove, rerun: for viewers.",
 )
 @click.option(
     "--to",
     metavar="[NAME=]ADDRESS",
     multiple=True,
-    help="Where to send: HOST or HOST:PORT, for a sensor of several NAME=HOST:PORT.  "
-    "[default: 127.0.0.1]",
+    help="packets: where to send, HOST or HOST:PORT, for a sensor of several NAME=HOST:PORT; "
+    "viewers: where to listen.  [default: 127.0.0.1]",
 )
 @options.flag("--loop", help="Play again and again until Ctrl-C; times go on.")
 @click.option(
@@ -85,6 +85,7 @@ def play(
       lidarpool play drive.yaml --as packets --to roof=127.0.0.1:2368 --to rear=127.0.0.1:2468
       lidarpool play packets/lidar.pcap --as packets --rate 0.5
       lidarpool play drive.yaml --as ros2 --layout ouster --organized
+      lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..playback.bridge import BridgeOptions, bridge_class
@@ -116,6 +117,7 @@ def play(
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, given)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
         with _summarized(lambda: bridge.summary), bridge:
+            bridge.show_content(played.content)
             click.echo(f"ready: {bridge.description}; Ctrl-C stops")
             play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
 

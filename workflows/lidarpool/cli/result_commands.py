@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,7 @@ def export(
     from lidarsim.columns.cloud_file import CloudFile
     from lidarsim.sweeps.instruments import INSTRUMENT_FILES
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+    from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
@@ -154,7 +156,7 @@ def export(
     target = result if out is None else out
     if isinstance(result, Path) and result.is_file():
         raise LidarError(f"{result} is a file: give its folder, {result.parent}.")
-    with local_result(result, (*required, *INSTRUMENT_FILES)) as source:
+    with local_result(result, (*required, PICTURE_FILE, *INSTRUMENT_FILES)) as source:
         for name in required:
             if not (source / name).exists():
                 raise LidarError(
@@ -163,6 +165,7 @@ def export(
                 )
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
+        pictures = partial(PictureContent.load_from, source)
         # Formats that have the option; if no format has the option, all, which refuse it.
         compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
             *formats
@@ -192,7 +195,8 @@ def export(
                     )
             try:
                 for chosen in chosen_formats:
-                    chosen.write(folder / chosen.row.file, cloud, sweeps, overwrite=overwrite)
+                    file = folder / chosen.row.file
+                    chosen.write(file, cloud, sweeps, overwrite=overwrite, content=pictures)
                     written.append(click.format_filename(send(folder / chosen.row.file, target)))
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)

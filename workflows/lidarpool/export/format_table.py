@@ -59,6 +59,9 @@ class FormatRow:
         Whether its points are always compensated for motion.
     laser_scans
         Whether it has a LaserScan of 2D scanners.
+    with_scene
+        Whether it has scene and planned path. The function that writes it then takes `content`, the
+        content of pictures, as well; None if unknown.
     inside
         Pattern of the names of the files in its folder.
     data_set
@@ -88,6 +91,7 @@ class FormatRow:
     one_system: bool = False
     compensates: bool = False
     laser_scans: bool = False
+    with_scene: bool = False
     inside: str = ""
     data_set: str = ""
     of_job: str = ""
@@ -273,6 +277,16 @@ FORMATS = {
         needs=("scan", *_ALL_RAYS),
         holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
+    ),
+    "rrd": FormatRow(
+        "cloud.rrd",
+        "lidarpool.export.rrd",
+        "write_rrd",
+        packages=("rerun",),
+        extra="rerun",
+        needs=("scan", "object"),
+        compensates=True,
+        with_scene=True,
     ),
     "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
     "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent
 
 from ..columns.parts import StoredCloud
 from .folder import staging
@@ -187,11 +188,12 @@ class Format:
         *,
         overwrite: bool = False,
         workers: RangeWorkers | None = None,
+        content: Callable[[], PictureContent | None] = lambda: None,
     ) -> None:
         """Write a cloud to a file or folder completely, or not at all.
 
         Points are read in order, a chunk at a time. Workers write a multi-file format, as far as
-        they see its folder.
+        they see its folder. `content` returns scene and planned path for formats that hold these.
 
         Raises
         ------
@@ -205,6 +207,8 @@ class Format:
                 "compensated": self.compensated,
                 "organized": self.organized,
             }
+        if self.row.with_scene:
+            options["content"] = content()
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as staging_folder:
@@ -265,15 +269,15 @@ def save_cloud(
 ) -> list[str]:
     """Write points in the format of the path's ending, completely or not at all.
 
-    The same points give the same bytes. About a million points are in memory at a time, or
-    those of the largest sweep.
+    The same points give the same bytes, except in .rrd. About a million points are in memory at a
+    time, or those of the largest sweep.
 
     Parameters
     ----------
     cloud
         In memory, or the stored points of a result.
     path
-        Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
+        Its ending is .ply, .las, .laz, .e57, .mcap, .rrd or .parquet, unless there is a `format`.
         Its folder must exist. An existing file is replaced, a folder is not.
     format
         Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",

@@ -1,15 +1,24 @@
-"""Runs and results in the browser, only on this machine and without the internet."""
+"""Runs and results in the browser and in viewers, only on this machine, without the internet."""
 
 from contextlib import AbstractContextManager, nullcontext
 
 from ..run.job_source import Jobs
+from ..run.options import Live
 from ..run.run_page import RunPage
 
 
-def page_of(jobs: Jobs, enabled: bool) -> AbstractContextManager[RunPage]:
-    """Show jobs in the browser if enabled; Matplotlib is imported only then."""
-    if not enabled:
+def page_of(jobs: Jobs, live: Live) -> AbstractContextManager[RunPage]:
+    """Show jobs in the browser, or a viewer; what either needs is imported only then.
+
+    LidarError if the package of a viewer is missing.
+    """
+    if not live:
         return nullcontext(RunPage())
+    title = jobs.title or "lidarpool"
+    if isinstance(live, str) and live != "page":
+        from .viewer_page import viewer_page
+
+        return viewer_page(live, title)
     from .live_page import live_page
 
-    return live_page(len(jobs.numbers), jobs.names, jobs.title or "lidarpool")
+    return live_page(len(jobs.numbers), jobs.names, title)

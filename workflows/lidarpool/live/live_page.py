@@ -53,6 +53,7 @@ from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, wait
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.job_under_way import JobUnderWay
+from .cpu_share import CpuShare
 from .downloads import downloads
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
@@ -316,29 +317,6 @@ def busy_slots(loads: Sequence[tuple[float, Mapping[str, PartitionStats]]]) -> l
         share = min(max(held, took) / max(load.slots, 1), 1.0)
         shares.append([f"{name}, slots busy", share, load.slots])
     return shares
-
-
-class CpuShare:
-    """A share of a core for an activity; processor time, since waiting does not count."""
-
-    def __init__(self, share: float) -> None:
-        self._share = share
-        self._due_at = 0.0
-
-    @property
-    def due(self) -> bool:
-        """True if the activity may run again."""
-        return time.monotonic() >= self._due_at
-
-    @contextmanager
-    def use(self, pause_s: float = 0.0) -> Iterator[None]:
-        """Delay the next run by the processor time of the body over the share, and by a pause."""
-        started = time.thread_time()
-        try:
-            yield
-        finally:
-            self._due_at = max(self._due_at, time.monotonic() + pause_s)
-            self._due_at += (time.thread_time() - started) / self._share
 
 
 class Charts:

@@ -12,6 +12,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.words import did_you_mean
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.picture_file import PictureContent
 
 from ..export.formats import Format
 from .schedule import Schedule
@@ -66,6 +67,10 @@ class Bridge(ABC):
         del settings
         return cls.format
 
+    @classmethod  # noqa: B027 - most need none
+    def check_installed(cls) -> None:
+        """Raise LidarError if a package is missing that is imported with the first bridge."""
+
     @property
     @abstractmethod
     def description(self) -> str:
@@ -83,6 +88,11 @@ class Bridge(ABC):
 
         `sweep` is the first sweep of a sensor, which `send` gets later.
         """
+
+    def show_content(  # noqa: B027 - most receivers have no use for a scene
+        self, content: Callable[[], PictureContent | None]
+    ) -> None:
+        """Show scene and planned path before the first sweep; `content` returns both."""
 
     @abstractmethod
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
@@ -115,6 +125,8 @@ class BridgeEntry(NamedTuple):
 BRIDGES = {
     "packets": BridgeEntry("lidarpool.playback.packets:PacketsBridge"),
     "ros2": BridgeEntry("lidarpool.playback.ros2:Ros2Bridge", "ros2"),
+    "foxglove": BridgeEntry("lidarpool.playback.viewer_bridges:FoxgloveBridge", "live"),
+    "rerun": BridgeEntry("lidarpool.playback.viewer_bridges:RerunBridge", "rerun"),
 }
 
 
@@ -136,4 +148,5 @@ def bridge_class(name: str) -> type[Bridge]:
         raise LidarError(
             f'--as {name} needs {error.name}: pip install "lidarpool[{entry.extra}]".'
         ) from error
+    bridge.check_installed()
     return bridge

@@ -14,7 +14,8 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.formats import Format
-from ..export.ros.layouts import LaidOut, survey_start_ns
+from ..export.frames import survey_start_ns
+from ..export.ros.layouts import LaidOut
 from ..export.ros.messages import RosMessage, SurveyMessages
 from .bridge import Bridge, BridgeOptions
 from .dds import Network, RosPublisher

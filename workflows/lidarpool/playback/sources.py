@@ -19,6 +19,7 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent
 
 from ..export.folder import local_result
 from ..export.formats import Format
@@ -42,6 +43,8 @@ class Played:
 
     sweeps: Sweeps
     points: Callable[[int], Cloud]  # of the sweep of a number; casts the sweep of a scenario
+    # Returns scene and planned path; None for a result without them.
+    content: Callable[[], PictureContent | None] = lambda: None
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
@@ -86,7 +89,7 @@ def open_source(source: Path | Storage, needs: Format | None = None) -> Iterator
                 )
             yield _cast(scenario_job(source, needs), stack)
             return
-        files = (CLOUD, SWEEPS_FILE, *INSTRUMENT_FILES)
+        files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
         folder = stack.enter_context(local_result(source, files))
         yield _recorded(folder, source)
 
@@ -110,7 +113,7 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
         points = next(cloud.chunks(stop - first, first))
         return next(sweeps.points(points, sweep, sweep + 1))
 
-    return Played(sweeps, read)
+    return Played(sweeps, read, lambda: PictureContent.load_from(folder))
 
 
 def scenario_job(path: Path, needs: Format | None = None) -> Job:
@@ -148,4 +151,4 @@ def _cast(job: Job, stack: ExitStack) -> Played:
         part = columns_of([*rig.cast(start, stop)])
         return part.cloud(table, survey.precision_m, origin)
 
-    return Played(sweeps, cast)
+    return Played(sweeps, cast, lambda: PictureContent.before_casting(job.scene, survey)[0])

@@ -199,7 +199,13 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                     output_format.write_to_storage(storage, points, sweeps, workers)
                 else:
                     format_workers = None if storage else workers
-                    output_format.write(staged / file, points, sweeps, workers=format_workers)
+                    output_format.write(
+                        staged / file,
+                        points,
+                        sweeps,
+                        workers=format_workers,
+                        content=partial(picture_content, result),
+                    )
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, counts)

@@ -21,6 +21,9 @@ from ..base.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster.cluster_file import ClusterFile
 
+# The page in the browser (also True), or a viewer; False for none.
+Live = bool | Literal["page", "foxglove", "rerun"]
+
 
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
@@ -50,8 +53,8 @@ class RunOptions(TaskOptions):
     other_workers: int | None = None
     wait_s: Annotated[float, Field(ge=0)] = WAIT_S
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
-    live: bool = False
-    stay: bool = True  # False if the live page ends with the run
+    live: Live = False
+    stay: bool = True  # False if the live page, or viewer, ends with the run
 
     def with_pool(
         self, pool: PoolSection, overrides: Mapping[str, Any] = MappingProxyType({})
@@ -93,7 +96,7 @@ class RunKeywords(TypedDict, total=False):
     other_workers: int | None
     wait_s: float
     patience_s: float
-    live: bool
+    live: Live
 
 
 def options_of_call(

@@ -194,6 +194,11 @@ class Scanner:
         """World coordinates of the scene's local origin, metres: (3,)."""
         return self._rig.scene.origin
 
+    @property
+    def scene(self) -> Scene:
+        """The scene, with actors and instances where they were moved."""
+        return self._rig.scene
+
     @checked
     def span_s(
         self, number: SweepNumber = 0, *, start_s: StartSeconds = None

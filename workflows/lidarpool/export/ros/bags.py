@@ -26,19 +26,19 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
 from .. import reading
+from ..frames import survey_start_ns
 from .layouts import (
     EXTRA_FIELDS,
     LAYOUTS,
     LaidOut,
     message_stamp_ns,
     sensor_traits,
-    survey_start_ns,
 )
 from .messages import (
     LATCHED_TOPICS,
     message_store,
-    points_topic,
     survey_messages,
+    sweep_topic,
 )
 
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
@@ -159,7 +159,7 @@ class Reader(reading.Reader):
 
     def _point_cloud(self, sweep: int) -> Any:
         """Return the PointCloud2 of a sweep; ValueError if the bag lacks the message."""
-        topic = points_topic(self.sweeps, sweep)
+        topic = sweep_topic(self.sweeps, sweep)
         connections = [opened for opened in self._bag.connections if opened.topic == topic]
         time_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
         record = next(self._bag.messages(connections, time_ns, time_ns + 1), None)

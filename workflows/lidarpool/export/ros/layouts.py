@@ -18,12 +18,12 @@ from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.sweeps import Sweeps
 
+from ..frames import survey_start_ns
+
 # Types of returns of Autoware's sensor drivers.
 UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
 _SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
-# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
-START_NS = 1_000_000_000_000_000_000
 
 _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 _XYZI = [*_XYZ, ("intensity", "<f4")]
@@ -344,11 +344,6 @@ def message_stamp_ns(sweeps: Sweeps, sweep: int) -> int:
 def sensor_traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
     """Return the traits of the sensor of a sweep."""
     return sweeps.lidars[sweeps.sensor[sweep]]
-
-
-def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey, nanoseconds since 1970; `START_NS` without a date."""
-    return START_NS if sweeps.start_ns is None else sweeps.start_ns
 
 
 def _maker_numbers(traits: LidarTraits) -> Ints:

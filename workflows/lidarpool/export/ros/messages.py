@@ -16,9 +16,10 @@ from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.ray_image import Image
-from lidarsim.sweeps.sweeps import SweepPoses, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 from ..boxes import Boxes
+from ..frames import CARRIER, INSTRUMENTS, WORLD, frame_names, points_topic, survey_start_ns
 from ..laser_scan import ScanRays
 from .layouts import (
     LaidOut,
@@ -26,7 +27,6 @@ from .layouts import (
     point_rows,
     sensor_traits,
     since_stamp_ns,
-    survey_start_ns,
 )
 from .livox import CUSTOM_DEFINITION, CUSTOM_MSG, check_lines, custom_message
 from .organized import organized_rows
@@ -48,10 +48,6 @@ class Serialised(NamedTuple):
     cdr: bytes
 
 
-# frames
-WORLD = "map"
-CARRIER = "base_link"
-_INSTRUMENTS = "imu", "gnss"
 LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # kept for late readers
 # Messages of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
@@ -108,8 +104,8 @@ class SurveyMessages:
             field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
             for name, (kind, offset, *_) in (self._row.fields or {}).items()
         ]
-        self._frames = frame_names(sweeps)
-        self._actors = self._frames[len(sweeps.sensors) : -len(_INSTRUMENTS)]
+        self._frames = frame_names(sweeps.sensors, sweeps.actors)
+        self._actors = self._frames[len(sweeps.sensors) : -len(INSTRUMENTS)]
         poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         # Carrier and actors: frame and poses.
         self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
@@ -152,7 +148,7 @@ class SurveyMessages:
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
-        topic = points_topic(sweeps, sweep)
+        topic = sweep_topic(sweeps, sweep)
         for name, content in self._measured(sweep, points).items():
             yield _sent(f"{topic.removesuffix('points')}{name}", content, time_ns)
         if self._actors:
@@ -225,7 +221,11 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
     instruments = sweeps.instruments
     if instruments is None or instruments.folder is None:
         return []
-    frames = zip(frame_names(sweeps)[-2:], (instruments.imu, instruments.gnss), strict=True)
+    frames = zip(
+        frame_names(sweeps.sensors, sweeps.actors)[-2:],
+        (instruments.imu, instruments.gnss),
+        strict=True,
+    )
     return [
         (
             CARRIER,
@@ -238,16 +238,11 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
     ]
 
 
-def frame_names(sweeps: Sweeps) -> list[str]:
-    """Return the frames of the sensors, then of the actors, the IMU and the GNSS receiver."""
-    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2:]
-
-
-def points_topic(sweeps: Sweeps, sweep: int) -> str:
+def sweep_topic(sweeps: Sweeps, sweep: int) -> str:
     """Return the topic of the points of a sweep."""
     sensor = sweeps.sensor[sweep]
-    return f"/{frame_names(sweeps)[sensor]}/points" if sweeps.sensors[sensor] else "/points"
+    frames = frame_names(sweeps.sensors, sweeps.actors)
+    return points_topic(sweeps.sensors[sensor], frames[sensor])
 
 
 def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
@@ -299,7 +294,7 @@ class _Messages:
         instruments = sweeps.instruments
         if instruments is None:
             return iter(())
-        *_, imu, gnss = frame_names(sweeps)
+        *_, imu, gnss = frame_names(sweeps.sensors, sweeps.actors)
         streams = self._imu(instruments, imu, start_ns), self._gnss(instruments, gnss, start_ns)
         return merge(*streams, key=lambda message: message.time_ns)
 

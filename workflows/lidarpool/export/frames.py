@@ -1,0 +1,29 @@
+"""Names of frames and topics of sweeps, alike in bags of ROS and in live views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
+
+WORLD = "map"
+CARRIER = "base_link"
+INSTRUMENTS = "imu", "gnss"
+# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
+START_NS = 1_000_000_000_000_000_000
+
+
+def frame_names(sensors: Sequence[str], actors: Sequence[str]) -> list[str]:
+    """Return the frames of sensors, then of actors, the IMU and the GNSS receiver, by names."""
+    named = (*(name or "lidar" for name in sensors), *actors)
+    return plain_names((WORLD, CARRIER, *named, *INSTRUMENTS))[2:]
+
+
+def points_topic(name: str, frame: str) -> str:
+    """Return the topic of the points of a sensor with a name, which may be empty, and a frame."""
+    return f"/{frame}/points" if name else "/points"
+
+
+def survey_start_ns(sweeps: Sweeps) -> int:
+    """Return the start of a survey, ns since 1970-01-01 UTC; `START_NS` without a date."""
+    return START_NS if sweeps.start_ns is None else sweeps.start_ns
