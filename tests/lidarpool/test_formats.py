@@ -46,13 +46,13 @@ from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
-from lidarpool.export.frames import START_NS
 from lidarpool.export.las import wkt
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLOURS, TABLE
+from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import Sweeps

@@ -35,12 +35,12 @@ from lidarpool import (
 )
 from lidarpool.cli.commands import cli
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.frames import START_NS
 from lidarpool.export.shown_sweeps import ShownSweep, Surroundings
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarpool.playback.sources import open_source
 from lidarpool.viewers.viewer import Address, Viewer, open_viewer
+from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import box
 from lidarsim.sensor.trajectory import matrices
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 WORLD = "map"
 CARRIER = "base_link"
 INSTRUMENTS = "imu", "gnss"
-# Start of a survey without a date: at time 0, tf2 would take the newest frames for all times.
-START_NS = 1_000_000_000_000_000_000
 
 
 def frame_names(sensors: Sequence[str], actors: Sequence[str]) -> list[str]:
@@ -25,5 +24,8 @@ def points_topic(name: str, frame: str) -> str:
 
 
 def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey, ns since 1970-01-01 UTC; `START_NS` without a date."""
+    """Return the start of a survey, ns since 1970-01-01 UTC; `START_NS` without a date.
+
+    Not 0: at time 0, tf2 would take the newest frames for all times.
+    """
     return START_NS if sweeps.start_ns is None else sweeps.start_ns

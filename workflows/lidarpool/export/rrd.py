@@ -16,11 +16,12 @@ import rerun as rr
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.table import COLOURS
+from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 from lidarview.render.colouring import TURBO
 
-from .frames import CARRIER, START_NS, WORLD
+from .frames import CARRIER, WORLD
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 
 APPLICATION = "lidarpool"

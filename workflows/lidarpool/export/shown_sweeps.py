@@ -10,13 +10,14 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints32
 from lidarsim.columns.cloud import Cloud
+from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from .boxes import Boxes
-from .frames import CARRIER, START_NS, WORLD, frame_names, points_topic, survey_start_ns
+from .frames import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
 
 MAX_TRIANGLES = 200_000  # of the scene in viewers
 MAX_POSITIONS = 10_000  # of a trajectory
