@@ -155,9 +155,8 @@ def check_columns(cloud_columns: Collection[str], names: Iterable[str]) -> None:
 def settings_of(sensor: Sensor) -> PacketSettings:
     """Return the packets of a sensor; LidarError, with models that have some, without packets."""
     if sensor.packets is None:
-        raise LidarError(
-            f"{sensor.model} has no packets: use a model with packets, {', '.join(with_packets())}."
-        )
+        names = ", ".join(name.rpartition("/")[2] for name in with_packets())
+        raise LidarError(f"{sensor.model} has no packets: use a model with packets, {names}.")
     return sensor.packets
 
 
