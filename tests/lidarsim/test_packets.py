@@ -138,7 +138,7 @@ def one_line(raised):
 @pytest.mark.parametrize(
     ("sensor", "mode", "says"),
     [
-        (Sensor.grid(), "strongest", "Sensor with 40 channels has no packets: .* velodyne/vlp16"),
+        (Sensor.grid(), "strongest", "Sensor with 40 channels has no packets: .* vlp16"),
         (load_sensor("hdl64e-s3"), "strongest", "has no packets: use a model with packets, "),
         (load_sensor("vlp16"), "first", "have the returns strongest, last, dual, not first"),
         (load_sensor("vlp16"), "all", "have the returns strongest, last, dual, not all"),
