@@ -18,6 +18,9 @@ demo:  ## the default survey, then a drive through a city; results in $(OUT)/ an
 	@mkdir -p $(OUT)/drive && cp examples/drive.yaml $(OUT)/drive
 	$(BIN)/lidarpool scene city $(OUT)/drive/city.glb --overwrite
 	$(BIN)/lidarpool run $(OUT)/drive/drive.yaml --out $(OUT)/drive --overwrite --pictures
+	@echo
+	@echo "Next, look at the drive:   $(BIN)/lidarpool view $(OUT)/drive"
+	@echo "and scan a mesh of yours:  $(BIN)/lidarpool run YOUR.glb --out $(OUT)/yours"
 
 # Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
 # file stay together, for they share clusters; files come in the order of testpaths.
