@@ -17,6 +17,7 @@ from .backend import Backend, ClosestHits
 from .crossing import Nearest, TimedBodies
 from .device import DeviceHits, OtherHits, to_device
 from .hits import Counted, Part, ScanReturns, join_hits
+from .installation import install_command
 from .instances import Scene
 from .layout import lay_out, lay_out_instances
 from .opacity import Masks
@@ -55,7 +56,7 @@ class CudaBackend(Backend):
     def missing(cls) -> str:
         """Return why CuPy or CUDA cannot be used and the remedy; "" if usable."""
         if importlib.util.find_spec("cupy") is None:
-            return "CuPy is not installed: pip install cupy-cuda12x or cupy-cuda13x"
+            return f"CuPy is not installed: {install_command('cupy-cuda12x')} or cupy-cuda13x"
         try:
             import cupy
         except ImportError as error:
@@ -70,9 +71,10 @@ class CudaBackend(Backend):
             cupy.cuda.nvrtc.getVersion()
         except RuntimeError as error:
             reason = str(error).partition("\n")[0]
-            return f"CuPy finds no compiler ({reason}): pip install 'cupy-cuda13x[ctk]', or 12x"
+            command = install_command("cupy-cuda13x[ctk]")
+            return f"CuPy finds no compiler ({reason}): {command}, or 12x"
         if not _headers():
-            return "CuPy finds no CUDA headers: pip install 'cupy-cuda13x[ctk]', or 12x"
+            return f"CuPy finds no CUDA headers: {install_command('cupy-cuda13x[ctk]')}, or 12x"
         return ""
 
     @classmethod

@@ -22,6 +22,7 @@ from .arrays import Floats
 from .backend import Backend, ClosestHits
 from .crossing import Crossing, Nearest
 from .hits import Part, join_hits
+from .installation import install_command
 from .instances import Scene
 from .mesh import NEAR
 from .pattern_rays import checked_rays
@@ -91,11 +92,11 @@ class EmbreeBackend(Backend):
     def missing(cls) -> str:
         """Return why Embree or numba cannot be used and the remedy; "" if usable."""
         if importlib.util.find_spec("numba") is None:
-            return "numba is not installed: pip install numba"
+            return f"numba is not installed: {install_command('numba')}"
         try:
             embree_library.load_library()
         except (ImportError, OSError) as error:
-            return f"Embree does not load ({error}): pip install embreex"
+            return f"Embree does not load ({error}): {install_command('embreex')}"
         return ""
 
     @classmethod

@@ -26,6 +26,7 @@ from .backend import BackendUnavailable
 from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, TimedBodies
 from .deforming import Deforming
+from .installation import install_command
 from .scan import Scan
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def hits_on(
         If numba is not installed.
     """
     if importlib.util.find_spec("numba") is None:
-        raise BackendUnavailable("Bodies that move need numba: pip install numba.")
+        raise BackendUnavailable(f"Bodies that move need numba: {install_command('numba')}.")
     from . import moving_loops as loops  # numba takes half a second to import
 
     end = float(np.nextafter(scan.t_max, np.inf))  # t_max counts

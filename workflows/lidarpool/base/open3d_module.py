@@ -10,6 +10,7 @@ from typing import Any
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.interrupts import deferred_interrupts
+from raybeam.installation import install_command
 
 _LOCK = Lock()  # a second thread would find the temporary package
 
@@ -30,7 +31,7 @@ def load_open3d() -> Any:
         except (ImportError, OSError) as error:
             advice = "apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0 (on Debian and Ubuntu)"
             if isinstance(error, ModuleNotFoundError):
-                advice = "pip install open3d-cpu (Linux x86_64) or open3d"
+                advice = f"{install_command('open3d-cpu')} (Linux x86_64) or open3d"
             raise LidarError(
                 f"Clouds are written through Open3D, which does not load ({error}): {advice}."
             ) from error

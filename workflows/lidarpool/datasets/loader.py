@@ -26,6 +26,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from raybeam.installation import install_command
 
 from ..base.sealed import unsealed
 from ..export.boxes import Boxes
@@ -160,7 +161,7 @@ class SavedSweeps:
             If torch is not installed.
         """
         if find_spec("torch") is None:
-            raise LidarError("This needs PyTorch: pip install torch.")
+            raise LidarError(f"This needs PyTorch: {install_command('torch')}.")
         from .torch_sweeps import TorchSweeps
 
         return TorchSweeps(self, transform, even)

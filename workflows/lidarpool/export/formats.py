@@ -18,6 +18,7 @@ from lidarsim.base.validation import checked, checked_fields
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
+from raybeam.installation import install_command
 
 from ..columns.parts import StoredCloud
 from .folder import staging
@@ -150,10 +151,9 @@ class Format:
     def check_installed(self) -> None:
         """Raise LidarError if a package that writes the format is missing in this environment."""
         if missing := self.row.missing_packages:
-            extra = f'"lidarpool[{self.row.extra}]"' if self.row.extra else " ".join(missing)
-            raise LidarError(
-                f"The format {self.format} needs {' and '.join(missing)}: pip install {extra}."
-            )
+            needs = [f"lidarpool[{self.row.extra}]"] if self.row.extra else missing
+            command = install_command(*needs)
+            raise LidarError(f"The format {self.format} needs {' and '.join(missing)}: {command}.")
         if self.row.plugin is not None:
             self.row.provides(self.row.write)
 

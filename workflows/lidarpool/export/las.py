@@ -26,6 +26,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
+from raybeam.installation import install_command
 
 from .flight_lines import FlightLines
 
@@ -289,7 +290,7 @@ def wkt(epsg: int) -> str:
     if find_spec("rasterio") is None:
         raise LidarError(
             f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need rasterio: "
-            'pip install "lidarpool[geo]".'
+            f"{install_command('lidarpool[geo]')}."
         )
     crs = import_module("rasterio.crs")
     try:

@@ -13,6 +13,7 @@ from lidarsim.base.words import did_you_mean
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
+from raybeam.installation import install_command
 
 from ..export.formats import Format
 from .schedule import Schedule
@@ -146,7 +147,7 @@ def bridge_class(name: str) -> type[Bridge]:
         if not entry.extra or (error.name or "").startswith("lidar"):
             raise
         raise LidarError(
-            f'--as {name} needs {error.name}: pip install "lidarpool[{entry.extra}]".'
+            f"--as {name} needs {error.name}: {install_command(f'lidarpool[{entry.extra}]')}."
         ) from error
     bridge.check_installed()
     return bridge

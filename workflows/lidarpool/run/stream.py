@@ -30,6 +30,7 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.simulator.scene_caster import check_backend_here
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
+from raybeam.installation import install_command
 
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
@@ -106,7 +107,7 @@ class SweepStream:
         LidarError if torch is not installed; in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
-            raise LidarError("This needs PyTorch: pip install torch.")
+            raise LidarError(f"This needs PyTorch: {install_command('torch')}.")
         from ..datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)

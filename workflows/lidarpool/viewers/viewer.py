@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Self
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
+from raybeam.installation import install_command
 
 from ..export.shown_sweeps import ShownSweep, Surroundings
 from .table import VIEWERS
@@ -78,7 +79,8 @@ def check_installed(name: str) -> None:
     """Raise LidarError if the package of a viewer is missing in this environment."""
     row = VIEWERS[name]
     if find_spec(row.package) is None:
-        raise LidarError(f'{name} needs {row.distribution}: pip install "lidarpool[{row.extra}]".')
+        command = install_command(f"lidarpool[{row.extra}]")
+        raise LidarError(f"{name} needs {row.distribution}: {command}.")
 
 
 class Address(NamedTuple):

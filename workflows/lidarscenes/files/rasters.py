@@ -35,6 +35,7 @@ from lidarsim.scene.files.scene_graph import (
     Window,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
+from raybeam.installation import install_command
 
 DRIVERS = {  # {ending: GDAL's name of the driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",
@@ -76,7 +77,9 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     The window has the pixels whose middles are within.
     """
     if find_spec("rasterio") is None:
-        raise MeshFileError('is a raster, which rasterio reads: pip install "lidarpool[geo]"')
+        raise MeshFileError(
+            f"is a raster, which rasterio reads: {install_command('lidarpool[geo]')}"
+        )
     request = options.raster
     window = request.window
     chosen = request.step_m is not None or window is not None

@@ -53,6 +53,7 @@ from lidarsim.scene.scene_instances import SceneInstance, scales_of
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
+from raybeam.installation import install_command
 
 from .usd_materials import MeshLook, UsdMaterials, material_pieces
 
@@ -71,7 +72,8 @@ _Frame = tuple[dict[str, Any], list[AnyArray]]
 def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read all visible prims of a scene at its first time, and their motions or an animation."""
     if find_spec("pxr") is None:
-        raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
+        command = install_command("lidarpool[usd]")
+        raise MeshFileError(f"is OpenUSD, which usd-core reads: {command}")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
     allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)  # of all its files

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
+from raybeam.installation import install_command
+
 from .errors import LidarError, explained, prefixed
 from .words import printable
 
@@ -16,7 +18,7 @@ def need(package: str, extra: str, purpose: str) -> None:
     `purpose` starts the error: «clouds are read».
     """
     if find_spec(package) is None:
-        raise LidarError(f'{purpose} by {package}: pip install "lidarpool[{extra}]".')
+        raise LidarError(f"{purpose} by {package}: {install_command(f'lidarpool[{extra}]')}.")
 
 
 @contextmanager

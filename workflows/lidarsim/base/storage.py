@@ -20,6 +20,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from raybeam.installation import install_command
+
 from .errors import LidarError
 from .input_files import open_input
 
@@ -142,11 +144,12 @@ class Storage:
         try:
             import fsspec
         except ImportError as error:
-            raise LidarError(f"{self.url} is opened by fsspec: pip install fsspec.") from error
+            command = install_command("fsspec")
+            raise LidarError(f"{self.url} is opened by fsspec: {command}.") from error
         try:
             system, folder = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError) as error:
-            extra = 'pip install "lidarpool[s3]"' if self.url.startswith("s3://") else ""
+            extra = install_command("lidarpool[s3]") if self.url.startswith("s3://") else ""
             hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
             raise LidarError(f"{self.url} cannot be opened: {error}{hint}.") from error
         return os.getpid(), system, folder

@@ -14,6 +14,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from raybeam.installation import install_command
+
 from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked, checked_fields, shown
@@ -241,9 +243,7 @@ def need_packages(*packages: str) -> None:
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
     ]
     if missing:
-        raise LidarError(
-            f"Dataframes need {' and '.join(missing)}: pip install {' '.join(missing)}."
-        )
+        raise LidarError(f"Dataframes need {' and '.join(missing)}: {install_command(*missing)}.")
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:

@@ -23,6 +23,8 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, Strict
 
+from raybeam.installation import install_command
+
 from ..base.arrays import Floats, Ints
 from ..base.declared import MinMax, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
@@ -239,8 +241,8 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
     gnss = navigation.gnss
     if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
         raise LidarError(
-            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: pip install "
-            '"lidarpool[geo]", or give navigation.gnss.origin.'
+            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: "
+            f"{install_command('lidarpool[geo]')}, or give navigation.gnss.origin."
         )
 
 

@@ -19,6 +19,7 @@ from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFORMATION
+from raybeam.installation import install_command
 
 from ..pipeline.names import GPU, LIDAR, OTHER
 
@@ -166,8 +167,9 @@ class ClusterFile(BaseModel):
                 factory = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
             raise LidarError(
-                f"{self._source}: {self.cluster} is not installed ({error}): pip install "
-                "'lidarpool[clusters]' has dask-jobqueue and what SSHCluster needs."
+                f"{self._source}: {self.cluster} is not installed ({error}): "
+                f"{install_command('lidarpool[clusters]')} has dask-jobqueue and what SSHCluster "
+                "needs."
             ) from error
         except ValueError:  # no dot
             factory = None

@@ -11,6 +11,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from raybeam.installation import install_command
+
 from ...base.allowance import Allowance
 from ...base.errors import LidarError
 from ...base.input_files import open_input
@@ -45,7 +47,7 @@ def open_las(path: Path) -> Iterator[Any]:
         If the file cannot be read.
     """
     if find_spec("laspy") is None:
-        raise LidarError('it is read by laspy: pip install "lidarpool[las]"')
+        raise LidarError(f"it is read by laspy: {install_command('lidarpool[las]')}")
     laspy: Any = import_module("laspy")  # an extra
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import NamedTuple
 
+from raybeam.installation import install_command
+
 from ...base.errors import LidarError
 
 # Records of LASF_Projection, by ASPRS LAS 1.4.
@@ -322,7 +324,7 @@ def _wkt_of_epsg(code: int) -> str:
     if find_spec("rasterio") is None:
         raise LidarError(
             f"its coordinate system EPSG:{code} may be in any unit: {_OVERRIDE}, or install what "
-            'knows it, pip install "lidarpool[geo]".'
+            f"knows it, {install_command('lidarpool[geo]')}."
         )
     from rasterio.crs import CRS
     from rasterio.errors import CRSError

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from raybeam.installation import install_command
+
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
 from ...base.errors import LidarError, prefixed
@@ -395,7 +397,7 @@ def _format_to_read(path: Path) -> MeshFormat:
     if row is not None:
         raise LidarError(f"{path} is not read: {row.advice}.")
     further = "".join(
-        f"; {package} reads more: pip install lidarpool" for package in missing_packages()
+        f"; {package} reads more: {install_command('lidarpool')}" for package in missing_packages()
     )
     raise LidarError(
         f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that can be "

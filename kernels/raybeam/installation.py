@@ -1,0 +1,33 @@
+"""How packages are installed in the environment of this process, for messages."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def install_command(*requirements: str) -> str:
+    """Return the command that installs requirements, such as ``lidarpool[las]``, here.
+
+    Environments of uv have no pip, and those of conda may lack it.
+    """
+    words = [f'"{word}"' if {*word} & {*"[]<>="} else word for word in requirements]
+    pip_install = " ".join(["pip install", *words])
+    if find_spec("pip") is not None:
+        return pip_install
+    prefix = Path(sys.prefix)
+    if (prefix / "conda-meta").is_dir():
+        return f"conda install pip && {pip_install}"
+    if _is_of_uv(prefix):
+        return f"uv {pip_install}"
+    return f"python -m ensurepip && python -m {pip_install}"
+
+
+def _is_of_uv(prefix: Path) -> bool:
+    """Return whether uv has made a virtual environment."""
+    try:
+        settings = (prefix / "pyvenv.cfg").read_text("utf-8")
+    except OSError:
+        return False
+    return any(line.partition("=")[0].strip() == "uv" for line in settings.splitlines())
