@@ -37,7 +37,7 @@ def _has_cache() -> bool:
     return True
 
 
-_HAS_CACHE = _has_cache()
+HAS_CACHE = _has_cache()  # whether compiled loops are kept for later processes
 
 
 _IMPORTS = re.compile(r"^\s*from (\.+)([\w.]*) import (?:\(([^)]*)\)|(.*))$", re.MULTILINE)
@@ -119,7 +119,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
 
 def _cached(dispatcher: Any, function: Any) -> Any:
     """Cache compiled code on disk, for processes with the same sources of the package."""
-    if not _HAS_CACHE:
+    if not HAS_CACHE:
         return dispatcher
     dispatcher.enable_caching()
     cache = dispatcher._cache

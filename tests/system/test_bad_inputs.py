@@ -63,8 +63,8 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is no place: give x,y,z"),
     "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a time"),
     "both": (["run", "good.yaml", "--resume", "--fresh"], "give one of them"),
-    "certificates alone": (["info", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
-    "certificate that is not there": (["info", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
+    "certificates alone": (["doctor", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
+    "certificate that is not there": (["doctor", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
     "two clusters": (
         ["run", "good.yaml", "--cluster", "c.yaml", "--scheduler", "tcp://127.0.0.1:1"],
         "--cluster starts a cluster, --scheduler is for one that runs",
@@ -85,7 +85,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "unknown scheme": (["run", "good.yaml", "--scheduler", "foo://127.0.0.1:1"], "scheme 'foo'"),
     "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "has no host"),
-    "no port": (["info", "--scheduler", "localhost"], "no port of 1 to 65535"),
+    "no port": (["doctor", "--scheduler", "localhost"], "no port of 1 to 65535"),
     "scene that is there": (["scene", "city", "good.ply"], "exists: give another"),
     "no scheduler": (  # nor is a folder left behind
         [

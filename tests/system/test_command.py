@@ -216,14 +216,16 @@ def test_verbose_shows_what_driver_and_workers_log(tmp_path):
     assert {"scheduler", "worker"} <= set(re.findall(r"distributed\.(\w+) - INFO", ended.stderr))
 
 
-def test_info_tells_versions_backends_and_gpus(lidarpool):
-    outcome = lidarpool("info")
+def test_doctor_tells_what_is_here(lidarpool):
+    outcome = lidarpool("doctor")
     assert (outcome.code, outcome.err) == (0, "")
     first_words = [line.split()[0] for line in outcome.out.splitlines()]
     assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "embree"} <= {*first_words}
+    assert {"cores", "memory", "disk", "extras", "las", "ports", "8786"} <= {*first_words}
     assert re.search(r"^  numpy +ready$", outcome.out, re.MULTILINE)
-    told = json.loads(lidarpool("info", "--json").out)
+    told = json.loads(lidarpool("doctor", "--json").out)
     assert told["backends"]["numpy"] == "ready" and told["workers"] == []
+    assert told["machine"]["cores"] >= 1 and told["ports"].keys() >= {"80", "8786"}
     assert lidarpool("-h").out == lidarpool().out == lidarpool("--help").out
     assert lidarpool("--version").out.startswith("lidarpool, version ")
 

@@ -37,9 +37,10 @@ def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, a
     lidar = {worker for stage in stages for worker in report["stages"][stage]["workers"]}
     assert len(lidar) == 4  # a long task each, since each has one slot
 
-    workers = json.loads(lidarpool("info", "--scheduler", cluster.address, "--json").out)["workers"]
+    figures = lidarpool("doctor", "--scheduler", cluster.address, "--json").out
+    workers = json.loads(figures)["workers"]
     assert [worker["resources"] for worker in workers].count({"LIDAR": 1}) == 4
-    told = lidarpool("info", "--scheduler", cluster.address)
+    told = lidarpool("doctor", "--scheduler", cluster.address)
     assert told.code == 0
     counts = [told.out.count(f"{name}=1") for name in ("GPU", "LIDAR", "OTHER")]
     assert counts == [1, 4, 1]

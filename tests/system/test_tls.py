@@ -91,6 +91,6 @@ def test_a_survey_on_an_encrypted_cluster(lidarpool, encrypted, tmp_path):
     outcome = lidarpool("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "-q", *given)
     assert (outcome.code, outcome.err) == (0, "")
     assert json.loads((tmp_path / "out" / "report.json").read_text())["placement_violations"] == 0
-    outcome = lidarpool("info", *given)
+    outcome = lidarpool("doctor", *given)
     assert outcome.code == 0
     assert "3 workers" in outcome.out

@@ -361,19 +361,17 @@ def merge(
 @cli.command()
 @shared.scheduler
 @shared.as_json
-def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
-    """Show versions, backends, GPUs and workers.
+def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
+    """Show what is here, workers of a cluster, and what to fix first.
 
     \b
     Examples:
-      lidarpool info
-      lidarpool info --scheduler tcp://127.0.0.1:8786
+      lidarpool doctor
+      lidarpool doctor --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     from poolpart import Pool
-    from poolpart.probe import visible_gpus
-    from raybeam import available_backends
 
-    from ..report.report import versions
+    from ..report.doctor import advice_in_words, examine, in_words
     from ..run.cluster.connection import connected
 
     pool = None
@@ -381,15 +379,9 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
     workers = sorted(pool or (), key=lambda worker: (sorted(worker.resources), worker.name))
-    figures: dict[str, Any] = {
-        "versions": versions(),
-        "gpus": list(visible_gpus()),
-        "backends": {name: reason or "ready" for name, reason in available_backends().items()},
-        "workers": [asdict(worker) for worker in workers],
-    }
-    lines = [f"{name:<14} {number}" for name, number in figures["versions"].items()]
-    lines += [f"{'GPUs here':<14} {', '.join(figures['gpus']) or 'none'}", "backends"]
-    lines += [f"  {name:<12} {state}" for name, state in figures["backends"].items()]
+    figures = examine()
+    figures["workers"] = [asdict(worker) for worker in workers]
+    lines = in_words(figures)
     if pool is not None:
         hosts = plural(len({worker.host for worker in workers}), "host")
         lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
@@ -403,6 +395,7 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{plural(len(worker.gpus), 'GPU')}"
         )
+    lines.append(advice_in_words(figures))
     shared.show(figures, lines, as_json)
 
 

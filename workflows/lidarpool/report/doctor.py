@@ -1,0 +1,174 @@
+"""What an environment offers to lidarpool, and the one thing to fix first."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from pathlib import Path
+from typing import Any
+
+import psutil
+from dask.system import CPU_COUNT
+from distributed.system import MEMORY_LIMIT
+from packaging.requirements import Requirement
+
+from lidarsim.base.errors import LidarError
+from poolpart.probe import visible_gpus
+from raybeam import available_backends
+from raybeam.compiled import HAS_CACHE
+from raybeam.installation import install_command
+
+from ..base.open3d_module import load_open3d
+from .report import versions
+
+READY = "ready"
+FREE = "free"
+# {port of this machine: what listens there}
+PORTS = {
+    80: "the interface of a sensor that is played",
+    8765: "Foxglove",
+    8786: "a scheduler of Dask",
+    8787: "the dashboard of a scheduler",
+    9876: "Rerun",
+}
+_FOR_DEVELOPERS = ("bench", "dev", "docs", "lint")
+_GIB = 2**30
+_MIN_MEMORY_GIB = 2.0  # of a small run with its three processes
+_MIN_DISK_GIB = 1.0
+
+
+def examine() -> dict[str, Any]:
+    """Return what is here, as plain data for JSON; `fix_first` is "" if nothing is wrong."""
+    figures: dict[str, Any] = {
+        "versions": versions(),
+        "machine": {
+            "cores": CPU_COUNT,
+            "memory_gib": MEMORY_LIMIT / _GIB,
+            "available_memory_gib": min(psutil.virtual_memory().available, MEMORY_LIMIT) / _GIB,
+            "disk_gib": {
+                str(folder): shutil.disk_usage(folder).free / _GIB
+                for folder in dict.fromkeys((Path.cwd(), Path(tempfile.gettempdir())))
+            },
+        },
+        "gpus": list(visible_gpus()),
+        "backends": {name: reason or READY for name, reason in available_backends().items()},
+        "open3d": _open3d_state(),
+        "extras": _extras(),
+        "ports": {str(port): _port_state(port) for port in PORTS},
+    }
+    return {**figures, "fix_first": _fix_first(figures)}
+
+
+def _open3d_state() -> str:
+    """Return `READY`, or why Open3D does not load."""
+    try:
+        load_open3d()
+    except LidarError as error:
+        return str(error).rstrip(".")
+    return READY
+
+
+def _extras() -> dict[str, str]:
+    """Return `READY`, or the command that installs what is missing, of each extra by its name."""
+    try:
+        names = metadata("lidarpool").get_all("Provides-Extra") or []
+    except PackageNotFoundError:  # a checkout that is not installed
+        return {}
+    requirements = [Requirement(text) for text in requires("lidarpool") or ()]
+    states = {}
+    for name in sorted({*names} - {*_FOR_DEVELOPERS}):
+        needed = [
+            requirement
+            for requirement in requirements
+            if requirement.marker is not None
+            and requirement.marker.evaluate({"extra": name})
+            and not requirement.marker.evaluate({"extra": ""})
+        ]
+        is_ready = all(map(_is_installed, needed))
+        states[name] = READY if is_ready else install_command(f"lidarpool[{name}]")
+    return states
+
+
+def _is_installed(requirement: Requirement) -> bool:
+    """Return whether a version of a distribution is installed that a requirement allows."""
+    try:
+        return requirement.specifier.contains(version(requirement.name), prereleases=True)
+    except PackageNotFoundError:
+        return False
+
+
+def _port_state(port: int) -> str:
+    """Return whether this process may listen at a port of the loopback interface."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            return "needs rights" if error.errno == errno.EACCES else "in use"
+    return FREE
+
+
+def _fix_first(figures: dict[str, Any]) -> str:
+    """Return the most urgent advice; "" if nothing is wrong."""
+    return next(_advice(figures), "")
+
+
+def _advice(figures: dict[str, Any]) -> Iterator[str]:
+    """Yield advice, the most urgent first."""
+    machine = figures["machine"]
+    backends = figures["backends"]
+    if figures["open3d"] != READY:
+        yield figures["open3d"]
+    if machine["available_memory_gib"] < _MIN_MEMORY_GIB:
+        yield (
+            f"{machine['available_memory_gib']:.1f} GiB of memory are free, and a small run takes "
+            f"{_MIN_MEMORY_GIB:g}: end other programs"
+        )
+    for folder, free_gib in machine["disk_gib"].items():
+        if free_gib < _MIN_DISK_GIB:
+            yield f"{folder} has {free_gib:.1f} GiB left: make room there"
+    if figures["gpus"] and backends["cuda"] != READY:
+        yield f"There is a GPU that is not used: {backends['cuda']}"
+    if backends["embree"] != READY:
+        yield f"Rays are cast a hundred times slower than by Embree: {backends['embree']}"
+    elif not HAS_CACHE:
+        yield (
+            "Each process compiles its loops for 20 s, as there is no folder to keep them: set "
+            "NUMBA_CACHE_DIR to a folder that can be written"
+        )
+
+
+def in_words(figures: dict[str, Any]) -> list[str]:
+    """Return the lines of a report for a terminal."""
+    machine = figures["machine"]
+    disks = ", ".join(f"{free:.1f} GiB in {name}" for name, free in machine["disk_gib"].items())
+    memory = (
+        f"{machine['memory_gib']:.1f} GiB, of which {machine['available_memory_gib']:.1f} are free"
+    )
+    rows: dict[str, str] = {
+        **figures["versions"],
+        "cores": str(machine["cores"]),
+        "memory": memory,
+        "disk": disks,
+        "GPUs here": ", ".join(figures["gpus"]) or "none",
+        "open3d": figures["open3d"],
+    }
+    lines = [f"{name:<14} {value}" for name, value in rows.items()]
+    for title, states in (("backends", figures["backends"]), ("extras", figures["extras"])):
+        lines.append(title)
+        lines += [f"  {name:<12} {state}" for name, state in states.items()]
+    lines.append("ports of 127.0.0.1")
+    lines += [
+        f"  {port:<12} {state}, for {PORTS[int(port)]}" for port, state in figures["ports"].items()
+    ]
+    return lines
+
+
+def advice_in_words(figures: dict[str, Any]) -> str:
+    """Return the last line of the report: what to fix first."""
+    advice = figures["fix_first"]
+    return f"fix first: {advice}." if advice else "nothing needs to be fixed."
