@@ -6,7 +6,7 @@ from contextlib import closing
 
 import pytest
 
-from lidarpool.report import doctor
+from lidarpool.cli import doctor
 
 SOUND = {
     "machine": {"available_memory_gib": 8.0, "disk_gib": {"/tmp": 9.0}},

@@ -371,8 +371,8 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     """  # noqa: D301 - click wants the character, not its name
     from poolpart import Pool
 
-    from ..report.doctor import advice_in_words, examine, in_words
     from ..run.cluster.connection import connected
+    from .doctor import advice_in_words, examine, in_words
 
     pool = None
     if scheduler is not None:

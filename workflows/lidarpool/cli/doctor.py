@@ -23,7 +23,7 @@ from raybeam.compiled import HAS_CACHE
 from raybeam.installation import install_command
 
 from ..base.open3d_module import load_open3d
-from .report import versions
+from ..report.report import versions
 
 READY = "ready"
 FREE = "free"
