@@ -183,6 +183,7 @@ HOST = Module(
         Stream=Stream,
         get_current_stream=Stream,
         alloc_pinned_memory=bytearray,
+        set_allocator=lambda allocate: None,
         Event=Event,
         get_elapsed_time=lambda one, other: max(1e3 * (other.time - one.time), 1e-3),
         runtime=SimpleNamespace(
