@@ -21,7 +21,7 @@ from unittest.mock import patch
 import numpy as np
 
 import lidarsim.simulator.device
-from lidarpool import Pose, Scanner, Scene, Survey, Track, load_sensor
+from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
 from lidarsim.base.storage import Storage
@@ -42,7 +42,7 @@ _ROOM = 4e9  # bytes
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
     """Return a drive of an OS1-128 at 10 m/s along the street."""
     positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
-    sensor = load_sensor("ouster/os1-128", step_deg=sizes.step_deg)
+    sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     drive = Track([0, seconds], positions)
     return Survey(sensor, trajectory=drive, keep_every=1, columns=["time", "range"])
 
@@ -149,7 +149,7 @@ def columns(session: Session) -> Rows:
 def scanner(session: Session) -> Rows:
     """Yield rates of sweeps and of images of ranges by a scanner in a loop, to the host."""
     sizes = session.sizes
-    sensor = load_sensor("ouster/os1-128", step_deg=sizes.step_deg)
+    sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     device_scanner = Scanner(city(sizes.cities[-1]), sensor, columns=["range"], backend="cuda")
     poses = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]])
     image = device_scanner.ranges(poses[:1])
@@ -286,9 +286,8 @@ def run(session: Session) -> Rows:
     """Run surveys on a local cluster, from rays to parts on the disk; yield their rates."""
     from lidarpool import simulate
 
-    drive = survey(
-        session.sizes, session.sizes.survey / (10 * 1024 * 128)
-    )  # it turns ten times a second
+    # It turns ten times a second, once at least.
+    drive = survey(session.sizes, max(0.1, session.sizes.survey / (10 * 1024 * 128)))
     for name, every in {"all points": 1, "every fifth point": 5}.items():
         kept_survey = replace(drive, keep_every=every)
         with tempfile.TemporaryDirectory(dir=session.folder) as folder:
