@@ -63,18 +63,23 @@ MEASURED = [name for name in SECTIONS if name not in _FIRST_ONLY]  # 400 s
 FIRST_S = 540
 MEASURED_S = 400
 
-# Rows of the table: what it is, its unit and digits, and where in the results the figures are.
 _CITIES = ("city 1e4", "city 1e5", "city 1e6")
-_KERNEL = [f"kernels/{city}, {{}}/grays_s/cast" for city in _CITIES]
 _MOVING = ("still", "a pose for each firing", "with motion")
+
+
+def _casts(kind: str) -> list[str]:
+    """Return the paths of the rates of casts, by city, of a kind of rays."""
+    paths = [f"kernels/{city}, {kind}/grays_s/cast" for city in _CITIES]
+    return [*paths, f"large/city 1e7, {kind}/grays_s/cast"]
+
+
+# Rows of the table: what it is, its unit and digits, and where in the results the figures are.
 ROWS = (
     ("rays in order, 16 revolutions of 128 × 2,048, city of 10⁴, 10⁵, 10⁶, 10⁷, Gray/s", 2,
-     (*(path.format("coherent") for path in _KERNEL), "large/city 1e7, coherent/grays_s/cast")),
-    ("the same, one revolution, city of 10⁴, 10⁵, 10⁶", 2,
-     [path.format("one revolution") for path in _KERNEL]),
-    ("the same, shuffled", 2, [path.format("shuffled") for path in _KERNEL]),
-    ("the same, random directions from random origins", 2,
-     [path.format("scattered") for path in _KERNEL]),
+     _casts("coherent")),
+    ("the same, one revolution", 2, _casts("one revolution")),
+    ("the same, shuffled", 2, _casts("shuffled")),
+    ("the same, random directions from random origins", 2, _casts("scattered")),
     ("brute force, Mray/s", 2, [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
     ("hits to the host, 20 bytes each, Gray/s", 2,
      [f"kernels/{city}, coherent/grays_s/to_host" for city in _CITIES]),

@@ -33,6 +33,8 @@ _WITHOUT_POOL = (
     "import sys, cupy; cupy.cuda.set_allocator(None); "
     "from benchmarks.gpu import main; sys.exit(main(sys.argv[1:]))"
 )
+# Errors of kernels alone: calls of CUDA that CuPy tries are no faults, nor are other programs.
+_SANITIZER = ("--target-processes", "application-only", "--report-api-errors", "no")
 # Of ncu: names of groups of figures, and of the figures to report.
 _NCU_SECTIONS = ("SpeedOfLight", "LaunchStats", "Occupancy", "WarpStateStats", "InstructionStats")
 _FIGURES = (
@@ -139,7 +141,8 @@ def sanitizer(_session: Session) -> Rows:
     program = _program("compute-sanitizer")
     cast = ("-c", _WITHOUT_POOL, "--quick", "--in-process", "--only", "bits")
     for tool in ("memcheck", "racecheck"):
-        text, code = _output_of([program, "--tool", tool, sys.executable, *cast], _TOOL_S)
+        command = [program, "--tool", tool, *_SANITIZER, sys.executable, *cast]
+        text, code = _output_of(command, _TOOL_S)
         # memcheck: ERROR SUMMARY: 0 errors; racecheck: RACECHECK SUMMARY: 0 hazards displayed (…)
         summary = re.search(r"SUMMARY: (\d+) (?:error|hazard)", text)
         scenes = len(re.findall(r"^bits: ", text, re.M))

@@ -125,23 +125,28 @@ def scattered(session: Session, rays: int) -> Scan:
     return check_scan(Pattern(directions, origins), poses, window=window, rays_per_pose=rays)
 
 
-def kernels(session: Session) -> Rows:
-    """Yield rates of rays in cities, in order, shuffled and scattered, and of brute force."""
-    directions = revolution(session.sizes.rays)
+def other_scans(session: Session, directions: Float) -> dict[str, Scan]:
+    """Return scans by the kind of their rays, for which the cast alone is timed."""
     shuffled = np.random.default_rng(0).permutation(directions)
-    other_scans = {
+    return {
         "shuffled": revolutions(session, shuffled),
         "scattered": scattered(session, len(directions)),
         "one revolution": check_scan(Pattern(directions), MIDDLE),
     }
+
+
+def kernels(session: Session) -> Rows:
+    """Yield rates of rays in cities, in order, shuffled and scattered, and of brute force."""
+    directions = revolution(session.sizes.rays)
+    scans = other_scans(session, directions)
     for count in (session.sizes.smallest, *session.sizes.cities):
         name = name_of(count)
         caster, row = build_caster(city(count))
         yield f"{name}, build", row
         yield f"{name}, coherent", rates(session, caster, revolutions(session, directions))
-        for kind, scan in other_scans.items():
+        for kind, scan in scans.items():
             yield f"{name}, {kind}", rates(session, caster, scan, ["cast"])
-        yield f"{name}, brute force", brute_force(session, caster, shuffled)
+        yield f"{name}, brute force", brute_force(session, caster, directions)
 
 
 def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[str, float]:
@@ -258,3 +263,5 @@ def large(session: Session) -> Rows:
     caster, row = build_caster(city(session.sizes.large))
     yield f"{name}, build", row
     yield f"{name}, coherent", rates(session, caster, revolutions(session, directions))
+    for kind, scan in other_scans(session, directions).items():
+        yield f"{name}, {kind}", rates(session, caster, scan, ["cast"])
