@@ -8,6 +8,9 @@ Points need lidarpool's dependencies besides, but not Open3D, trimesh or Matplot
 warp-lang and mujoco-lidar. What cannot be imported is left out and named. Each section is a process
 of its own, with a limit of time: one that fails, even by ending the process, leaves the others. The
 file is written after each. At the end comes the table of docs/performance.md. Times are medians.
+
+`--first-device` is for a device on which nothing has run yet: it runs the tests and NVIDIA's tools
+besides, in an order of rising risk, and writes a page of Markdown beside the file.
 """
 
 from __future__ import annotations
@@ -32,38 +35,55 @@ from raybeam.registry import choose
 
 from .gpu_clock import QUICK, Session, Sizes, clocks
 
-# {section: (its module, seconds at most)}, the most important first; its function is of that name.
-# A section has that long on a device with nothing compiled yet: 400 s for all of them.
+# {section: (its module, seconds at most)}, in an order of rising risk; its function has its name.
+# A section has that long on a device with nothing compiled yet.
 SECTIONS = {
-    "device": ("gpu_clock", 20),
+    "device": ("gpu_clock", 15),
+    "compiling": ("gpu_first", 20),
+    "tests": ("gpu_first", 100),
+    "bits": ("gpu_bits", 40),
+    "leaks": ("gpu_bits", 15),
+    "sanitizer": ("gpu_first", 80),
     "kernels": ("gpu_rays", 60),
-    "bits": ("gpu_rays", 30),
-    "leaks": ("gpu_rays", 15),
-    "moving": ("gpu_rays", 25),
-    "columns": ("gpu_points", 40),
-    "instances": ("gpu_rays", 30),
-    "durable": ("gpu_points", 35),
-    "sharing": ("gpu_points", 25),
-    "run": ("gpu_points", 40),
+    "scanner": ("gpu_points", 30),
+    "columns": ("gpu_points", 35),
+    "run": ("gpu_points", 35),
     "peers": ("gpu_warp", 20),
-    "mujoco": ("gpu_warp", 20),
     "large": ("gpu_rays", 40),
+    "counters": ("gpu_first", 40),
+    "moving": ("gpu_rays", 25),
+    "instances": ("gpu_rays", 30),
+    "durable": ("gpu_points", 30),
+    "sharing": ("gpu_points", 20),
+    "mujoco": ("gpu_warp", 15),
 }
+_FIRST_ONLY = ("tests", "sanitizer", "scanner", "counters")
+MEASURED = [name for name in SECTIONS if name not in _FIRST_ONLY]  # 400 s
+# Seconds for all sections: of a device on which nothing has run yet, and of other devices.
+FIRST_S = 540
+MEASURED_S = 400
+
+_CITIES = ("city 1e4", "city 1e5", "city 1e6")
+_MOVING = ("still", "a pose for each firing", "with motion")
+
+
+def _casts(kind: str) -> list[str]:
+    """Return the paths of the rates of casts, by city, of a kind of rays."""
+    paths = [f"kernels/{city}, {kind}/grays_s/cast" for city in _CITIES]
+    return [*paths, f"large/city 1e7, {kind}/grays_s/cast"]
+
 
 # Rows of the table: what it is, its unit and digits, and where in the results the figures are.
-_CITIES = ("city 1e5", "city 1e6")
-_KERNEL = [f"kernels/{city}, {{}}/grays_s/cast" for city in _CITIES]
-_MOVING = ("still", "a pose for each firing", "with motion")
 ROWS = (
-    ("rays in order, 16 revolutions of 128 × 2,048, city of 10⁵, 10⁶, 10⁷ triangles, Gray/s", 2,
-     (*(path.format("coherent") for path in _KERNEL), "large/city 1e7, coherent/grays_s/cast")),
-    ("the same, one revolution, city of 10⁵, 10⁶", 2,
-     [path.format("one revolution") for path in _KERNEL]),
-    ("the same, shuffled", 2, [path.format("shuffled") for path in _KERNEL]),
+    ("rays in order, 16 revolutions of 128 × 2,048, city of 10⁴, 10⁵, 10⁶, 10⁷, Gray/s", 2,
+     _casts("coherent")),
+    ("the same, one revolution", 2, _casts("one revolution")),
+    ("the same, shuffled", 2, _casts("shuffled")),
+    ("the same, random directions from random origins", 2, _casts("scattered")),
     ("brute force, Mray/s", 2, [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
     ("hits to the host, 20 bytes each, Gray/s", 2,
      [f"kernels/{city}, coherent/grays_s/to_host" for city in _CITIES]),
-    ("caster of 10⁵, 10⁶, 10⁷ triangles, s", 1,
+    ("build of a caster of 10⁴, 10⁵, 10⁶, 10⁷ triangles, s", 1,
      (*(f"kernels/{city}, build/seconds" for city in _CITIES), "large/city 1e7, build/seconds")),
     ("a still sensor; a pose for each firing; with motion, city of 10⁶, Gray/s", 2,
      [f"moving/{name}/grays_s/cast" for name in _MOVING]),
@@ -72,7 +92,9 @@ ROWS = (
     ("values that differ from NumPy's in samples; rays that escape", 0,
      ("different", "leaks/edges and corners/escaped")),
     ("NVIDIA Warp's mesh query at best, city of 10⁵, 10⁶, in order, Gray/s", 2,
-     [f"peers/{city}/coherent" for city in _CITIES]),
+     [f"peers/{city}/coherent" for city in _CITIES[1:]]),
+    ("raybeam's rate ÷ Warp's at best, in order, shuffled, city of 10⁵; 10⁶", 2,
+     [f"to Warp/{city}/{order}" for city in _CITIES[1:] for order in ("coherent", "shuffled")]),
     ("MuJoCo-LiDAR's Warp backend; raybeam, poses to distances on the host, city of 10⁵, Gray/s", 2,
      ("mujoco/MuJoCo-LiDAR/grays_s", "mujoco/raybeam/grays_s")),
     ("points with columns in host memory: plain survey, every fifth, ten actors, million/s", 0,
@@ -85,6 +107,15 @@ ROWS = (
      [f"run/{name}/mpoints_s" for name in ("all points", "every fifth point")]),
     ("two processes on a device, compared with one", 2, ("sharing/two to one/ratio",)),
     ("2³¹ rays, Gray/s", 2, ("large/many rays/grays_s",)),
+    ("a scanner in a loop, to the host: images of ranges, sweeps, Gray/s", 2,
+     ("scanner/ranges of 16 poses/grays_s", "scanner/sweeps/grays_s")),
+    ("tests that need a device: passed, failed", 0, ("tests/passed", "tests/failed")),
+    ("compute-sanitizer on small scenes: errors of memory, hazards", 0,
+     ("sanitizer/memcheck/errors", "sanitizer/racecheck/errors")),
+    ("the cast by ncu: registers, occupancy %, threads at work in a warp", 0,
+     [f"counters/cast_table/{figure}" for figure in (
+         "Registers Per Thread, register per thread", "Achieved Occupancy, %",
+         "Avg. Active Threads Per Warp")]),
 )  # fmt: skip
 
 
@@ -95,10 +126,19 @@ def figure_at(results: dict[str, Any], path: str) -> float | None:
         rows = [row for section in checked for row in section.values() if isinstance(row, dict)]
         wrong = [n for row in rows for name, n in row.items() if name.startswith("different")]
         return sum(wrong) if wrong else None
-    if path.startswith("peers/"):
-        _, scene, order = path.split("/")
+    first, _, rest = path.partition("/")
+    if first == "tests":
+        rows = [row for row in results.get("tests", {}).values() if isinstance(row, dict)]
+        return sum(row.get(rest, 0) for row in rows) if rows else None
+    if first == "peers":
+        scene, order = rest.split("/")
         rows = [row for name, row in results.get("peers", {}).items() if name.startswith(scene)]
         return max((row[order]["grays_s"] for row in rows), default=None)
+    if first == "to Warp":
+        peer = figure_at(results, f"peers/{rest}")
+        scene, order = rest.split("/")
+        rate = figure_at(results, f"kernels/{scene}, {order}/grays_s/cast")
+        return rate / peer if rate and peer else None
     value: Any = results
     for key in path.split("/"):
         value = value.get(key) if isinstance(value, dict) else None
@@ -128,13 +168,45 @@ def headline(results: dict[str, Any]) -> str:
 def problems(results: dict[str, Any]) -> list[str]:
     """List failed sections and wrong results of the device."""
     failures = [f"{name}: {row['error']}" for name, row in results.items() if "error" in row]
+    failures += [
+        f"{name}: {title} failed"
+        for name, rows in results.items()
+        for title, row in rows.items()
+        if isinstance(row, dict) and row.get("failed")
+    ]
     if figure_at(results, "different"):
-        failures.append("values differ from NumPy's")
+        failures.append("values differ from NumPy's or Embree's")
     if figure_at(results, "leaks/edges and corners/escaped"):
         failures.append("rays escape")
     if figure_at(results, "large/many rays/wrong hits"):
         failures.append("hits of many rays are wrong")
     return failures
+
+
+def left_out(results: dict[str, Any]) -> list[str]:
+    """List sections and rows that were not measured, with their reasons."""
+    notes = []
+    for name, rows in results.items():
+        if "left out" in rows:
+            notes.append(f"left out: {name}, because {rows['left out']}")
+        notes += [
+            f"left out: {name}, {title}, because {row['left out']}"
+            for title, row in rows.items()
+            if isinstance(row, dict) and "left out" in row
+        ]
+    return notes
+
+
+def page(results: dict[str, Any]) -> str:
+    """Return the results as Markdown for docs/performance.md."""
+    lines = [headline(results), "", *table(results), "", "| section | seconds | rows | |"]
+    lines.append("|---|--:|--:|---|")
+    for name, rows in results.items():
+        count = sum(isinstance(row, dict) for title, row in rows.items() if title != "clocks")
+        words = rows.get("error") or rows.get("left out") or ""
+        lines.append(f"| {name} | {rows.get('seconds', 0):.1f} | {count} | {words} |")
+    notes = [*left_out(results), *(f"wrong: {problem}" for problem in problems(results))]
+    return "\n".join([*lines, "", *(f"- {note}" for note in notes), ""])
 
 
 def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
@@ -151,7 +223,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
             print(f"{name}: {title}: {shown(row)}", flush=True)
             yield rows
             if time.monotonic() > end:
-                rows["left out"] = "the rest, for want of time"
+                rows["left out"] = "its time was over: there may be more rows"
                 break
     except ModuleNotFoundError as error:
         rows["left out"] = f"{error.name} is not installed"
@@ -176,6 +248,7 @@ def shown(row: Any) -> str:
 
 def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
     """Measure a section in a new process, which is killed after `seconds`; return its rows."""
+    start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rows.json")
         arguments = ["--in-process", "--only", name, "--json", str(path), *options]
@@ -193,6 +266,7 @@ def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         rows = json.loads(path.read_text())["sections"].get(name, {}) if path.exists() else {}
+        rows["seconds"] = round(time.monotonic() - start, 1)
         return {**rows, "error": error} if error else rows
 
 
@@ -200,28 +274,47 @@ def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 for failures or wrong results, 2 without a device."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy sizes: whether it works")
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS))
-    parser.add_argument("--seconds", type=float, default=400, help="for all sections")
+    parser.add_argument(
+        "--first-device",
+        action="store_true",
+        help="tests and NVIDIA's tools as well, on a device on which nothing has run yet",
+    )
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="these sections")
+    parser.add_argument("--seconds", type=float, help="for all sections")
     parser.add_argument("--folder", default=".", help="on the disk for parts")
     parser.add_argument("--json", type=Path, help="write the results here")
     parser.add_argument("--in-process", action="store_true", help="all sections in this process")
     chosen = parser.parse_args(arguments)
+    if chosen.first_device and chosen.json is None:
+        chosen.json = Path("first-device.json")
     if reason := available_backends()["cuda"]:
         print(f"Nothing was measured: {reason}.", file=sys.stderr)
         return 2
+    names = chosen.only or (list(SECTIONS) if chosen.first_device else MEASURED)
+    results = run_sections(names, chosen)
+    wrong = problems(results)
+    if len(names) > 1:
+        print("", headline(results), "", *table(results), "", sep="\n")
+        print(*left_out(results), *(f"wrong: {problem}" for problem in wrong), sep="\n")
+    return int(bool(wrong))
+
+
+def run_sections(names: list[str], chosen: argparse.Namespace) -> dict[str, Any]:
+    """Run sections one after another; write the results after each, and return them."""
     options = ["--folder", chosen.folder, *(["--quick"] if chosen.quick else [])]
-    end = time.monotonic() + chosen.seconds
-    results = {}
+    seconds = chosen.seconds or (FIRST_S if chosen.first_device else MEASURED_S)
+    end = time.monotonic() + seconds
+    results: dict[str, Any] = {}
 
     def store(name: str, rows: dict[str, Any]) -> None:
         results[name] = rows
         if chosen.json:
             report = {"command": sys.argv[1:], "sections": results}
-            unfinished = chosen.json.with_name(f"{chosen.json.name}.new")
-            unfinished.write_text(json.dumps(report, indent=1, default=float) + "\n")
-            unfinished.replace(chosen.json)
+            write(chosen.json, json.dumps(report, indent=1, default=float) + "\n")
+            if chosen.first_device:
+                write(chosen.json.with_suffix(".md"), page(results))
 
-    for name in chosen.only:
+    for name in names:
         remaining_s = end - time.monotonic()
         if remaining_s < 5:
             store(name, {"left out": "no time was left"})
@@ -230,13 +323,14 @@ def main(arguments: list[str] | None = None) -> int:
                 store(name, rows)
         else:
             store(name, apart(name, options, min(SECTIONS[name][1], remaining_s)))
-    wrong = problems(results)
-    if len(chosen.only) > 1:
-        print("", headline(results), "", *table(results), "", sep="\n")
-        left_out = {name: rows["left out"] for name, rows in results.items() if "left out" in rows}
-        notes = [f"left out: {name}, because {reason}" for name, reason in left_out.items()]
-        print(*notes, *(f"wrong: {problem}" for problem in wrong), sep="\n")
-    return int(bool(wrong))
+    return results
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file under another name first, so that it is complete at all times."""
+    unfinished = path.with_name(f"{path.name}.new")
+    unfinished.write_text(text, "utf-8")
+    unfinished.replace(path)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,11 @@ _LEAST = 3
 _MOST = 50
 _BATCH_MS = 50  # of the device: short launches are repeated, until its clock has settled
 _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
+# What sections of the benchmark are left out without.
+_PACKAGES = (
+    "pytest", "embreex", "numba", "pydantic", "trimesh", "distributed", "open3d-cpu", "warp-lang",
+    "cuda-pathfinder", "nvidia-cuda-nvrtc",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,7 @@ class Sizes:
     """Sizes of all sections; the defaults are for a device, `QUICK` is for tests."""
 
     cities: tuple[int, ...] = (100_000, 1_000_000)  # triangles
+    smallest: int = 10_000
     large: int = 10_000_000
     rays: int = 128 * 2048  # of a revolution
     poses: int = 16  # revolutions of one launch
@@ -40,11 +47,14 @@ class Sizes:
     survey: int = 100_000_000  # rays
     seconds: float = 0.7  # for one figure
     copied: int = 1 << 26  # bytes
+    sweeps: int = 100_000_000  # rays of sweeps of a scanner
+    tests: tuple[str, ...] = ("tests/raybeam", "tests/lidarsim/test_device.py")
 
 
 QUICK = Sizes(
-    cities=(1000,), large=2000, rays=128 * 16, poses=2, rays_beyond_int=5000, forest=(20, 100),
-    sample=300, leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
+    cities=(1000,), smallest=500, large=2000, rays=128 * 16, poses=2, rays_beyond_int=5000,
+    forest=(20, 100), sample=300, leaks=5000, batch=14_000, step_deg=18, survey=50_000,
+    seconds=0.05, copied=1 << 16, sweeps=50_000, tests=("tests/raybeam/test_device.py",),
 )  # fmt: skip
 
 
@@ -165,6 +175,7 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
             "date": time.strftime("%Y-%m-%d"),
         },
     )
+    yield "versions", {name: _version(name) for name in _PACKAGES}
     array = cupy.zeros(count, np.uint8)
     plain = np.zeros(count, np.uint8)
     source = pinned(cupy, count)
@@ -188,6 +199,13 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
             "device, read and write": 2 * count / copied / 1e6,
         },
     )
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def clocks() -> dict[str, str]:

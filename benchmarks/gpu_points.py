@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from unittest.mock import patch
 import numpy as np
 
 import lidarsim.simulator.device
-from lidarpool import Scene, Survey, Track, load_sensor
+from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
 from lidarsim.base.storage import Storage
@@ -41,7 +42,7 @@ _ROOM = 4e9  # bytes
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
     """Return a drive of an OS1-128 at 10 m/s along the street."""
     positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
-    sensor = load_sensor("ouster/os1-128", step_deg=sizes.step_deg)
+    sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     drive = Track([0, seconds], positions)
     return Survey(sensor, trajectory=drive, keep_every=1, columns=["time", "range"])
 
@@ -137,9 +138,36 @@ def columns(session: Session) -> Rows:
     yield "a batch, ms", split_batch(session, rig)
     fifth = replace(plain, keep_every=5)
     yield "every fifth point", time_batches(Rig(scene, fifth, "cuda"), sizes.batch, sizes.seconds)
+    yield "bits", compare_columns(city(min(sizes.cities)), plain)
+    if find_spec("numba") is None:  # finds hits on actors
+        yield "ten actors", {"left out": "numba is not installed"}
+        return
     row = time_batches(Rig(traffic(scene), plain, "cuda"), sizes.batch, 3 * sizes.seconds)
     yield "ten actors", row
-    yield "bits", compare_columns(city(min(sizes.cities)), plain)
+
+
+def scanner(session: Session) -> Rows:
+    """Yield rates of sweeps and of images of ranges by a scanner in a loop, to the host."""
+    sizes = session.sizes
+    sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
+    device_scanner = Scanner(city(sizes.cities[-1]), sensor, columns=["range"], backend="cuda")
+    poses = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]])
+    image = device_scanner.ranges(poses[:1])
+    rays = image.size
+    hits = int(np.isfinite(image).sum())
+    calls: dict[str, tuple[int, Callable[[], object]]] = {
+        "ranges of 16 poses": (16, lambda: device_scanner.ranges(np.repeat(poses, 8, axis=0))),
+        "sweeps": (1, lambda: device_scanner.sweep(Pose(tuple(poses[0])))),
+    }
+    for name, (sweeps, call) in calls.items():
+        count = max(3, sizes.sweeps // (2 * rays * sweeps))
+        call()
+        start = time.perf_counter()
+        for _ in range(count):
+            call()
+        took = time.perf_counter() - start
+        cast = count * sweeps * rays
+        yield name, {"rays": cast, "hits": hits / rays, "grays_s": cast / took / 1e9}
 
 
 def split_batch(session: Session, rig: Rig) -> dict[str, float]:
@@ -258,9 +286,8 @@ def run(session: Session) -> Rows:
     """Run surveys on a local cluster, from rays to parts on the disk; yield their rates."""
     from lidarpool import simulate
 
-    drive = survey(
-        session.sizes, session.sizes.survey / (10 * 1024 * 128)
-    )  # it turns ten times a second
+    # It turns ten times a second, once at least.
+    drive = survey(session.sizes, max(0.1, session.sizes.survey / (10 * 1024 * 128)))
     for name, every in {"all points": 1, "every fifth point": 5}.items():
         kept_survey = replace(drive, keep_every=every)
         with tempfile.TemporaryDirectory(dir=session.folder) as folder:

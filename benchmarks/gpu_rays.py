@@ -1,9 +1,9 @@
-"""Sections of the device's benchmark that need raybeam alone: kernels, and what they return."""
+"""Sections of the device's benchmark that need raybeam alone: rates of the kernels."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,18 +17,18 @@ from raybeam import (
     RayCaster,
     Scan,
     check_scan,
-    pattern_rays,
 )
 from raybeam.scan import Groups
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
-from .gpu_scenes import Float, beam_directions, city, revolution, six_objects, track
+from .gpu_scenes import Float, beam_directions, city, revolution, track
 from .gpu_scenes import Mesh as Faces
 from .instances import tree, tree_transforms
 
 Rows = Iterator[tuple[str, dict[str, Any]]]
 MIDDLE = np.array([10.0, 10.0, 2.0])  # a crossing of the city
 _BLOCK = 128
+STAGES = ("rays", "cast", "pack", "to_device", "to_host")
 
 # Moeller and Trumbore in float against all triangles, without a tree: what needs no thought.
 _BRUTE_FORCE = """
@@ -62,7 +62,9 @@ def name_of(triangles: int) -> str:
     return f"city {triangles:.0e}".replace("e+0", "e")
 
 
-def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
+def rates(
+    session: Session, caster: RayCaster, scan: Scan, stages: Sequence[str] = STAGES
+) -> dict[str, Any]:
     """Time a scan: rays, the cast alone, packing of hits, and copies of hits to the host."""
     engine: Any = caster.engine
     parts = list(scan.chunks(engine.chunk))
@@ -84,13 +86,14 @@ def rates(session: Session, caster: RayCaster, scan: Scan) -> dict[str, Any]:
         for (start, _), hit in zip(parts, hit_parts, strict=True):
             engine._pack(hit, start, groups, 1.0, engine._no_counters, engine._no_other_hits)
 
-    times = {
-        "rays": milliseconds(session, rays),
-        "cast": milliseconds(session, cast),
-        "pack": milliseconds(session, pack),
-        "to_device": wall_milliseconds(session, lambda: caster.visit(scan, len)),
-        "to_host": wall_milliseconds(session, lambda: engine.scan(scan)),
+    calls: dict[str, tuple[Any, Callable[[], object]]] = {
+        "rays": (milliseconds, rays),
+        "cast": (milliseconds, cast),
+        "pack": (milliseconds, pack),
+        "to_device": (wall_milliseconds, lambda: caster.visit(scan, len)),
+        "to_host": (wall_milliseconds, lambda: engine.scan(scan)),
     }
+    times = {name: clock(session, call) for name, (clock, call) in calls.items() if name in stages}
     per_ms = {name: len(scan) / took["ms"] / 1e6 for name, took in times.items()}
     return {"rays": len(scan), "hits": hits / len(scan), "grays_s": per_ms, "ms": times}
 
@@ -112,25 +115,38 @@ def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
     return caster, {"triangles": caster.face_count, "seconds": took, "bytes_a_triangle": size}
 
 
-def kernels(session: Session) -> Rows:
-    """Yield rates of rays in cities, coherent and shuffled, and of brute force."""
-    directions = revolution(session.sizes.rays)
+def scattered(session: Session, rays: int) -> Scan:
+    """Make a scan of random directions from random origins in the middle of the city."""
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(rays, 3))
+    origins = rng.uniform([-40, -40, 0], [40, 40, 20], (rays, 3))
+    poses = np.broadcast_to(MIDDLE * [1, 1, 0], (session.sizes.poses, 3))
+    window = (0, rays * len(poses))
+    return check_scan(Pattern(directions, origins), poses, window=window, rays_per_pose=rays)
+
+
+def other_scans(session: Session, directions: Float) -> dict[str, Scan]:
+    """Return scans by the kind of their rays, for which the cast alone is timed."""
     shuffled = np.random.default_rng(0).permutation(directions)
-    for count in session.sizes.cities:
+    return {
+        "shuffled": revolutions(session, shuffled),
+        "scattered": scattered(session, len(directions)),
+        "one revolution": check_scan(Pattern(directions), MIDDLE),
+    }
+
+
+def kernels(session: Session) -> Rows:
+    """Yield rates of rays in cities, in order, shuffled and scattered, and of brute force."""
+    directions = revolution(session.sizes.rays)
+    scans = other_scans(session, directions)
+    for count in (session.sizes.smallest, *session.sizes.cities):
         name = name_of(count)
         caster, row = build_caster(city(count))
         yield f"{name}, build", row
         yield f"{name}, coherent", rates(session, caster, revolutions(session, directions))
-        yield f"{name}, shuffled", rates(session, caster, revolutions(session, shuffled))
-        yield (
-            f"{name}, one revolution",
-            rates(session, caster, check_scan(Pattern(directions), MIDDLE)),
-        )
-        yield f"{name}, brute force", brute_force(session, caster, shuffled)
-    engine: Any = caster.engine
-    for kernel in ("cast_table", "pack", "make_rays"):
-        function = engine._module.get_function(kernel)
-        yield kernel, {"registers": function.num_regs, "local_bytes": function.local_size_bytes}
+        for kind, scan in scans.items():
+            yield f"{name}, {kind}", rates(session, caster, scan, ["cast"])
+        yield f"{name}, brute force", brute_force(session, caster, directions)
 
 
 def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[str, float]:
@@ -214,93 +230,6 @@ def instances(session: Session) -> Rows:
         yield "one tree, masked" if masked else "one tree", rates(session, alone, scan_near_tree)
 
 
-def bits(session: Session) -> Rows:
-    """Count sample rays that differ from NumPy's results in any bit; 0 expected."""
-    crown = np.array([0.3, 0.2, 6.0])  # of a tree
-    step = max(1, session.sizes.rays // session.sizes.sample)
-    sample = revolution(session.sizes.rays)[::step]
-    plain = city(session.sizes.cities[-1])
-    scenes = {
-        "six objects": ([Instance(Mesh(*six_objects()))], np.array([0, 0, 2.0])),
-        name_of(session.sizes.cities[-1]): ([Instance(Mesh(*plain))], MIDDLE),
-        "forest": (forest(25, 2000, False), crown),
-        "forest, masked": (forest(25, 2000, True), crown),
-    }
-    for name, (scene, origin) in scenes.items():
-        casters = [RayCaster.from_instances(scene, backend) for backend in ("cuda", "numpy")]
-        yield name, _count_differences(casters, sample, origin)
-
-
-def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -> dict[str, int]:
-    device_hits, host_hits = (caster.cast(origin, sample) for caster in casters)
-    counts = {"rays": len(sample), "hits": int(host_hits.hit.sum())}
-    for name in ("distance", "triangle", "u", "v", "instance"):
-        differs = getattr(device_hits, name) != getattr(host_hits, name)
-        counts[f"different {name}"] = int(differs.sum())
-    rotation, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-    pattern = Pattern(sample, 0.01 * sample)
-    still = check_scan(pattern, origin, rotation)
-    moving = _moving_scan(pattern, origin, rotation)
-    for name, scan in {"scan": still, "moving scan": moving}.items():
-        device_scan, host_scan = (caster.engine.scan(scan) for caster in casters)
-        counts[f"different {name}"] = _count_different_hits(device_scan, host_scan)
-    counts["different tally"] = int((device_scan.tally != host_scan.tally).sum())  # type: ignore[operator]
-    expected = pattern_rays(pattern, host_scan.ray, moving.poses)
-    counts["different rays"] = _count_different_rays(casters[0], moving, expected)
-    return counts
-
-
-def _moving_scan(pattern: Pattern, origin: Float, rotation: Float) -> Scan:
-    """Make a scan with a pose for each ray, 1 mm apart, and motion within poses."""
-    positions = origin + 1e-3 * np.arange(len(pattern))[:, None]
-    rotations = np.broadcast_to(rotation, (len(positions), 3, 3))
-    rates = np.full_like(positions, 0.3)
-    motion = PoseMotion(np.zeros(1) + 2e-5, rates, rates)
-    return check_scan(pattern, positions, rotations, rays_per_pose=1, motion=motion, tally=True)
-
-
-def _count_different_hits(device_scan: Any, host_scan: Any) -> int:
-    """Count hits that differ in distance or triangle; 1 if the rays that hit differ."""
-    if not np.array_equal(device_scan.ray, host_scan.ray):
-        return 1
-    differs = device_scan.distance != host_scan.distance
-    differs |= device_scan.triangle != host_scan.triangle
-    return int(np.sum(differs))
-
-
-def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, Float]) -> int:
-    """Count coordinates of the device's rays of hits that differ from expected rays."""
-    parts: list[tuple[Float, Float]] = []
-    caster.visit(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
-    return int(
-        sum(
-            (rays != np.concatenate(arrays, axis=1).T).sum()
-            for arrays, rays in zip(zip(*parts, strict=True), expected, strict=True)
-        )
-    )
-
-
-def leaks(session: Session) -> Rows:
-    """Count rays from inside a closed mesh that escape at its edges and corners."""
-    vertices, faces = six_objects()
-    faces = faces[: len(faces) // 6]
-    vertices = vertices[: faces.max() + 1] + 5e5
-    caster = RayCaster(vertices, faces, backend="cuda")
-    inside = np.array([-20, -20, 1.5]) + 5e5
-    rng = np.random.default_rng(2)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    escaped = cast_count = 0
-    while cast_count < session.sizes.leaks:
-        count = min(1 << 20, session.sizes.leaks - cast_count)
-        edge_vertices = vertices[edges[rng.integers(len(edges), size=count)]]
-        part = np.clip(rng.uniform(-0.5, 1.5, (count, 1)), 0, 1)  # half of them at corners
-        origins = inside + 0.1 * rng.uniform(-1, 1, (count, 3))
-        directions = edge_vertices[:, 0] * (1 - part) + edge_vertices[:, 1] * part - origins
-        escaped += count - int(caster.cast(origins, directions).hit.sum())
-        cast_count += count
-    yield "edges and corners", {"rays": cast_count, "escaped": escaped}
-
-
 def large(session: Session) -> Rows:
     """Cast more rays than a 32-bit integer counts, then cast in a large city."""
     directions = revolution(session.sizes.rays)
@@ -334,3 +263,5 @@ def large(session: Session) -> Rows:
     caster, row = build_caster(city(session.sizes.large))
     yield f"{name}, build", row
     yield f"{name}, coherent", rates(session, caster, revolutions(session, directions))
+    for kind, scan in other_scans(session, directions).items():
+        yield f"{name}, {kind}", rates(session, caster, scan, ["cast"])

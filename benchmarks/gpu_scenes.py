@@ -41,6 +41,32 @@ def six_objects() -> Mesh:
     return joined([(vertices + np.array([x, y, 0]), faces) for x, y in positions])
 
 
+def ball(radius_m: float, rows: int = 40, columns: int = 60) -> Mesh:
+    """Make a closed sphere around the origin."""
+    polar = np.linspace(0, np.pi, rows)[:, None]
+    azimuth = np.arange(columns) * 2 * np.pi / columns
+    ring = np.sin(polar)
+    ring[[0, -1]] = 0
+    parts = (ring * np.cos(azimuth), ring * np.sin(azimuth), np.cos(polar))
+    points = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
+    return radius_m * points, grid_faces(rows, columns, wrap=True)
+
+
+def soup(kind: str) -> Mesh:
+    """Make unconnected triangles of one kind: random, sliver, huge or tiny; 20 m around zero."""
+    rng = np.random.default_rng(0)
+    count = 5000 if kind in ("sliver", "tiny") else 300
+    first_corner = rng.uniform(-20, 20, (count, 1, 3))
+    edges = rng.normal(size=(count, 2, 3))
+    if kind == "sliver":
+        edges *= 8
+        edges[:, 1] = edges[:, 0] * rng.uniform(0.1, 1, (count, 1)) + 1e-2 * edges[:, 1]
+    else:
+        edges *= {"random": 4.0, "huge": 1e3, "tiny": 0.2}[kind]
+    points = np.concatenate([first_corner, first_corner + edges], axis=1).reshape(-1, 3)
+    return points, np.arange(3 * count).reshape(-1, 3)
+
+
 def city(triangles: int, seed: int = 0) -> Mesh:
     """Make streets of panelled box buildings on flat ground, about `triangles` triangles."""
     rng = np.random.default_rng(seed)

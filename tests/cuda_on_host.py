@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -181,6 +183,7 @@ HOST = Module(
         Stream=Stream,
         get_current_stream=Stream,
         alloc_pinned_memory=bytearray,
+        set_allocator=lambda allocate: None,
         Event=Event,
         get_elapsed_time=lambda one, other: max(1e3 * (other.time - one.time), 1e-3),
         runtime=SimpleNamespace(
@@ -190,6 +193,7 @@ HOST = Module(
             runtimeGetVersion=lambda: 12090,
             CUDARuntimeError=CudaError,
         ),
+        nvrtc=SimpleNamespace(getVersion=lambda: (13, 0)),
     ),
 )
 
@@ -210,31 +214,51 @@ class SourceBackend(CudaBackend):
 
 
 def compiled(compiler, folder, code, options):
-    """Kernels made a library for the CPU."""
-    number = len(list(folder.iterdir()))
-    source = folder / f"{number}.cpp"
-    library = folder / f"{number}.so"
+    """Load kernels as a library for the CPU; compile the library if no process has done so."""
     names = re.findall(r"^KERNEL (\w+)\(", code, re.M)
     runs = "".join(f"RUN({name}, {str(name in VOTING).lower()})\n" for name in names)
-    source.write_text(f'#include "launch.h"\n{code}\n{runs}')
-    command = [
-        compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-ffp-contract=off",
-        "-shared", "-fPIC", *(option for option in options if option != "-fmad=false"),
-        f"-I{HOST_FILES}", "-o", str(library), str(source),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    text = f'#include "launch.h"\n{code}\n{runs}'
+    key = hashlib.sha256("\0".join([text, *options]).encode()).hexdigest()[:16]
+    library = folder / f"{key}.so"
+    if not library.exists():
+        source = folder / f"{key}-{os.getpid()}.cpp"
+        unfinished = source.with_suffix(".new")
+        source.write_text(text)
+        command = [
+            compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-ffp-contract=off",
+            "-shared", "-fPIC", *(option for option in options if option != "-fmad=false"),
+            f"-I{HOST_FILES}", "-o", str(unfinished), str(source),
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        unfinished.replace(library)
     return ctypes.CDLL(str(library))
+
+
+def compile_into(folder):
+    """Have g++ compile kernels into a folder, which processes may share."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not here to compile the kernels for the CPU")
+    Kernels.compile_for = staticmethod(cache(partial(compiled, compiler, folder)))
+
+
+def write_cupy(folder):
+    """Write a package `cupy` for processes that have `folder` and the checkout on their path."""
+    package = folder / "cupy"
+    libraries = folder / "libraries"
+    package.mkdir(parents=True)
+    libraries.mkdir()
+    package.joinpath("__init__.py").write_text(
+        "from pathlib import Path\n\nfrom tests.cuda_on_host import HOST, compile_into\n\n"
+        f"compile_into(Path({str(libraries)!r}))\nglobals().update(vars(HOST))\n"
+    )
 
 
 @pytest.fixture(scope="session")
 def source_backend(tmp_path_factory):
     """`SourceBackend`, its libraries made by g++ when they are needed."""
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("g++ is not here to compile the kernels for the CPU")
-    folder = tmp_path_factory.mktemp("source")
-    Kernels.compile_for = staticmethod(cache(partial(compiled, compiler, folder)))
+    compile_into(tmp_path_factory.mktemp("source"))
     return SourceBackend
 
 

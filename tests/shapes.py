@@ -9,11 +9,20 @@ import numpy as np
 import trimesh
 
 from lidarpool import Beams, Optics, Pose, Scene, Sensor, Spin, Survey
+from lidarsim.scene.colours import Colours
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
+BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
+COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
+BALL_AROUND = Scene.from_meshes(
+    [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
+)
+DELAYS = 300.0 * np.arange(128)
+SPIN_OF_128_BEAMS = Sensor(Beams(np.radians(np.linspace(-22, 22, 128)), time_ns=DELAYS), Spin(2048))
 COLUMNS = ("ray", "range", "intensity", "reflectance", "return_number", "returns", "class")
 
 

@@ -7,14 +7,15 @@ import shutil
 import subprocess
 import tracemalloc
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
-from tests.lidarsim.test_memory import MANY
-from tests.lidarsim.test_memory import SCENE as SPHERE
 from tests.lidarsim.test_rig import CART, SURVEYS, TURNED
 from tests.lidarsim.test_rig import COLUMNS as RIG_COLUMNS
+from tests.shapes import BALL_AROUND as SPHERE
+from tests.shapes import SPIN_OF_128_BEAMS as MANY
 from tests.shapes import cast_between
 
 from lidarpool import (
@@ -57,6 +58,8 @@ WAYS = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
 ACTORS = tuple(
     Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(WAYS)
 )
+
+NEEDS_NUMBA = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
 
 MODELS = {
     name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=RIG_COLUMNS)
@@ -199,7 +202,10 @@ MORE = {
 
 
 @pytest.mark.every_nth(3)
-@pytest.mark.parametrize("actors", [(), ACTORS], ids=["", "actors"])
+@pytest.mark.parametrize(
+    "actors",
+    [pytest.param((), id=""), pytest.param(ACTORS, id="actors", marks=NEEDS_NUMBA)],
+)
 @pytest.mark.parametrize("name", MORE)
 def test_numpy_makes_the_other_columns_of_the_hits(name, actors, scenes, backend):
     survey = replace(MADE["on the move"], **MORE[name])
@@ -218,6 +224,7 @@ def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
     assert not isinstance(next(rigs[0].cast(0, 1)), DevicePoints)
 
 
+@NEEDS_NUMBA
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_actors(scene, name, scenes, backend):

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.rows import quick
+from tests.shapes import BALL_AROUND as SCENE
+from tests.shapes import SPIN_OF_128_BEAMS as MANY
 
 from lidarpool import (
     Beams,
@@ -19,15 +20,12 @@ from lidarpool import (
     Noise,
     Optics,
     Returns,
-    Scene,
-    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
     load_sensor,
 )
-from lidarsim.scene.colours import Colours
 from lidarsim.sensor.survey import OPTIONAL_NAMES
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.memory import HIT_COUNTER, cast_bytes, scans_that_fit
@@ -35,15 +33,6 @@ from lidarsim.simulator.rig import Rig
 
 RAYS = 600_000
 
-BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
-COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
-PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
-SCENE = Scene.from_meshes(
-    [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
-)
-
-DELAYS = 300.0 * np.arange(128)
-MANY = Sensor(Beams(np.radians(np.linspace(-22, 22, 128)), time_ns=DELAYS), Spin(2048))
 ONE = Sensor(Beams(np.zeros(1)), Spin(20_000))
 STILL = {"poses": [(0, 0, 1)], "steps": 10_000}
 WAY = {"trajectory": Track([0, 60], [(0, 0, 1), (2, 0, 1)], [[0, 0, 0, 1], [0, 0, 1, 0]])}

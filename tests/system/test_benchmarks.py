@@ -92,7 +92,7 @@ def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
     def threads(*_needed, **_options):
         with (
             thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
-            Client(cluster) as c,
+            Client(cluster, set_as_default=False) as c,
         ):
             yield c
 
