@@ -163,7 +163,6 @@ def test_tools_that_cannot_be_used(played_cuda, tmp_path, monkeypatch):  # noqa:
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_a_device_on_which_nothing_has_run(source_backend, tmp_path, monkeypatch):  # noqa: F811
     """The whole command, with a device that the CPU plays in all of its processes."""
     root = Path(__file__).parents[2]
