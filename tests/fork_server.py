@@ -1,4 +1,4 @@
-"""A process that has imported usd-core, and forks itself for each file: a quarter of the time."""
+"""A process that has imported a library, and forks itself for each file: a quarter of the time."""
 
 import json
 import os
@@ -13,12 +13,19 @@ from types import SimpleNamespace
 from typing import Any
 
 
-class UsdServer:
-    """Takes the place of `subprocess.Popen` for `lidarscenes.files.usd`."""
+USD_CORE = """
+from pxr import Usd, UsdGeom, UsdUtils
+UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
+UsdUtils.CoalescingDiagnosticDelegate()
+"""
 
-    def __init__(self) -> None:
+
+class ForkServer:
+    """Takes the place of `subprocess.Popen` for `lidarscenes.files.child_process`."""
+
+    def __init__(self, preload: str) -> None:
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self._process = subprocess.Popen([sys.executable, "-P", __file__], **pipes)
+        self._process = subprocess.Popen([sys.executable, "-P", __file__, preload], **pipes)
 
     def close(self) -> None:
         self._process.communicate()
@@ -36,10 +43,7 @@ class UsdServer:
 
 
 def serve() -> None:
-    from pxr import Usd, UsdGeom, UsdUtils
-
-    UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
-    UsdUtils.CoalescingDiagnosticDelegate()
+    exec(sys.argv[1], {})
     compiled = cache(lambda path: compile(Path(path).read_text(), path, "exec"))
     for line in sys.stdin:
         args, cwd, env, pipe = json.loads(line)
