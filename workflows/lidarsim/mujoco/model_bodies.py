@@ -102,7 +102,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
     Bodies that are welded to the world stand; mocap bodies and all others move. Geoms that are
     completely transparent are left out, as by MuJoCo's rays, and so are flexes and skins.
     """
-    geoms = _visible_geoms(model, choice)
+    geoms = seen_geoms(model, choice)
     groups = [[geom] for geom in geoms]
     if choice.objects == "body":
         by_body: dict[int, list[int]] = {}
@@ -134,7 +134,7 @@ def _static_bodies(model: Any) -> Any:
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
-def _visible_geoms(model: Any, choice: Choice) -> list[int]:
+def seen_geoms(model: Any, choice: Choice) -> list[int]:
     """Return the numbers of the geoms that a lidar may see."""
     colours = _colours(model)
     seen = np.isin(model.geom_group, choice.groups) & (colours[:, 3] > 0)

@@ -143,6 +143,9 @@ class Scene:
         epsg: int | None = None,
         assets: str | Path | None = None,
         geometry: Geometry | None = None,
+        keyframe: str | None = None,
+        groups: Sequence[int] | None = None,
+        exclude: Sequence[str] = (),
         same_names: SameNames = "number",
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
@@ -177,6 +180,13 @@ class Scene:
             are looked for in it first.
         geometry
             Of a world of Gazebo, its "visual" shapes, as by default, or those for "collision".
+        keyframe
+            Of a model of MuJoCo: name of the keyframe at which its bodies are, or the number of a
+            keyframe without a name; None for the reference pose.
+        groups
+            Of a model of MuJoCo: groups of the geoms to read; None for 0, 1 and 2.
+        exclude
+            Of a model of MuJoCo: names of bodies and geoms to leave out.
         same_names
             With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
             objects of a name are one object.
@@ -203,6 +213,9 @@ class Scene:
             epsg=epsg,
             assets=assets,
             geometry=geometry,
+            keyframe=keyframe,
+            groups=groups,
+            exclude=exclude,
         )
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")

@@ -52,6 +52,8 @@ class MeshFormat:
         Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
     collisions
         Whether files may have shapes for collisions, see `ReadOptions.collisions`.
+    models
+        Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -65,6 +67,7 @@ class MeshFormat:
     from_path: bool = False
     raster: bool = False
     collisions: bool = False
+    models: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -102,7 +105,6 @@ _READ = (
 _TABLES = ("lidarscenes.files.formats",)
 
 _POINTS = "make a mesh of it by lidarpool scene points"
-_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
 
 _NOT_READ = (
     MeshFormat(
@@ -144,12 +146,7 @@ _NOT_READ = (
         (".osm",),
         advice="it is a map, make a mesh of its buildings, for example by blosm in Blender",
     ),
-    MeshFormat((".mjcf",), advice=_MUJOCO),
-    MeshFormat(
-        (".xml",),
-        advice=f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
-        "scenario names floating car data of SUMO",
-    ),
+    MeshFormat((".mjcf",), advice="MuJoCo reads its models from .xml: give it that ending"),
     MeshFormat(
         (".xodr",),
         advice="it is a road network, make a mesh of its roads, for example by libOpenDRIVE",
