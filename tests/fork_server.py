@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
-
 USD_CORE = """
 from pxr import Usd, UsdGeom, UsdUtils
 UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
@@ -38,8 +37,11 @@ class ForkServer:
             print(json.dumps(asked), file=self._process.stdin, flush=True)
             with open(pipe, "rb") as read:  # noqa: PTH123
                 wait = cache(lambda: int(self._process.stdout.readline()))
-                yield SimpleNamespace(stdout=read, wait=wait, kill=read.close)
-            wait()
+                try:
+                    yield SimpleNamespace(stdout=read, wait=wait, kill=read.close)
+                finally:
+                    read.close()
+                    wait()
 
 
 def serve() -> None:

@@ -18,21 +18,25 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_WAIT_S = 300  # broken files may take for ever
+MAX_WAIT_S = 120  # broken files may take for ever
 
-_ARENA_BYTES = 2**20  # memory for simulating, which is not needed for poses
+# Memory for simulating, of which the rays of a camera take 24 bytes each.
+_ARENA_BYTES = 128 * 2**20
 
-_OF_MODEL = """
-names name_bodyadr name_geomadr name_matadr name_siteadr name_camadr
-body_parentid body_rootid body_weldid body_mocapid body_pos body_quat
-geom_type geom_bodyid geom_dataid geom_matid geom_group geom_size geom_pos geom_quat geom_rgba
-mesh_vert mesh_vertadr mesh_vertnum mesh_face mesh_faceadr mesh_facenum
-hfield_size hfield_nrow hfield_ncol hfield_adr hfield_data
-mat_rgba mat_texid tex_height tex_width tex_nchannel tex_adr tex_data
-site_bodyid cam_bodyid cam_fovy cam_resolution cam_sensorsize cam_intrinsic
-sensor_type sensor_objtype sensor_objid sensor_dim sensor_cutoff sensor_noise
-""".split()
-_OF_DATA = "xpos xmat site_xpos site_xmat cam_xpos cam_xmat sensordata".split()
+# Prefixes of the names of arrays, and the names after the prefix.
+_OF_MODEL = {
+    "name": ("s", "_bodyadr", "_geomadr", "_matadr", "_siteadr", "_camadr"),
+    "body": ("_parentid", "_rootid", "_weldid", "_mocapid", "_pos", "_quat"),
+    "geom": ("_type", "_bodyid", "_dataid", "_matid", "_group", "_size", "_pos", "_quat", "_rgba"),
+    "mesh": ("_vert", "_vertadr", "_vertnum", "_face", "_faceadr", "_facenum"),
+    "hfield": ("_size", "_nrow", "_ncol", "_adr", "_data"),
+    "mat": ("_rgba", "_texid"),
+    "tex": ("_height", "_width", "_nchannel", "_adr", "_data"),
+    "site": ("_bodyid",),
+    "cam": ("_bodyid", "_fovy", "_resolution", "_sensorsize", "_intrinsic", "_projection"),
+    "sensor": ("_type", "_objtype", "_objid", "_cutoff", "_noise", "_interval"),
+}
+_OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
 
 
 class NoKeyframeError(Exception):
@@ -49,7 +53,9 @@ def main(path: str, request: dict[str, Any]) -> None:
     arrays: list[NDArray[Any]] = []
     try:
         model, data = _state(path, request["keyframe"])
-        fields = {name: getattr(model, name) for name in _OF_MODEL if hasattr(model, name)}
+        names = [prefix + name for prefix, rest in _OF_MODEL.items() for name in rest]
+        # Older versions lack some.
+        fields = {name: getattr(model, name) for name in names if hasattr(model, name)}
         if not request["colours"]:
             fields["tex_data"] = fields["tex_data"][:0]
         fields["names"] = np.frombuffer(model.names, np.uint8)
@@ -67,7 +73,8 @@ def main(path: str, request: dict[str, Any]) -> None:
     except NoKeyframeError as error:
         frame = {"what": "keyframes", "names": error.args[0][:1000]}
     except Exception as error:  # of any type, as readers of broken files are
-        frame = {"what": "error", "reason": str(error).replace(os.path.dirname(path) + "/", "")}  # noqa: PTH120
+        reason = " ".join(str(error).split())
+        frame = {"what": "error", "reason": reason.replace(os.path.dirname(path) + "/", "")}  # noqa: PTH120
     signal.alarm(0)  # who reads this may take long
     frame["arrays"] = [(array.dtype.str, array.shape) for array in arrays]
     output.write(json.dumps(frame).encode() + b"\n")

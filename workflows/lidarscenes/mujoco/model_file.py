@@ -41,6 +41,7 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.transform import affine
 
 from ..files.child_process import Child
 from .model_sources import check_sources
@@ -183,15 +184,7 @@ def _named_geoms_of_world(model: Any) -> list[int]:
 
 def body_matrix(model: Any, body: int) -> Floats:
     """Return the matrix from the frame of a body to the world, (4, 4)."""
-    return frame_matrix(model.xpos[body], model.xmat[body])
-
-
-def frame_matrix(position: Any, rotation: Any) -> Floats:
-    """Return the matrix (4, 4) of a position (3,) and a rotation (9,) of MuJoCo."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    matrix[:3, :3] = np.asarray(rotation).reshape(3, 3)
-    return matrix
+    return affine(model.xmat[body].reshape(3, 3), model.xpos[body])
 
 
 def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:

@@ -139,7 +139,7 @@ def seen_geoms(model: Any, choice: Choice) -> list[int]:
     colours = _colours(model)
     seen = np.isin(model.geom_group, choice.groups) & (colours[:, 3] > 0)
     seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)
-    seen[choice.excluded_geoms] = False
+    seen[[*choice.excluded_geoms]] = False
     return np.flatnonzero(seen).tolist()
 
 
@@ -172,9 +172,7 @@ def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
     return as_srgb(LINEAR[srgb] * light)
 
 
-def _mesh_of_geoms(
-    model: Any, geoms: list[int], colours: Floats, choice: Choice
-) -> SceneMesh:
+def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, choice: Choice) -> SceneMesh:
     """Return the mesh of geoms of a body, in the frame of the body, without a name.
 
     `colours` (geoms, 4) are those of all geoms of the model.
