@@ -92,7 +92,7 @@ if __name__ == "__main__":
     envs = LidarVectorEnv()
     observation, _ = envs.reset(seed=1)
     total = np.zeros(envs.num_envs)
-    for _ in range(100):  # away from the nearest surface
+    for _ in range(60):  # away from the nearest surface
         nearest = observation["lidar"].min(axis=1)
         bearing = nearest.argmin(axis=1) * 2 * np.pi / LIDAR.period
         yaw_rate = np.clip(-1.5 * np.sin(bearing) / nearest.min(axis=1), -2, 2)
