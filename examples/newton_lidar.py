@@ -18,17 +18,23 @@ DURATION_S = 0.55
 SIZE_M = 0.6
 
 
-def main() -> None:
-    """Simulate half a second; save the last sweep as boxes.ply."""
+def model_of_boxes(positions):
+    """Return a model of boxes above the ground."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
-    positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
     for position in positions.tolist():
         body = builder.add_body(xform=warp.transform(position, warp.quat_identity()))
         builder.add_shape_box(body, hx=SIZE_M / 2, hy=SIZE_M / 2, hz=SIZE_M / 2)
-    model = builder.finalize()
+    return builder.finalize()
+
+
+def main() -> None:
+    """Simulate half a second; save the last sweep as boxes.ply."""
+    positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
+    model = model_of_boxes(positions)
     solver = newton.solvers.SolverXPBD(model)
-    state, next_state = model.state(), model.state()
+    state = model.state()
+    next_state = model.state()
     collisions = newton.CollisionPipeline(model)
     contacts = collisions.contacts()
     # Frames of Newton's boxes are at their centres, of `box` in the middle below.

@@ -62,8 +62,8 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
     folders = {home, *(file.parent for file in roots)}
     for root in roots.values():
         for compiler in root.iter("compiler"):
-            names = [compiler.get(name) for name in _FOLDERS]
-            folders |= {folder / name for folder in [*folders] for name in names if name}
+            inner = filter(None, map(compiler.get, _FOLDERS))
+            folders |= {folder / name for name in inner for folder in folders}
             _count(len(folders))
     names = {name for root in roots.values() for name in _names_of(root)}
     _count(len(names) * len(folders))
