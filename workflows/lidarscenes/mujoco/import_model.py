@@ -18,7 +18,7 @@ from lidarsim.base.elementary import arctan2, cos, sin
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import length, turned
-from lidarsim.base.words import plural, printable
+from lidarsim.base.words import printable
 from lidarsim.mujoco.model_bodies import Choice, names_of, seen_geoms
 from lidarsim.scene.files.scene_graph import MeshFileError, ModelOptions, ReadOptions
 from lidarsim.scene.object_names import unique_names
@@ -241,10 +241,10 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
     all_groups = np.unique(model.geom_group)
     further = sorted({*all_groups.tolist()} - {*ModelOptions().groups})
     if further and seen_geoms(model, Choice(further, (), (), "body")):
-        listed = ", ".join(map(str, further))
+        numbers = ", ".join(map(str, further))
         lines.append(
-            f"rangefinders meet geoms of {plural(len(further), 'further group')}, {listed}: add "
-            "them to groups of scene.files"
+            f"rangefinders also meet geoms of {'groups' if len(further) > 1 else 'group'} "
+            f"{numbers}: groups of scene.files"
         )
     carriers = {group.body for group in groups} - {0}
     if len(carriers) > 1:
