@@ -72,6 +72,94 @@ def test_a_robot_of_mujoco_scans_while_balls_fall(tmp_path, monkeypatch, capsys)
     assert (tmp_path / "balls.ply").exists()
 
 
+def test_robots_of_a_vector_environment_avoid_columns(capsys):
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    pytest.importorskip("gymnasium", reason="Gymnasium is not installed: pip install gymnasium")
+    example = runpy.run_path(str(EXAMPLES / "vector_env.py"), run_name="__main__")
+    assert capsys.readouterr().out == f"lidar (8, 4, 90), rewards {[2.4] * 8}\n"
+    envs = example["LidarVectorEnv"](3)
+    observation, infos = envs.reset(seed=2)
+    assert envs.observation_space.contains(observation) and infos == {}
+    assert observation["lidar"].dtype == np.float32
+    assert observation["lidar"].shape == (3, 4, 90)
+    again, _ = envs.reset(seed=2)
+    assert np.array_equal(again["lidar"], observation["lidar"])
+    assert envs.single_observation_space.spaces["state"].shape == (3,)
+    ends = np.zeros(3, bool)
+    while not ends.any():  # straight ahead, into a column
+        observation, reward, ends, cut, infos = envs.step(np.float32([[1, 0]] * 3))
+        assert envs.observation_space.contains(observation) and not cut.any()
+        assert np.allclose(reward, 0.05 - 5 * ends)
+    assert (infos["final_obs"]["lidar"].min(axis=(1, 2))[ends] < 0.35).all()
+    assert (observation["lidar"].min(axis=(1, 2)) > 0.35).all()
+
+
+class Falling:
+    """What the examples need of PyBullet, and what Newton's need besides: boxes in free fall."""
+
+    DIRECT = GEOM_PLANE = GEOM_BOX = 0
+
+    def __init__(self):
+        self.solvers = self
+        self.poses = np.zeros((0, 7))
+        self.time_s = 0.0
+
+    def do_nothing(self, *values, **options):
+        return self
+
+    connect = setGravity = createCollisionShape = disconnect = do_nothing  # noqa: N815
+    ModelBuilder = SolverXPBD = CollisionPipeline = do_nothing
+    finalize = state = control = contacts = add_ground_plane = add_shape_box = do_nothing
+    clear_forces = collide = quat_identity = do_nothing
+
+    def createMultiBody(self, mass, shape=None, basePosition=(0, 0, 0)):  # noqa: N802, N803
+        if mass:
+            self.poses = np.vstack([self.poses, [*basePosition, 0, 0, 0, 1]])
+        return len(self.poses) - 1
+
+    def transform(self, position, quaternion):
+        return position
+
+    def add_body(self, xform):
+        return self.createMultiBody(1, basePosition=xform)
+
+    def stepSimulation(self):  # noqa: N802
+        self.step(self, self, None, None, 1 / 240)
+
+    def step(self, state, next_state, control, contacts, step_s):
+        self.time_s += step_s
+        self.poses[:, 2] -= 9.81 * self.time_s * step_s
+
+    def getBasePositionAndOrientation(self, body):  # noqa: N802
+        return self.poses[body, :3], self.poses[body, 3:]
+
+    def getMatrixFromQuaternion(self, quaternion):  # noqa: N802
+        return np.eye(3).ravel()
+
+    @property
+    def body_q(self):
+        return SimpleNamespace(numpy=self.poses.copy)
+
+
+@pytest.mark.parametrize(
+    ("example", "modules"),
+    [("pybullet_lidar.py", ["pybullet"]), ("newton_lidar.py", ["newton", "warp"])],
+)
+def test_a_lidar_scans_falling_boxes(tmp_path, monkeypatch, capsys, example, modules):
+    """With a stand-in for the program, since its installation is large."""
+    program = Falling()
+    for name in modules:
+        monkeypatch.setitem(sys.modules, name, program)
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / example), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    on_boxes = [
+        re.fullmatch(r"0\.\d+ s: 1[45],.* points, (.*) on boxes", line)[1] for line in lines
+    ]
+    assert len(on_boxes) == 5 and all(int(n.replace(",", "")) > 500 for n in on_boxes)
+    assert (tmp_path / "boxes.ply").exists()
+
+
 def test_a_node_publishes_what_a_bag_holds(tmp_path):
     node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
     scene = Scene.seed()

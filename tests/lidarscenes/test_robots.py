@@ -575,8 +575,8 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
 @pytest.mark.parametrize(
     ("name", "way"),
     [
-        ("a.xml", "mujoco-usd-converter, lidarpool import"),
-        ("a.mjcf", "mujoco"),
+        ("a.mjcf", "MuJoCo reads its models from .xml"),
+        ("a.ifc", "it is a building"),
     ],
 )
 def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way):

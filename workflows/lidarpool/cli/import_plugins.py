@@ -7,19 +7,19 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from xml.etree.ElementTree import ParseError
 
+from lidarscenes.files.lenient_xml import lenient_root
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import read_input
 from lidarsim.base.plugins import Plugin, find_plugin
 from lidarsim.base.words import printable
-from lidarsim.base.xmlfile import xml_root
 
 # Names are tags of the outermost elements of XML files, without namespaces, or endings of other
 # files.
 GROUP = "lidarpool.importers"
 SCENARIO_FILE = "scenario.yaml"
 _HELIOS = "document"  # root of a survey of HELIOS++
+_MUJOCO = "mujoco"  # root of a model of MuJoCo
 
 # Arguments: a survey, the folder for SCENARIO_FILE and further files, and folders where references
 # start. Returns the features that are not supported, a line each.
@@ -27,17 +27,27 @@ Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
 def importer_of(survey: Path) -> Plugin | None:
-    """Return the plug-in that imports a survey; None for surveys of HELIOS++ and unknown files.
+    """Return the plug-in that imports a survey; None for those of lidarpool and unknown files.
 
     Raises
     ------
     LidarError
         If two plug-ins import the survey.
     """
-    name = survey.suffix.lower()
-    with suppress(OSError, LidarError, ParseError, ValueError, LookupError):
-        name = xml_root(read_input(survey)).tag.rpartition("}")[2]  # without its namespace
-    return None if name == _HELIOS else find_plugin(GROUP, name)
+    name = _kind_of(survey)
+    return None if name in (_HELIOS, _MUJOCO) else find_plugin(GROUP, name)
+
+
+def is_mujoco_model(survey: Path) -> bool:
+    """Return True if a file is a model of MuJoCo."""
+    return _kind_of(survey) == _MUJOCO
+
+
+def _kind_of(survey: Path) -> str:
+    """Return the tag of the outermost element of XML without a namespace, else the ending."""
+    with suppress(OSError, LidarError, ValueError):
+        return lenient_root(read_input(survey)).tag.rpartition(":")[2]
+    return survey.suffix.lower()
 
 
 def import_by(

@@ -127,24 +127,26 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a survey of another program as a scenario.
 
-    Surveys of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, and surveys for
-    which a plug-in is installed. Unsupported features are listed, one line each. Mesh files stay
-    where they are.
+    Surveys of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, models of
+    MuJoCo (.xml) with their rangefinders, and surveys for which a plug-in is installed. Unsupported
+    features are listed, one line each. Mesh files stay where they are.
 
     \b
     Examples:
       lidarpool import helios/data/surveys/toyblocks/als_toyblocks.xml
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
       lidarpool import worlds/house.sdf --assets models
+      lidarpool import robot.xml
     """  # noqa: D301 - click wants the character, not its name
     from lidarscenes.files.formats import WORLDS
     from lidarscenes.gazebo.import_world import import_world
     from lidarscenes.helios import import_survey
+    from lidarscenes.mujoco.import_model import import_model
 
     from ..scenario.build import build
     from ..scenario.point_scene import surfels
     from ..scenario.scenario import Scenario
-    from .import_plugins import SCENARIO_FILE, import_by, import_whole, importer_of
+    from .import_plugins import SCENARIO_FILE, import_by, import_whole, importer_of, is_mujoco_model
 
     def check(path: Path) -> None:
         build(Scenario.load(path))
@@ -152,6 +154,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     folder = out or Path(survey.stem)
     if survey.suffix.lower() in WORLDS:
         left_out = import_whole(import_world, survey, folder, assets, check)
+    elif is_mujoco_model(survey):
+        left_out = import_whole(import_model, survey, folder, assets, check)
     elif (plugin := importer_of(survey)) is not None:
         left_out = import_by(plugin, survey, folder, assets, check=check)
     else:

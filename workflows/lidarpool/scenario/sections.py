@@ -85,9 +85,9 @@ class MeshFile(Section):
         str,
         about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), roads of "
-            "OpenDRIVE (.xodr), voxels of AMAPVox (.vox), a world of Gazebo (.sdf), a robot that "
-            "stands still (.urdf), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
-            "scenario's folder",
+            "OpenDRIVE (.xodr), voxels of AMAPVox (.vox), a world of Gazebo (.sdf), a model of "
+            "MuJoCo (.xml), a robot that stands still (.urdf), or a raster of heights: .tif .asc "
+            ".hgt .img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -131,6 +131,17 @@ class MeshFile(Section):
         Geometry | None,
         about("of a world of Gazebo: its visual shapes, or those for collision", "collision"),
     ] = None
+    keyframe: Annotated[
+        Text | None,
+        about("of a model of MuJoCo: the keyframe at which its bodies are", "home"),
+    ] = None
+    groups: Annotated[
+        Several[Annotated[int, Field(ge=0, le=5)]] | None,
+        about("of a model of MuJoCo: groups of the geoms that are seen; by default 0, 1 and 2"),
+    ] = None
+    exclude: Annotated[
+        Several[Text], about("of a model of MuJoCo: bodies and geoms that are left out")
+    ] = ()
     assets: Annotated[
         Text | None,
         about(

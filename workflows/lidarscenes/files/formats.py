@@ -7,6 +7,7 @@ from lidarsim.scene.files.mesh_formats import MeshFormat
 CITYJSON = (".json", ".cityjson", ".jsonl")
 ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
 WORLDS = (".sdf", ".world")  # of Gazebo
+MODELS = (".xml",)  # of MuJoCo
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"
@@ -34,5 +35,6 @@ MESH_FORMATS = (
     ),
     MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
     MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
+    MeshFormat(MODELS, "lidarscenes.mujoco.model_file:read_mjcf", models=True),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

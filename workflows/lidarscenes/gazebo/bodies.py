@@ -17,10 +17,10 @@ from lidarsim.base.vectors import matmul
 from lidarsim.base.words import printable
 from lidarsim.scene.files.scene_graph import MAX_NODES
 
+from ..files.lenient_xml import lenient_root
 from .frames import Frames, RelativePose, placed_by, pose_of
 from .notes import Notes
 from .resources import MissingFileError, Resources, Source, short_name
-from .sdf_xml import sdf_root
 
 _MAX_NESTED = 30  # models within each other
 _MODEL_FRAME = "__model__"
@@ -220,7 +220,7 @@ class BodyReader:
     def _ground_plane(self) -> Element:
         """Return the model of the ground plane that Gazebo brings."""
         if self._ground is None:
-            self._ground = sdf_root(GROUND_PLANE.encode())
+            self._ground = lenient_root(GROUND_PLANE.encode())
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
@@ -230,7 +230,7 @@ class BodyReader:
             self._files[path] = None
             try:
                 data = read_input(path)
-                root = sdf_root(data)
+                root = lenient_root(data)
             except (OSError, ValueError, LidarError) as error:
                 reason = getattr(error, "strerror", None) or error
                 self.notes.unread_files[f"{path.parent.name}/{path.name}"] = f"{reason}"

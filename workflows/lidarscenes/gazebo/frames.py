@@ -10,9 +10,9 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import shown
-from lidarsim.base.vectors import applied, length, matmul
+from lidarsim.base.vectors import length, matmul
 from lidarsim.base.words import did_you_mean, printable
-from lidarsim.scene.transform import affine
+from lidarsim.scene.transform import affine, inverted
 from lidarsim.sensor.trajectory import matrices, rotations_of
 
 MAX_NUMBER = 1e8  # in a file
@@ -160,9 +160,3 @@ def placed_by(pose: Floats, frames: Frames, placement_frame: str) -> Floats:
     if not placement_frame:
         return pose
     return matmul(pose, inverted(frames.matrix(placement_frame)))
-
-
-def inverted(matrix: Floats) -> Floats:
-    """Return the inverse (4, 4) of the matrix (4, 4) of a pose."""
-    back = matrix[:3, :3].T
-    return affine(back, -applied(back, matrix[:3, 3]))

@@ -9,11 +9,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import printable
 
+from ..writers.lidar_scenario import Lidar, clean
 from .bodies import scoped
 from .frames import numbers_in, numbers_of, pose_of
 from .world import PlacedLink, World
@@ -24,38 +24,6 @@ _RATE_HZ = 10.0  # of sensors that state none
 _FULL_TURN = 360.0
 _SLACK_DEG = 1e-3
 _MAX_SAMPLES = 1_000_000
-_ZERO = 1e-9  # numbers below are roundings
-
-
-class Lidar(NamedTuple):
-    """A lidar of a world.
-
-    Attributes
-    ----------
-    name
-        Names of its models, its link and its own: MODEL::LINK::SENSOR.
-    sensor
-        Name of the sensor alone.
-    model
-        Name of the outermost model.
-    data
-        Content of a data file of the sensor.
-    range_m
-        Shortest and longest range, metres; the longest may be infinite.
-    matrix, model_matrix
-        From the frames of the lidar and of the outermost model to the world, (4, 4).
-    left_out
-        What is not as in Gazebo, a clause each.
-    """
-
-    name: str
-    sensor: str
-    model: str
-    data: dict[str, Any]
-    range_m: tuple[float, float]
-    matrix: Floats
-    model_matrix: Floats
-    left_out: tuple[str, ...]
 
 
 def lidars_of(world: World) -> Iterator[Lidar]:
@@ -183,8 +151,3 @@ def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str,
         left_out.append("a mean of its noise")
     sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
     return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}
-
-
-def clean(value: float) -> float:
-    """Return a number for a file, rounded to 12 digits; roundings of zero are zero."""
-    return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0

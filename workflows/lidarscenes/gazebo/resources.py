@@ -14,7 +14,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import read_input
 from lidarsim.base.words import natural, printable
 
-from .sdf_xml import sdf_root
+from ..files.lenient_xml import lenient_root
 
 # Variables with folders of models and resources, of Gazebo Sim, then of Gazebo classic.
 FOLDER_VARIABLES = (
@@ -228,7 +228,7 @@ def _newest_file(folder: Path) -> Path:
 def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
     """Return the files that a configuration names: {version: name}."""
     try:
-        root = sdf_root(read_input(path))
+        root = lenient_root(read_input(path))
     except (OSError, ValueError, LidarError):
         return {}
     return {_version(entry): (entry.text or "").strip() for entry in root.iter("sdf")}

@@ -28,13 +28,13 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 
+from ..files.lenient_xml import lenient_root
 from .actors import actors_of
 from .appearance import appearance_of
 from .bodies import Body, BodyReader, Instance, Link, scoped
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Resources, Source
-from .sdf_xml import sdf_root
 from .shapes import road_mesh
 from .state import NO_SCALE, State, state_of
 
@@ -141,7 +141,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     LidarError, ValueError, lidarsim.scene.files.scene_graph.MeshFileError
         If the file is broken, or none of Gazebo.
     """
-    root = sdf_root(data)
+    root = lenient_root(data)
     if root.tag == _OLD_ROOT:
         raise MeshFileError("is of Gazebo before 1.9: convert it, gz sdf -k, with a Gazebo of then")
     if root.tag not in ("sdf", "model", "world"):

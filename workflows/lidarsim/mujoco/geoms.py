@@ -18,6 +18,8 @@ from ..scene.shapes import capsule, cylinder
 # Half of the side of planes without a size, metres: far beyond the range of lidars on robots, and
 # so small that single precision resolves a millimetre.
 PLANE_M = 4000.0
+# Largest distance of triangles from the surface of cylinders, metres; of balls twice that.
+SAG_M = 2.5e-4
 _MAX_SEGMENTS = 1024
 
 
@@ -42,10 +44,11 @@ class GeomMesh(NamedTuple):
     faces: Ints  # (f, 3)
 
 
-def mesh_of_geom(model: Any, geom: int, sag_m: float) -> GeomMesh:
+def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) -> GeomMesh:
     """Return the triangles of a geom, by its number.
 
-    Triangles of round surfaces are up to `sag_m` within the surface, twice that on balls.
+    Triangles of round surfaces are up to `sag_m` within the surface, twice that on balls. Planes
+    without a size end `plane_m` from their centre.
 
     Raises
     ------
@@ -57,7 +60,7 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float) -> GeomMesh:
     radius, half, _ = size.tolist()
     match kind:
         case GeomType.PLANE:
-            return _plane(size)
+            return _plane(size, plane_m)
         case GeomType.HFIELD:
             return height_field(model, int(model.geom_dataid[geom]))
         case GeomType.SPHERE:
@@ -145,9 +148,9 @@ def _walls(rim: Ints, first_lower: int) -> Ints:
     )
 
 
-def _plane(size: Floats) -> GeomMesh:
-    """Return the triangles of a plane; without a size along an axis, of `PLANE_M`."""
-    x, y = np.where(size[:2] > 0, size[:2], PLANE_M).tolist()
+def _plane(size: Floats, plane_m: float) -> GeomMesh:
+    """Return the triangles of a plane; without a size along an axis, of `plane_m`."""
+    x, y = np.where(size[:2] > 0, size[:2], plane_m).tolist()
     corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
     return GeomMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 

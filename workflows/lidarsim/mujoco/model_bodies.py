@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
@@ -12,14 +11,12 @@ import numpy as np
 from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarError
 from ..base.vectors import applied, length, matmul, turned
-from ..base.words import did_you_mean
+from ..base.words import did_you_mean, plural
 from ..scene.colours import LINEAR, Colours, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked
 from ..sensor.trajectory import matrices as rotations_of_quaternions
-from .geoms import GeomMesh, mesh_of_geom
-
-_log = logging.getLogger(__name__)
+from .geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
 
 _TEXTURE_OF_COLOURS = 1  # mjTEXROLE_RGB, column of mat_texid
 
@@ -47,7 +44,8 @@ class Choice(NamedTuple):
     excluded_bodies: Sequence[int]
     excluded_geoms: Sequence[int]
     objects: Objects  # what an object of the scene is: a body or a geom
-    sag_m: float  # distance of the triangles of round geoms from their surface, metres
+    sag_m: float = SAG_M
+    plane_m: float = PLANE_M
 
 
 def number_of(model: Any, kind: str, name: str | int) -> int:
@@ -104,8 +102,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
     Bodies that are welded to the world stand; mocap bodies and all others move. Geoms that are
     completely transparent are left out, as by MuJoCo's rays, and so are flexes and skins.
     """
-    _warn_of_soft_bodies(model)
-    geoms = _visible_geoms(model, choice)
+    geoms = seen_geoms(model, choice)
     groups = [[geom] for geom in geoms]
     if choice.objects == "body":
         by_body: dict[int, list[int]] = {}
@@ -122,7 +119,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
         body = int(model.geom_bodyid[group[0]])
         key = tuple(_key(model, geom) for geom in group)
         if key not in meshes:
-            meshes[key] = _mesh_of_geoms(model, group, colours, choice.sag_m)
+            meshes[key] = _mesh_of_geoms(model, group, colours, choice)
         name = names[group[0] if choice.objects == "geom" else body]
         if is_static[body]:
             rotation, position = _rest_pose(model, body)
@@ -137,12 +134,12 @@ def _static_bodies(model: Any) -> Any:
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
-def _visible_geoms(model: Any, choice: Choice) -> list[int]:
+def seen_geoms(model: Any, choice: Choice) -> list[int]:
     """Return the numbers of the geoms that a lidar may see."""
     colours = _colours(model)
     seen = np.isin(model.geom_group, choice.groups) & (colours[:, 3] > 0)
     seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)
-    seen[choice.excluded_geoms] = False
+    seen[[*choice.excluded_geoms]] = False
     return np.flatnonzero(seen).tolist()
 
 
@@ -175,12 +172,12 @@ def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
     return as_srgb(LINEAR[srgb] * light)
 
 
-def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, sag_m: float) -> SceneMesh:
+def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, choice: Choice) -> SceneMesh:
     """Return the mesh of geoms of a body, in the frame of the body, without a name.
 
     `colours` (geoms, 4) are those of all geoms of the model.
     """
-    shapes = [_placed_geom(model, geom, sag_m) for geom in geoms]
+    shapes = [_placed_geom(model, geom, choice) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
     vertices, faces = stacked((shape.vertices, shape.faces) for shape in shapes)
     face_colours = [_srgb_of(model, geom, colours[geom]) for geom in geoms]
@@ -193,9 +190,9 @@ def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, sag_m: float) 
     )
 
 
-def _placed_geom(model: Any, geom: int, sag_m: float) -> GeomMesh:
+def _placed_geom(model: Any, geom: int, choice: Choice) -> GeomMesh:
     """Return the triangles of a geom in the frame of its body."""
-    shape = mesh_of_geom(model, geom, sag_m)
+    shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
     points = turned(shape.vertices, _rotation(model.geom_quat[geom]))
     return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
 
@@ -236,9 +233,12 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
     return rotation, position
 
 
-def _warn_of_soft_bodies(model: Any) -> None:
-    """Warn of flexes and skins, which a lidar does not see."""
-    for kind, count in (("flexes", "nflex"), ("skins", "nskin")):
-        number = int(getattr(model, count, 0))
-        if number:
-            _log.warning("the model has %d %s, which the lidar does not see", number, kind)
+def soft_bodies(model: Any) -> str:
+    """Return the numbers of flexes and skins, which a lidar does not see; empty without any."""
+    counts = {
+        "flex": (int(getattr(model, "nflex", 0)), "flexes"),
+        "skin": (int(getattr(model, "nskin", 0)), "skins"),
+    }
+    return " and ".join(
+        plural(count, singular, several) for singular, (count, several) in counts.items() if count
+    )

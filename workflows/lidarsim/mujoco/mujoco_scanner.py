@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,10 @@ from ..base.errors import LidarError
 from ..columns.cloud import Cloud
 from ..follower import Follower
 from ..sensor import Mounted, Sensor
-from .model_bodies import Choice, Objects, bodies_of, excluded, required_number
+from .geoms import SAG_M
+from .model_bodies import Choice, Objects, bodies_of, excluded, required_number, soft_bodies
+
+_log = logging.getLogger(__name__)
 
 
 class MujocoScanner:
@@ -67,7 +71,7 @@ class MujocoScanner:
         groups: Sequence[int] = (0, 1, 2),
         exclude: Sequence[str | int] = (),
         objects: Objects = "body",
-        sag_m: float = 2.5e-4,
+        sag_m: float = SAG_M,
         **options: Any,
     ) -> None:
         if (body is None) == (site is None):
@@ -90,6 +94,8 @@ class MujocoScanner:
         # The world, body 0, cannot carry a lidar that would not see it.
         unseen = [*excluded_bodies, *(carrier for carrier in carriers.tolist() if carrier)]
         choice = Choice(tuple(groups), unseen, excluded_geoms, objects, sag_m)
+        if soft := soft_bodies(model):
+            _log.warning("the model has %s, which the lidar does not see", soft)
         bodies = bodies_of(model, choice)
         self._bodies: Indices = np.array([item.body for item in bodies.moving], np.intp)
         if not bodies.static and not bodies.moving:

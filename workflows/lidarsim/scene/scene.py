@@ -144,6 +144,9 @@ class Scene:
         sag_m: float | None = None,
         assets: str | Path | None = None,
         geometry: Geometry | None = None,
+        keyframe: str | None = None,
+        groups: Sequence[int] | None = None,
+        exclude: Sequence[str] = (),
         same_names: SameNames = "number",
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, or a raster (.tif).
@@ -182,6 +185,13 @@ class Scene:
             are looked for in it first.
         geometry
             Of a world of Gazebo, its "visual" shapes, as by default, or those for "collision".
+        keyframe
+            Of a model of MuJoCo: name of the keyframe at which its bodies are, or the number of a
+            keyframe without a name; None for the reference pose.
+        groups
+            Of a model of MuJoCo: groups of the geoms to read; None for 0, 1 and 2.
+        exclude
+            Of a model of MuJoCo: names of bodies and geoms to leave out.
         same_names
             With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
             objects of a name are one object.
@@ -209,6 +219,9 @@ class Scene:
             sag_m=sag_m,
             assets=assets,
             geometry=geometry,
+            keyframe=keyframe,
+            groups=groups,
+            exclude=exclude,
         )
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")

@@ -12,7 +12,7 @@ from ..base.arrays import Floats
 from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarError
 from ..base.validation import as_array
-from ..base.vectors import length, matmul, rank
+from ..base.vectors import applied, length, matmul, rank
 from ..sensor import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
@@ -31,6 +31,12 @@ def affine(linear: Floats, offset: Floats) -> Floats:
     matrices[..., :3, 3] = offset
     matrices[..., 3, 3] = 1
     return matrices
+
+
+def inverted(matrix: Floats) -> Floats:
+    """Return the inverse (4, 4) of the matrix (4, 4) of a pose."""
+    back = matrix[:3, :3].T
+    return affine(back, -applied(back, matrix[:3, 3]))
 
 
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:

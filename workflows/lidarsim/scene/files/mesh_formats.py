@@ -54,6 +54,8 @@ class MeshFormat:
         Whether files may have shapes for collisions, see `ReadOptions.collisions`.
     roads
         Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
+    models
+        Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -68,6 +70,7 @@ class MeshFormat:
     raster: bool = False
     collisions: bool = False
     roads: bool = False
+    models: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -105,7 +108,6 @@ _READ = (
 _TABLES = ("lidarscenes.files.formats",)
 
 _POINTS = "make a mesh of it by lidarpool scene points"
-_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
 
 _NOT_READ = (
     MeshFormat(
@@ -147,12 +149,7 @@ _NOT_READ = (
         (".osm",),
         advice="it is a map, make a mesh of its buildings, for example by blosm in Blender",
     ),
-    MeshFormat((".mjcf",), advice=_MUJOCO),
-    MeshFormat(
-        (".xml",),
-        advice=f"{_MUJOCO}, lidarpool import reads a survey of HELIOS++, and traffic.file of a "
-        "scenario names floating car data of SUMO",
-    ),
+    MeshFormat((".mjcf",), advice="MuJoCo reads its models from .xml: give it that ending"),
 )
 
 

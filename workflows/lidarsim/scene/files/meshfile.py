@@ -41,6 +41,7 @@ from .mesh_formats import (
 from .scene_graph import (
     Content,
     MeshFileError,
+    ModelOptions,
     ObjectClass,
     Raster,
     RasterOptions,
@@ -106,6 +107,9 @@ def load_objects(
     assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
     geometry: Geometry | None = None,
+    keyframe: str | None = None,
+    groups: Sequence[int] | None = None,
+    exclude: Sequence[str] = (),
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
@@ -137,6 +141,8 @@ def load_objects(
         leaves all meshes static.
     geometry
         Of a world of Gazebo: its "visual" shapes, which is None as well, or those for "collision".
+    keyframe, groups, exclude
+        Of a model of MuJoCo, see `Scene.load`.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -165,6 +171,7 @@ def load_objects(
             f"{path} has no curves that are read: leave out sag_m, or give a file of roads "
             f"({' '.join(endings(lambda row: row.roads))})."
         )
+    model = _model_options(path, row, keyframe, groups, exclude)
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
@@ -177,6 +184,7 @@ def load_objects(
         raster=raster,
         collisions=geometry == "collision",
         sag_m=sag_m,
+        model=model,
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
@@ -263,6 +271,24 @@ def _check_geometry(path: Path, row: MeshFormat, geometry: Geometry | None) -> N
             f"{path} has no shapes for collisions: leave out geometry, or give a "
             f"{' or '.join(endings(lambda row: row.collisions))}."
         )
+
+
+def _model_options(
+    path: Path,
+    row: MeshFormat,
+    keyframe: str | None,
+    groups: Sequence[int] | None,
+    exclude: Sequence[str],
+) -> ModelOptions:
+    """Return the options of a model of MuJoCo; LidarError if a file of another format has any."""
+    seen_groups = ModelOptions().groups if groups is None else tuple(groups)
+    options = ModelOptions(keyframe, seen_groups, tuple(exclude))
+    if options != ModelOptions() and not row.models:
+        raise LidarError(
+            f"{path} is no model of MuJoCo: leave out keyframe, groups and exclude, or give a "
+            f"{' or '.join(endings(lambda row: row.models))}."
+        )
+    return options
 
 
 def load_meshes(

@@ -65,6 +65,14 @@ class RasterOptions(NamedTuple):
     epsg: int | None = None  # coordinate system of the mesh; None chooses by the file
 
 
+class ModelOptions(NamedTuple):
+    """Options for reading a model of MuJoCo."""
+
+    keyframe: str | None = None  # name or number of the state; None for the reference pose
+    groups: Sequence[int] = (0, 1, 2)  # groups of the geoms that are read
+    exclude: Sequence[str] = ()  # names of bodies and geoms that are left out
+
+
 class ReadOptions(NamedTuple):
     """Content to read from a mesh file, besides triangles."""
 
@@ -76,6 +84,7 @@ class ReadOptions(NamedTuple):
     materials: bool = False  # names of the materials of faces
     raster: RasterOptions = RasterOptions()
     collisions: bool = False  # shapes for collisions in place of visible ones, of worlds
+    model: ModelOptions = ModelOptions()
     skins_at_rest: bool = False  # meshes that a skeleton moves, which else are refused
     sag_m: float | None = None  # tolerance of triangles along curves; None for the reader's
 

@@ -1,4 +1,4 @@
-"""A process that has imported usd-core, and forks itself for each file: a quarter of the time."""
+"""A process that has imported a library, and forks itself for each file: a quarter of the time."""
 
 import json
 import os
@@ -12,13 +12,19 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
+USD_CORE = """
+from pxr import Usd, UsdGeom, UsdUtils
+UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
+UsdUtils.CoalescingDiagnosticDelegate()
+"""
 
-class UsdServer:
-    """Takes the place of `subprocess.Popen` for `lidarscenes.files.usd`."""
 
-    def __init__(self) -> None:
+class ForkServer:
+    """Takes the place of `subprocess.Popen` for `lidarscenes.files.child_process`."""
+
+    def __init__(self, preload: str) -> None:
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self._process = subprocess.Popen([sys.executable, "-P", __file__], **pipes)
+        self._process = subprocess.Popen([sys.executable, "-P", __file__, preload], **pipes)
 
     def close(self) -> None:
         self._process.communicate()
@@ -31,15 +37,15 @@ class UsdServer:
             print(json.dumps(asked), file=self._process.stdin, flush=True)
             with open(pipe, "rb") as read:  # noqa: PTH123
                 wait = cache(lambda: int(self._process.stdout.readline()))
-                yield SimpleNamespace(stdout=read, wait=wait, kill=read.close)
-            wait()
+                try:
+                    yield SimpleNamespace(stdout=read, wait=wait, kill=read.close)
+                finally:
+                    read.close()
+                    wait()
 
 
 def serve() -> None:
-    from pxr import Usd, UsdGeom, UsdUtils
-
-    UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
-    UsdUtils.CoalescingDiagnosticDelegate()
+    exec(sys.argv[1], {})
     compiled = cache(lambda path: compile(Path(path).read_text(), path, "exec"))
     for line in sys.stdin:
         args, cwd, env, pipe = json.loads(line)

@@ -1,6 +1,6 @@
-"""XML of SDFormat, as leniently as Gazebo reads it.
+"""XML of SDFormat and MJCF, as leniently as Gazebo and MuJoCo read it.
 
-Public worlds have comments with «--» and prefixes without a namespace, which end expat, and with
+Public files have comments with «--» and prefixes without a namespace, which end expat, and with
 expat ElementTree. Entities are refused, except those of XML itself and of characters.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from xml.etree.ElementTree import Element
 
-MAX_ELEMENTS = 1_000_000  # of a file; public worlds have up to 60,000
+MAX_ELEMENTS = 1_000_000  # of a file; public worlds of Gazebo have up to 60,000
 _MAX_DEPTH = 200
 
 _TAG = re.compile(
@@ -23,7 +23,7 @@ _SKIPPED = {"<!--": "-->", "<?": "?>"}  # {start of a part without elements: end
 _CDATA = ("<![CDATA[", "]]>")
 
 
-def sdf_root(data: bytes) -> Element:
+def lenient_root(data: bytes) -> Element:
     """Return the root element of a file; prefixes stay in tags, and comments are left out.
 
     Raises

@@ -1,0 +1,57 @@
+"""A lidar in PyBullet: boxes fall while its beams leave, and it scans them as they fall."""
+
+import numpy as np
+
+try:
+    import pybullet as bullet
+except ImportError as error:
+    raise SystemExit("This example needs PyBullet: pip install pybullet") from error
+
+from lidarpool import Follower, Noise, load_sensor, save_cloud
+from lidarsim.scene.actors import box
+
+STEP_S = 1 / 240  # of PyBullet, by default
+DURATION_S = 0.55
+SIZE_M = 0.6
+
+
+def matrix(position, quaternion):
+    """Return the matrix (4, 4) of a pose of PyBullet, from the body's frame to the world."""
+    result = np.eye(4)
+    result[:3, :3] = np.reshape(bullet.getMatrixFromQuaternion(quaternion), (3, 3))
+    result[:3, 3] = position
+    return result
+
+
+def main() -> None:
+    """Simulate half a second; save the last sweep as boxes.ply."""
+    bullet.connect(bullet.DIRECT)
+    bullet.setGravity(0, 0, -9.81)
+    bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
+    shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[SIZE_M / 2] * 3)
+    positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
+    boxes = [bullet.createMultiBody(5, shape, basePosition=p) for p in positions.tolist()]
+    # Frames of PyBullet's boxes are at their centres, of `box` in the middle below.
+    mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
+    follower = Follower(
+        [mesh] * len(boxes),
+        load_sensor("velodyne/vlp16"),
+        static=[box("Ground", (200, 200, 0.1)).moved("Ground", np.eye(3), np.array([0, 0, -0.1]))],
+        columns=["range", "time", "intensity"],
+        noise=Noise(range_m=0.01),
+    )
+    lidar = matrix((0, 0, 1), (0, 0, 0, 1))
+    cloud = None
+    for number in range(round(DURATION_S / STEP_S)):
+        bullet.stepSimulation()
+        poses = [matrix(*bullet.getBasePositionAndOrientation(body)) for body in boxes]
+        for cloud in follower.step(number * STEP_S, lidar, poses):
+            on_boxes = cloud.object > 0
+            print(f"{number * STEP_S:.3f} s: {len(cloud):,} points, {on_boxes.sum():,} on boxes")
+    if cloud is not None:
+        save_cloud(cloud, "boxes.ply")
+    bullet.disconnect()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,252 @@
+"""Models of MuJoCo as scenarios: their rangefinders are sensors, on one carrier that stands.
+
+The rangefinders of all sites of a body are the beams of one sensor, and those of a camera the beams
+of another. After https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.elementary import arctan2, cos, sin
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.input_files import read_input
+from lidarsim.base.vectors import length, turned
+from lidarsim.base.words import printable
+from lidarsim.mujoco.model_bodies import Choice, names_of, seen_geoms
+from lidarsim.scene.files.scene_graph import MeshFileError, ModelOptions, ReadOptions
+from lidarsim.scene.object_names import unique_names
+from lidarsim.scene.transform import affine
+
+from ..writers.lidar_scenario import Lidar, clean, write_scenario
+from .model_file import body_matrix, load_model
+
+_RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
+_SITE = 6  # mjOBJ_SITE, of sensor_objtype
+_ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC, of cam_projection
+_MAX_RAYS = 65_536  # of a camera
+_MAX_RATE_HZ = 1e6
+
+
+class _Group(NamedTuple):
+    """Rangefinders that are the beams of a sensor."""
+
+    body: int  # that carries them
+    camera: int | None  # of the beams; None for beams of sites
+    cutoff_m: float  # 0 for none
+    noise_m: float  # standard deviation
+    rate_hz: float
+
+
+def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
+    """Write a model as a scenario into a folder: `scenario.yaml`, and a data file of each sensor.
+
+    Parameters
+    ----------
+    path
+        An .xml of MuJoCo with rangefinders.
+    folder
+        The folder, which exists.
+    assets
+        A folder besides the model's, from which files are read.
+
+    Returns
+    -------
+    What is not as in MuJoCo, a line each.
+
+    Raises
+    ------
+    LidarError
+        If the model cannot be read, or has no rangefinder.
+    """
+    if len(assets) > 1:
+        raise LidarError("it is of MuJoCo: give one folder, --assets DIR.")
+    model = _loaded(path, assets)
+    groups = _groups(model)
+    left_out = _differences(model, groups)
+    groups = {group: sites for group, sites in groups.items() if not _unusable(model, group.camera)}
+    if not groups:
+        reason = "".join(f" {line}." for line in left_out)
+        raise LidarError(
+            f"it has no rangefinder that becomes a sensor: lidarpool init --mesh {path.name} makes "
+            f"a scenario for a sensor of yours.{reason}"
+        )
+    names = unique_names([_name(model, group) for group in groups])
+    lidars = [
+        _lidar(model, name, group, sites)
+        for name, (group, sites) in zip(names, groups.items(), strict=True)
+    ]
+    carriers = [body for body in dict.fromkeys(group.body for group in groups) if body]
+    bodies = names_of(model, "body")
+    entry: dict[str, Any] = {"file": path, **({"assets": assets[0]} if assets else {})}
+    if carriers:
+        entry["exclude"] = [bodies[body] for body in carriers]
+    return write_scenario(folder, "MuJoCo", entry, lidars, {}, left_out)
+
+
+def _loaded(path: Path, assets: Sequence[Path]) -> Any:
+    """Return the arrays of a model; LidarError if the file cannot be read."""
+    with explained("it cannot be read"):
+        data = read_input(path)
+    folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
+    options = ReadOptions(masks=False, colours=False, folders=folders)
+    try:
+        return load_model(data, path, options)
+    except MeshFileError as error:
+        raise LidarError(f"it {error}.") from error
+    except ValueError as error:
+        raise LidarError(f"it is broken or cut short ({error}): export it again.") from error
+
+
+def _groups(model: Any) -> dict[_Group, list[int]]:
+    """Return the rangefinders as groups, each with the numbers of its sites."""
+    groups: dict[_Group, list[int]] = {}
+    for sensor in np.flatnonzero(model.sensor_type == _RANGEFINDER).tolist():
+        number = int(model.sensor_objid[sensor])
+        of_site = int(model.sensor_objtype[sensor]) == _SITE
+        body = int((model.site_bodyid if of_site else model.cam_bodyid)[number])
+        group = _Group(
+            body,
+            None if of_site else number,
+            float(model.sensor_cutoff[sensor]),
+            float(model.sensor_noise[sensor]),
+            _rate_hz(model, sensor),
+        )
+        groups.setdefault(group, []).extend([number] * of_site)
+    return groups
+
+
+def _rate_hz(model: Any, sensor: int) -> float:
+    """Return how often a sensor measures: at its interval, else at each step of the model."""
+    intervals = getattr(model, "sensor_interval", None)  # since MuJoCo 4
+    interval_s = 0.0 if intervals is None else float(np.atleast_1d(intervals[sensor])[0])
+    interval_s = interval_s if interval_s > 0 else model.timestep_s
+    return min(1 / interval_s, _MAX_RATE_HZ) if interval_s > 0 else _MAX_RATE_HZ
+
+
+def _name(model: Any, group: _Group) -> str:
+    """Return the name of a sensor: that of its camera, else of its body."""
+    if group.camera is not None:
+        return printable(names_of(model, "cam")[group.camera])
+    return printable(names_of(model, "body")[group.body])
+
+
+def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
+    """Return the sensor of a group of rangefinders."""
+    matrix, origins, directions = _beams(model, group, sites)
+    x, y, z = directions.T
+    elevations_deg = np.array(_degrees(arctan2(z, length(directions[:, :2]))))
+    order = np.argsort(elevations_deg, kind="stable")  # of channels, of any sensor
+    origins = origins[order]
+    beams: dict[str, Any] = {
+        "elevation_deg": elevations_deg[order].tolist(),
+        "azimuth_deg": _degrees(arctan2(y, x)[order]),
+    }
+    site_names = names_of(model, "site")
+    channels = ", ".join(printable(site_names[sites[row]]) for row in order) if sites else ""
+    if origins.any():
+        beams["origin_m"] = [[clean(value) for value in origin] for origin in origins.tolist()]
+    data: dict[str, Any] = {
+        "name": f"{name} of MuJoCo",
+        "sources": {"channels": f"rangefinders of {channels or 'the pixels, lowest first'}"},
+        "rate_hz": clean(group.rate_hz),
+        "firings_per_turn": 1,
+        "beams": beams,
+    }
+    if group.noise_m > 0:
+        data["performance"] = {"range_m": clean(group.noise_m)}
+    root = int(model.body_rootid[group.body])
+    return Lidar(
+        name,
+        name,
+        names_of(model, "body")[root],
+        data,
+        (0.0, group.cutoff_m or math.inf),
+        matrix,
+        body_matrix(model, root),
+    )
+
+
+def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats, Floats]:
+    """Return the frame of a sensor in the world (4, 4), and origins and directions in it (k, 3).
+
+    The frame of sites has the axes of the body, with their mean position as its origin. The frame
+    of a camera looks along x, with z up in the image.
+    """
+    if group.camera is not None:
+        axes = model.cam_xmat[group.camera].reshape(3, 3)
+        axes = np.stack([-axes[:, 2], -axes[:, 0], axes[:, 1]], axis=1)
+        directions = _pixel_directions(model, group.camera)
+        matrix = affine(axes, model.cam_xpos[group.camera])
+        return matrix, np.zeros_like(directions), directions
+    axes = model.xmat[group.body].reshape(3, 3)
+    positions = model.site_xpos[sites]
+    centre = positions.mean(axis=0)
+    directions = model.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
+    return (
+        affine(axes, centre),
+        turned(positions - centre, axes.T),
+        turned(directions, axes.T),
+    )
+
+
+def _pixel_directions(model: Any, camera: int) -> Floats:
+    """Return the directions of the rays of a camera, row by row (pixels, 3): x ahead, z up."""
+    width, height = model.cam_resolution[camera].tolist()
+    sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
+    row, column = np.divmod(np.arange(width * height), width)
+    if sensor_m[1] > 0:
+        # The rays of MuJoCo 4.0 take the principal point from the upper left corner.
+        focal_x, focal_y, principal_x, principal_y = model.cam_intrinsic[camera].tolist()
+        right = ((column + 0.5) / width * sensor_m[0] - principal_x) / focal_x
+        down = ((row + 0.5) / height * sensor_m[1] - principal_y) / focal_y
+    else:
+        half_angle = np.radians(float(model.cam_fovy[camera]) / 2)
+        focal = height / 2 * float(cos(half_angle) / sin(half_angle))  # pixels
+        right = (column + 0.5 - width / 2) / focal
+        down = (row + 0.5 - height / 2) / focal
+    directions = np.stack([np.ones(len(row)), -right, -down], axis=1)
+    return np.asarray(directions / length(directions)[:, None])
+
+
+def _degrees(angles: Floats) -> list[float]:
+    """Return angles as numbers for a file, degrees."""
+    return [clean(angle) for angle in np.degrees(angles).tolist()]
+
+
+def _unusable(model: Any, camera: int | None) -> str:
+    """Return why the rays of a camera do not become a sensor, or empty."""
+    if camera is None:
+        return ""
+    projections = getattr(model, "cam_projection", None)
+    if projections is not None and int(projections[camera]) == _ORTHOGRAPHIC:
+        return "its rays are parallel"
+    rays = math.prod(model.cam_resolution[camera].tolist())
+    return f"it has {rays:,} rays, of at most {_MAX_RAYS:,}" if rays > _MAX_RAYS else ""
+
+
+def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
+    """Return what is not as in MuJoCo, a clause each."""
+    lines = [
+        f"the rangefinder of {_name(model, group)!r}: {reason}"
+        for group in groups
+        if (reason := _unusable(model, group.camera))
+    ]
+    all_groups = np.unique(model.geom_group)
+    further = sorted({*all_groups.tolist()} - {*ModelOptions().groups})
+    if further and seen_geoms(model, Choice(further, (), (), "body")):
+        numbers = ", ".join(map(str, further))
+        lines.append(
+            f"rangefinders also meet geoms of {'groups' if len(further) > 1 else 'group'} "
+            f"{numbers}: groups of scene.files"
+        )
+    carriers = {group.body for group in groups} - {0}
+    if len(carriers) > 1:
+        lines.append("no sensor sees any body that carries a sensor: exclude of scene.files")
+    return lines

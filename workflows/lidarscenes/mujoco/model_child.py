@@ -1,0 +1,113 @@
+"""Reads a model of MuJoCo in a process that `model_file.py` starts: a script, not a module.
+
+Broken files can end the process, and some models take any memory; here both end this process only.
+The script imports nothing of lidarpool. Standard output gets one frame: a line of JSON, and the
+bytes of the arrays of the model at its initial state, named by `names` of the line.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_WAIT_S = 120  # broken files may take for ever
+
+# Memory for simulating, of which the rays of a camera take 24 bytes each.
+_ARENA_BYTES = 128 * 2**20
+
+# Prefixes of the names of arrays, and the names after the prefix.
+_OF_MODEL = {
+    "name": ("s", "_bodyadr", "_geomadr", "_matadr", "_siteadr", "_camadr"),
+    "body": ("_parentid", "_rootid", "_weldid", "_mocapid", "_pos", "_quat"),
+    "geom": ("_type", "_bodyid", "_dataid", "_matid", "_group", "_size", "_pos", "_quat", "_rgba"),
+    "mesh": ("_vert", "_vertadr", "_vertnum", "_face", "_faceadr", "_facenum"),
+    "hfield": ("_size", "_nrow", "_ncol", "_adr", "_data"),
+    "mat": ("_rgba", "_texid"),
+    "tex": ("_height", "_width", "_nchannel", "_adr", "_data"),
+    "site": ("_bodyid",),
+    "cam": ("_bodyid", "_fovy", "_resolution", "_sensorsize", "_intrinsic", "_projection"),
+    "sensor": ("_type", "_objtype", "_objid", "_cutoff", "_noise", "_interval"),
+}
+_OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
+
+
+class NoKeyframeError(Exception):
+    """The model lacks a keyframe; the argument has the names of its keyframes."""
+
+
+def main(path: str, request: dict[str, Any]) -> None:
+    """Read a file, and write a frame to standard output."""
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)  # else into a file of the working directory
+    frame: dict[str, Any]
+    arrays: list[NDArray[Any]] = []
+    try:
+        model, data = _state(path, request["keyframe"])
+        names = [prefix + name for prefix, rest in _OF_MODEL.items() for name in rest]
+        # Older versions lack some.
+        fields = {name: getattr(model, name) for name in names if hasattr(model, name)}
+        if not request["colours"]:
+            fields["tex_data"] = fields["tex_data"][:0]
+        fields["names"] = np.frombuffer(model.names, np.uint8)
+        fields |= {name: getattr(data, name) for name in _OF_DATA}
+        frame = {
+            "what": "model",
+            "names": [*fields],
+            "warnings": warnings[:8],
+            "extent_m": float(model.stat.extent),
+            "timestep_s": float(model.opt.timestep),
+            "nflex": int(model.nflex),
+            "nskin": int(model.nskin),
+        }
+        arrays = [np.ascontiguousarray(array) for array in fields.values()]
+    except NoKeyframeError as error:
+        frame = {"what": "keyframes", "names": error.args[0][:1000]}
+    except Exception as error:  # of any type, as readers of broken files are
+        reason = " ".join(str(error).split())
+        frame = {"what": "error", "reason": reason.replace(os.path.dirname(path) + "/", "")}  # noqa: PTH120
+    signal.alarm(0)  # who reads this may take long
+    frame["arrays"] = [(array.dtype.str, array.shape) for array in arrays]
+    output.write(json.dumps(frame).encode() + b"\n")
+    for array in arrays:
+        output.write(array.data)
+    output.flush()
+
+
+def _state(path: str, keyframe: str | None) -> tuple[Any, Any]:
+    """Return the model of a file, and its data at the reference pose or at a keyframe."""
+    spec = mujoco.MjSpec.from_file(path)
+    spec.memory = _ARENA_BYTES
+    spec.nstack = -1  # of old files, and in conflict with the memory
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    if keyframe is not None:
+        names = [model.key(number).name or str(number) for number in range(model.nkey)]
+        if keyframe not in names:
+            raise NoKeyframeError(names)
+        mujoco.mj_resetDataKeyframe(model, data, names.index(keyframe))
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    return model, data
+
+
+if __name__ == "__main__":
+    file = sys.argv[1]
+    message = json.loads(sys.argv[2])
+    signal.alarm(MAX_WAIT_S)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
+    max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
+    resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
+    main(file, message)
+    os._exit(0)

@@ -1,0 +1,212 @@
+"""Models of MuJoCo, .xml of MJCF, as scenes: the geoms that a lidar sees, at the initial state.
+
+MuJoCo itself (Apache-2.0) reads the files, in a process of its own: `model_child.py`. Geoms become
+meshes as for `lidarsim.mujoco.MujocoScanner`.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import did_you_mean, listed
+from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
+from lidarsim.mujoco.model_bodies import (
+    Choice,
+    bodies_of,
+    excluded,
+    names_of,
+    seen_geoms,
+    soft_bodies,
+)
+from lidarsim.scene.files.scene_graph import (
+    MAX_NODES,
+    Content,
+    MeshFileError,
+    ModelOptions,
+    PlacedNode,
+    ReadOptions,
+    placed_content,
+)
+from lidarsim.scene.masks import MaskNotes
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.scene.transform import affine
+
+from ..files.child_process import Child
+from .model_sources import check_sources
+
+MUJOCO_BYTES = 512 * 2**20  # bytes that MuJoCo takes for any file
+_ADVICE = "simplify its meshes, or give it in parts"
+# Half of the side of planes without a size: at least metres, and as a multiple of the model's size.
+_MIN_PLANE_M = 200.0
+_PLANE_SIZES = 5.0
+_MAX_ROUND_TRIANGLES = 4_000_000  # of balls, ellipsoids, capsules and cylinders in all
+_MAX_SAG_M = 1.0
+
+
+def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the geoms of a model at its initial state, as objects of its bodies.
+
+    Geoms of the world itself are objects of their own if they have names.
+    """
+    model = load_model(data, path, options)
+    content = placed_content(_placed(model, options))
+    content.unit_m = 1.0
+    content.up_axis = "z"
+    content.notes = _notes(model, options)
+    if not content.meshes and not content.skipped:
+        groups = tuple(options.model.groups)
+        raise MeshFileError(f"has nothing that a lidar sees in the groups {groups}: give groups")
+    return content
+
+
+def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace:
+    """Return the arrays of a model and of its initial state, by the names of MuJoCo.
+
+    Raises
+    ------
+    ValueError
+        If MuJoCo refuses the model.
+    LidarError, MeshFileError
+        If MuJoCo is not installed, the file is no model, or takes too much memory.
+    """
+    allowance = Allowance(0, _ADVICE)
+    check_sources(data, path, options, allowance)
+    if find_spec("mujoco") is None:
+        raise MeshFileError("is a model of MuJoCo, which MuJoCo reads: pip install mujoco")
+    if sys.platform == "win32":  # where a process has no limits of memory
+        raise MeshFileError("is a model of MuJoCo, which is not read on Windows")
+    request = {"keyframe": options.model.keyframe, "colours": options.colours}
+    with TemporaryDirectory() as folder:
+        child = Child(
+            Path(__file__).with_name("model_child.py"),
+            "MuJoCo",
+            allowance.limit + MUJOCO_BYTES,
+            Path(folder),  # MuJoCo writes a log into it
+            hidden=("MUJOCO_",),
+        )
+        frames = child.frames(path, request, lambda _, size: allowance.take(size))
+        with closing(frames):
+            frame, arrays = next(frames)
+    if frame["what"] == "keyframes":
+        keyframe = str(options.model.keyframe)
+        hint = did_you_mean(keyframe, frame["names"]) or f" There are: {listed(frame['names'], 8)}."
+        raise LidarError(f"the model has no keyframe {keyframe!r}.{hint if frame['names'] else ''}")
+    fields = dict(zip(frame.pop("names"), arrays, strict=True))
+    if not options.colours:  # without the pixels of textures
+        fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)
+    return SimpleNamespace(**frame, **fields)
+
+
+def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
+    """Return the meshes of the bodies of a model, at the poses of its initial state."""
+    bodies, geoms = excluded(model, options.model.exclude)
+    choice = _choice(model, options.model, bodies, geoms)
+    named = _named_geoms_of_world(model)
+    others = np.arange(1, len(model.body_parentid)).tolist()
+    unnamed = sorted({*range(len(model.geom_type))} - {*named})
+    world = choice._replace(
+        objects="geom",
+        excluded_bodies=[*bodies, *others],
+        excluded_geoms=[*geoms, *unnamed],
+    )
+    inner = choice._replace(excluded_geoms=[*geoms, *named])
+    meshes: dict[int, SceneMesh] = {}  # {id of the triangles: mesh}
+    nodes = []
+    for part in (world, inner):
+        parts = bodies_of(model, part)
+        nodes += [
+            PlacedNode(_stripped(mesh, options), np.eye(4), mesh.name) for mesh in parts.static
+        ]
+        for body, mesh in parts.moving:
+            shared = meshes.setdefault(id(mesh.faces), _stripped(mesh, options))
+            nodes.append(PlacedNode(shared, body_matrix(model, body), mesh.name))
+    return nodes
+
+
+def _choice(model: Any, options: ModelOptions, bodies: list[int], geoms: list[int]) -> Choice:
+    """Return what is seen of a model; MeshFileError for too many geoms."""
+    plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
+    choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)
+    seen = np.array(seen_geoms(model, choice), np.int64)
+    if len(seen) > MAX_NODES:
+        raise MeshFileError(f"has {len(seen):,} geoms, of at most {MAX_NODES:,}: give it in parts")
+    return choice._replace(sag_m=_sag_m(model, seen))
+
+
+def _sag_m(model: Any, geoms: Ints) -> float:
+    """Return the sag of round geoms, larger for many of them, metres."""
+    kinds = np.column_stack([model.geom_type[geoms], model.geom_size[geoms]])
+    shapes, counts = np.unique(kinds, axis=0, return_counts=True)
+    sag_m = SAG_M
+    while sag_m < _MAX_SAG_M:
+        triangles = (
+            int(count) * _round_triangles(int(shape[0]), shape[1:], sag_m)
+            for shape, count in zip(shapes, counts, strict=True)
+        )
+        if sum(triangles) <= _MAX_ROUND_TRIANGLES:
+            break
+        sag_m *= 2
+    return sag_m
+
+
+def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
+    """Return the number of triangles of a round geom; 0 of other geoms."""
+    match kind:
+        case GeomType.SPHERE | GeomType.CAPSULE | GeomType.ELLIPSOID:
+            radius = float(size.max() if kind == GeomType.ELLIPSOID else size[0])
+            return segments(radius, sag_m) ** 2
+        case GeomType.CYLINDER:
+            return 4 * segments(float(size[0]), sag_m)
+    return 0
+
+
+def _named_geoms_of_world(model: Any) -> list[int]:
+    """Return the numbers of the geoms of the world itself that have a name."""
+    names = names_of(model, "geom")
+    return [
+        geom
+        for geom in np.flatnonzero(np.asarray(model.geom_bodyid) == 0).tolist()
+        if names[geom] != f"geom {geom}"
+    ]
+
+
+def body_matrix(model: Any, body: int) -> Floats:
+    """Return the matrix from the frame of a body to the world, (4, 4)."""
+    return affine(model.xmat[body].reshape(3, 3), model.xpos[body])
+
+
+def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
+    """Return a mesh with the colours and materials that are asked for."""
+    return replace(
+        mesh,
+        colours=mesh.colours if options.colours else None,
+        materials=mesh.materials if options.materials else None,
+    )
+
+
+def _notes(model: Any, options: ReadOptions) -> list[str]:
+    """Return notes on what is not in the scene, as clauses that follow the file's name."""
+    notes = [f"has {soft}, which are left out"] if (soft := soft_bodies(model)) else []
+    if model.warnings:
+        notes.append(f"makes MuJoCo warn: {listed([text.strip() for text in model.warnings], 3)}")
+    if not options.masks:
+        return notes
+    transparent = MaskNotes()
+    opacity = np.asarray(model.mat_rgba).reshape(-1, 4)[:, 3]
+    names = names_of(model, "mat")
+    for material in np.unique(model.geom_matid).tolist():
+        if material >= 0 and 0 < opacity[material] < 1:
+            transparent.glass[names[material]] = None
+    return notes + transparent.lines()

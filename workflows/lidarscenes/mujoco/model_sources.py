@@ -1,0 +1,119 @@
+"""Files of a model of MuJoCo: the files that the model includes, and those of meshes and textures.
+
+MuJoCo opens these files itself. The files are looked up here first, so that a model takes data from
+its own folder and from named folders only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.input_files import check_input, read_input
+from lidarsim.scene.files.companions import outside
+from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
+
+from ..files.lenient_xml import lenient_root
+
+ROOT = "mujoco"
+_INCLUDED_ROOTS = (ROOT, "mujocoinclude")
+_OF_XML = ("include", "model")  # elements that name further files of MJCF
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+_MAX_FILES = 20_000
+_OTHER_ROOTS = {  # {root element of other XML files: advice}
+    "robot": "is a robot in URDF: give it the ending .urdf",
+    "sdf": "is a world of Gazebo: give it the ending .sdf",
+    "document": "is no model of MuJoCo, and perhaps a survey of HELIOS++: lidarpool import reads "
+    "these",
+    "fcd-export": "is no model of MuJoCo but floating car data of SUMO: name it in traffic.file of "
+    "a scenario",
+}
+
+
+def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allowance) -> None:
+    """Check that a file is a model of MuJoCo, and that its files may be read.
+
+    The sizes of all files are added to the allowance. Missing files are left to MuJoCo.
+
+    Raises
+    ------
+    ValueError
+        If a file is not XML.
+    MeshFileError
+        If a file is no model of MuJoCo, or a file is in a folder that is not allowed.
+    """
+    root = lenient_root(data)
+    if root.tag != ROOT:
+        advice = "is XML, but no model of MuJoCo: it begins with <{}>"
+        raise MeshFileError(_OTHER_ROOTS.get(root.tag, advice.format(root.tag[:40])))
+    home = path.resolve().parent
+    roots = {path.resolve(): root}  # {file: its root element}
+    pending = [path.resolve()]
+    while pending:
+        file = pending.pop()
+        for name in _names_of(roots[file], _OF_XML):
+            for included in _targets(name, {home, file.parent}, options):
+                if included not in roots:
+                    _count(len(roots))
+                    roots[included] = _included_root(included)
+                    pending.append(included)
+    folders = {home, *(file.parent for file in roots)}
+    for root in roots.values():
+        for compiler in root.iter("compiler"):
+            inner = filter(None, map(compiler.get, _FOLDERS))
+            folders |= {folder / name for name in inner for folder in folders}
+            _count(len(folders))
+    names = {name for root in roots.values() for name in _names_of(root)}
+    _count(len(names) * len(folders))
+    targets = {target for name in names for target in _targets(name, folders, options)}
+    for target in {path.resolve(), *roots, *targets}:
+        check_input(target)
+        allowance.add_file(target)
+
+
+def _count(count: int) -> None:
+    """Raise MeshFileError if a model names too many files."""
+    if count > _MAX_FILES:
+        raise MeshFileError(f"names more than {_MAX_FILES:,} files: give it in parts")
+
+
+def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield the names of the files that elements name; of elements with `tags`, if given."""
+    for element in root.iter():
+        if not tags or element.tag in tags:
+            for attribute, name in element.items():
+                if attribute.startswith("file") and name.strip():
+                    yield name.strip()
+
+
+def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Path]:
+    """Yield the existing files that a name may mean in some folders.
+
+    MeshFileError for a file in a folder that is not allowed.
+    """
+    names = {name, name.replace("\\", "/"), name.replace("\\", "/").rpartition("/")[2]}
+    for folder in folders:
+        for candidate in names:
+            target = folder / candidate
+            try:
+                is_file = target.exists() and not target.is_dir()
+                resolved = target.resolve()
+            except (OSError, ValueError, RuntimeError):
+                continue  # no file can have this name
+            if is_file:
+                if not options.allows(resolved):
+                    raise MeshFileError(outside(name))
+                yield resolved
+
+
+def _included_root(file: Path) -> Element:
+    """Return the root element of an included file; ValueError if it is not XML."""
+    try:
+        root = lenient_root(read_input(file))
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from error
+    if root.tag not in _INCLUDED_ROOTS:
+        raise ValueError(f"{file.name} begins with <{root.tag[:40]}>, which is not MuJoCo's")
+    return root

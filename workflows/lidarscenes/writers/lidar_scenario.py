@@ -1,0 +1,183 @@
+"""Lidars of other programs' worlds as scenarios: a sensor for each, on one carrier that stands."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.vectors import matmul
+from lidarsim.scene.transform import inverted
+from lidarsim.sensor import Pose
+from lidarsim.sensor.survey import MAX_SENSORS
+
+SCENARIO_FILE = "scenario.yaml"
+_ZERO = 1e-9  # numbers below are roundings
+
+
+class Lidar(NamedTuple):
+    """A lidar of a world.
+
+    Attributes
+    ----------
+    name
+        Its name, which no other lidar of the world has.
+    sensor
+        Its short name.
+    model
+        Name of the model that carries the lidar.
+    data
+        Content of a data file of the sensor.
+    range_m
+        Shortest and longest range, metres; the longest may be infinite.
+    matrix, model_matrix
+        From the frames of the lidar and of the model to the world, (4, 4).
+    left_out
+        What is not as in the other program, a clause each.
+    """
+
+    name: str
+    sensor: str
+    model: str
+    data: dict[str, Any]
+    range_m: tuple[float, float]
+    matrix: Floats
+    model_matrix: Floats
+    left_out: tuple[str, ...] = ()
+
+
+def write_scenario(
+    folder: Path,
+    program: str,
+    entry: Mapping[str, Any],
+    lidars: Sequence[Lidar],
+    sections: Mapping[str, Any],
+    left_out: Sequence[str] = (),
+) -> list[str]:
+    """Write a scenario of lidars into a folder, with a data file of each lidar.
+
+    Parameters
+    ----------
+    folder
+        The folder, which exists.
+    program
+        Name of the other program.
+    entry
+        The entry of `scene.files`, with the path of the world as `file`, perhaps one as `assets`.
+    lidars
+        At least one.
+    sections
+        Further sections of the scenario.
+    left_out
+        What is not as in the other program, besides what the lidars state.
+
+    Returns
+    -------
+    What is not as in the other program, a line each.
+
+    Raises
+    ------
+    LidarError
+        If there are too many lidars.
+    """
+    if len(lidars) > MAX_SENSORS:
+        raise LidarError(f"it has {len(lidars)} lidars; at most {MAX_SENSORS} are allowed.")
+    lines = [*left_out, *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.left_out)]
+    files = _Files()
+    data = {
+        "scene": {"files": [_relative(entry, folder)]},
+        **_carrier(lidars, files),
+        **sections,
+        "cloud": {"columns": ["time", "range", "intensity", "object"]},
+    }
+    head = [f"From {Path(entry['file']).name} of {program} by lidarpool import."]
+    head += [f"Not as in {program}: {line}." for line in lines]
+    text = "".join(f"# {line}\n" for line in head) + _dumped(data)
+    for name, content in {**files.texts(), SCENARIO_FILE: text}.items():
+        (folder / name).write_text(content, encoding="utf-8", newline="\n")
+    return lines
+
+
+def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
+    """Return an entry of `scene.files` with paths from a folder; the file's name if it is all."""
+    paths = {
+        name: Path(os.path.relpath(value.resolve(), folder.resolve())).as_posix()
+        for name, value in entry.items()
+        if isinstance(value, Path)
+    }
+    return paths["file"] if len(entry) == 1 else {**entry, **paths}
+
+
+def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
+    """Return the sections of sensors and poses: of the lidars' model, or of the world's zero."""
+    of_one_model = len({lidar.model for lidar in lidars}) == 1
+    counts = Counter(lidar.sensor for lidar in lidars)
+    sensors = {}
+    for lidar in lidars:
+        mount = lidar.matrix
+        if of_one_model:
+            mount = matmul(inverted(lidar.model_matrix), mount)
+        name = lidar.sensor if counts[lidar.sensor] == 1 else lidar.name
+        min_range_m, max_range_m = lidar.range_m
+        sensors[name] = {
+            "model": files.name_of(lidar),
+            "step_deg": 360,
+            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": clean(max_range_m)} if math.isfinite(max_range_m) else {}),
+            "mount": _pose(mount),
+        }
+    pose = _pose(lidars[0].model_matrix) if of_one_model else {"position": [0.0, 0.0, 0.0]}
+    return {"sensors": sensors, "poses": [pose], "steps": 1}
+
+
+def _pose(matrix: Floats) -> dict[str, Any]:
+    """Return the pose of a matrix (4, 4) as a scenario has it."""
+    pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
+    angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+    return {
+        "position": [clean(value) for value in matrix[:3, 3].tolist()],
+        **{name: angle for name, angle in angles.items() if angle},
+    }
+
+
+class _Files:
+    """Data files of lidars; lidars with the same figures share a file."""
+
+    def __init__(self) -> None:
+        self._data: dict[str, dict[str, Any]] = {}  # {name: content}
+
+    def name_of(self, lidar: Lidar) -> str:
+        """Return the name of the file of a lidar."""
+        for name, data in self._data.items():
+            if {**data, "name": ""} == {**lidar.data, "name": ""}:
+                return name
+        stem = re.sub(r"[^\w.-]+", "_", lidar.sensor).strip("._").lower() or "lidar"
+        name = f"{stem}.yaml"
+        number = 1
+        while name in self._data or name == SCENARIO_FILE:
+            number += 1
+            name = f"{stem}-{number}.yaml"
+        self._data[name] = lidar.data
+        return name
+
+    def texts(self) -> dict[str, str]:
+        """Return the files: {name: text}."""
+        return {name: _dumped(data) for name, data in self._data.items()}
+
+
+def _dumped(data: dict[str, Any]) -> str:
+    """Return data as YAML."""
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def clean(value: float) -> float:
+    """Return a number for a file, rounded to 12 digits; roundings of zero are zero."""
+    return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0
