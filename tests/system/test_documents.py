@@ -35,7 +35,7 @@ from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
-from lidarpool.scenario import point_scene as points
+from lidarpool.scenario import point_files as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
