@@ -247,6 +247,7 @@ EXTRAS = {
     "parquet": r"\bparquet\b",
     "pcd": r"\bpcd\b",
     "e57": r"\be57\b",
+    "osi": r"\bosi\b|\bbetterosi\b",
     "ros": r"\bmcap\b|\brosbag2\b",
     "s3": r"\bs3://",
     "clusters": r"--cluster\b|\bdask_jobqueue\b",

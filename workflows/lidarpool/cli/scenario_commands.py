@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -363,7 +363,7 @@ def points(
     voxel_m: float | None,
     size: float,
     unit: str | None,
-    colour: str | None,
+    colour: Literal["rgb", "intensity"] | None,
     overwrite: bool,
 ) -> None:
     """Make a scene of a point cloud, Z-up: a scan that can be scanned again.

@@ -73,7 +73,7 @@ class TraceContent(NamedTuple):
     """Moving objects of a trace between two times."""
 
     passages: list[ObjectPassage]  # in the order of their starts
-    count: int  # of moving objects until the end
+    object_count: int  # number of moving objects until the end
     notes: list[str]  # on what is left out
 
 
@@ -182,16 +182,24 @@ def _ground_truths(path: Path) -> Iterator[Any]:
     """Yield the ground truth of each message of a trace; LidarError if it has none."""
     osi: Any = import_module("betterosi")
     with reading(str(path)):
-        input_size(path)
+        if not input_size(path):
+            raise LidarError("it is empty.")
         is_mcap = path.suffix.lower() == ".mcap"
         kind = None if is_mcap else _message_type(osi, path)
         messages = osi.read(str(path), return_ground_truth=True, osi_message_type=kind)
-    while True:
+        try:
+            truth = next(messages, None)
+        except ValueError as error:
+            if is_mcap or kind is not None:
+                raise
+            raise LidarError(
+                "its first message is neither GroundTruth nor SensorView, or might be both: name "
+                "the file as in town_gt.osi or town_sv.osi."
+            ) from error
+    while truth is not None:
+        yield truth
         with reading(str(path)):
             truth = next(messages, None)
-        if truth is None:
-            return
-        yield truth
 
 
 def _message_type(osi: Any, path: Path) -> str | None:

@@ -73,8 +73,13 @@ class ScannedPoints:
 
     def take(self, rows: Indices) -> ScannedPoints:
         """Return selected points."""
-        fields = (self.outward, self.classes, self.intensities, self.colours)
-        return ScannedPoints(self.positions[rows], *(f if f is None else f[rows] for f in fields))
+        return ScannedPoints(
+            self.positions[rows],
+            None if self.outward is None else self.outward[rows],
+            None if self.classes is None else self.classes[rows],
+            None if self.intensities is None else self.intensities[rows],
+            None if self.colours is None else self.colours[rows],
+        )
 
 
 @dataclass
