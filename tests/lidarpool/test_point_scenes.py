@@ -281,6 +281,17 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
         scene_of_points(path)
 
 
+def test_the_command_says_what_is_not_kept(tmp_path):
+    columns = [*plane().T, np.ones(len(GRID))]
+    rows = np.rec.fromarrays(
+        columns, np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("intensity", "f4")])
+    )
+    (tmp_path / "a.ply").write_bytes(header_of(".ply", rows) + rows.tobytes())
+    arguments = ["points", str(tmp_path / "a.ply"), str(tmp_path / "b.obj")]
+    outcome = CliRunner().invoke(command, arguments, catch_exceptions=False)
+    assert "note: " in outcome.stderr and "b.obj holds no colours and classes" in outcome.stderr
+
+
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
     monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)

@@ -377,10 +377,15 @@ def points(
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import scene_of_points
 
+    def tell(note: str) -> None:
+        click.echo(f"note: {note}", err=True)
+
     def make() -> Scene:
-        place = scene_of_points(cloud, voxel_m=voxel_m, size=size, unit=unit, colour=colour)
+        place = scene_of_points(
+            cloud, voxel_m=voxel_m, size=size, unit=unit, colour=colour, tell=tell
+        )
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
-            click.echo(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
+            tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
         return place
 
     _write(out, make, overwrite)

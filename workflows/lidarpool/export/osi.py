@@ -54,29 +54,47 @@ _VEHICLES = {
 
 
 def write_osi(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a trace, `.osi` or `.mcap` by the path's suffix: sweeps in the order of their starts.
+    """Write an .osi trace: a message for each sweep, in the order of their starts."""
+    _write(path, ".osi", cloud, sweeps)
 
-    Points are in the sensor frame at the start of the sweep. A `.mcap` has a topic for each sensor,
-    and GroundTruth messages on `GROUND_TRUTH_TOPIC`.
+
+def write_osi_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write the messages of an .osi trace as MCAP.
+
+    Each sensor has a topic; the ground truth is on `GROUND_TRUTH_TOPIC` as well.
     """
+    _write(path, ".mcap", cloud, sweeps)
+
+
+def _write(path: Path, suffix: str, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write a trace of the kind of a suffix, by which the library chooses the kind."""
     osi: Any = import_module("betterosi")  # an extra
-    is_mcap = path.suffix == ".mcap"
     messages = _Messages(osi, sweeps)
     options: dict[str, Any] = {}
-    if is_mcap:
+    if suffix == ".mcap":
         stamp = datetime.fromtimestamp(messages.start_ns / 1e9, UTC)
         options["metadata"] = {"creation_time": stamp.strftime("%Y-%m-%dT%H:%M:%SZ")}
+    suffixed = path.with_name(path.name + suffix)
+    writer = osi.Writer(str(suffixed), **options)
+    try:
+        with writer:
+            _write_messages(writer, messages, cloud, sweeps)
+    finally:
+        writer.file.close()  # the library leaves the file open if its end cannot be written
+    suffixed.replace(path)
+
+
+def _write_messages(writer: Any, messages: _Messages, cloud: CloudLike, sweeps: Sweeps) -> None:
     topics = [f"/{name}/sensor_data" if name else "/sensor_data" for name in _names(sweeps)]
-    with osi.Writer(str(path), **options) as writer:
-        for sweep in np.argsort(sweeps.begins_ns, kind="stable").tolist():
-            (points,) = sweeps.points(cloud, sweep, sweep + 1)
-            boxes = Boxes.from_points(sweeps, sweep, points)
-            truth = messages.ground_truth(sweep, boxes)
-            time_ns = messages.time_ns(sweep)
-            if is_mcap:
-                writer.add(truth, topic=GROUND_TRUTH_TOPIC, log_time=time_ns)
-            data = messages.sensor_data(sweep, points, boxes, truth)
-            writer.add(data, topic=topics[sweeps.sensor[sweep]], log_time=time_ns)
+    for sweep in np.argsort(sweeps.begins_ns, kind="stable").tolist():
+        (points,) = sweeps.points(cloud, sweep, sweep + 1)
+        boxes = Boxes.from_points(sweeps, sweep, points)
+        truth = messages.ground_truth(sweep, boxes)
+        time_ns = messages.time_ns(sweep)
+        if writer.write_mcap:
+            writer.add(truth, topic=GROUND_TRUTH_TOPIC, log_time=time_ns)
+        data = messages.sensor_data(sweep, points, boxes, truth)
+        writer.add(data, topic=topics[sweeps.sensor[sweep]], log_time=time_ns)
 
 
 def _names(sweeps: Sweeps) -> list[str]:

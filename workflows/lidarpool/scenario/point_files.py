@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.allowance import bytes_of, memory
+from lidarsim.base.allowance import Allowance, bytes_of, memory
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError, explained, prefixed
 from lidarsim.base.extras import need
-from lidarsim.base.input_files import check_input, read_input, read_input_text
+from lidarsim.base.input_files import check_input, input_size, read_input, read_input_text
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, printable
 from lidarsim.scene.files.las import las_units, open_las
@@ -30,6 +30,7 @@ from ..base.open3d_module import load_open3d
 
 MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
+_E57_BYTES = 24  # of the coordinates of a point, at least
 # Names of columns in files of various programs; the first name that a file has is read.
 _CLASSES = (
     "class", "classification", "scalar_Classification", "scalar_classification", "label",
@@ -126,7 +127,7 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
-        reason = printable(str(error))[:200] or type(error).__name__
+        reason = printable(str(error).partition("\n")[0])[:200] or type(error).__name__
         raise LidarError(f"{path} is broken or cut short ({reason}).") from error
     _check_points(path, points)
     if names := _left_out(content):
@@ -333,7 +334,9 @@ def _read_e57(path: Path) -> _FileContent:
     file = import_module("pye57").E57(str(path))
     try:
         headers = [file.get_header(number) for number in range(file.scan_count)]
-        _check_count(sum(header.point_count for header in headers))
+        count = sum(header.point_count for header in headers)
+        _check_count(count)
+        Allowance(input_size(path), "thin it first").take(_E57_BYTES * count)
         scans = [_read_scan(file, number, header) for number, header in enumerate(headers)]
     finally:
         file.close()
