@@ -60,7 +60,12 @@ from lidarsim.sweeps.sweeps import Sweeps
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
            "return_number", "returns", "sensor", "ray", "signal")  # fmt: skip
 # pcap needs a maker's packets, and rrd a large package: see test_rrd.py.
-OF_ANY_SENSOR = [name for name in EXPORTS if name not in ("pcap", "rrd")]
+OF_ANY_SENSOR = [
+    name
+    for name in EXPORTS
+    if name not in ("pcap", "rrd")
+    and not (name.startswith("osi") and FORMATS[name].missing_packages)
+]
 DISTRIBUTIONS = {"rerun": "rerun-sdk"}  # of packages with another name
 
 

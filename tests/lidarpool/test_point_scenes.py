@@ -37,6 +37,72 @@ def written(path, points):
     return path
 
 
+def written_with_columns(path, points, classes, intensities, colours):
+    """Write points with classes, intensities and colours, as programs of each format do."""
+    red, green, blue = colours.T.copy()
+    if path.suffix == ".las":
+        laspy = pytest.importorskip("laspy", reason="laspy is an extra")
+        las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
+        las.header.scales = [1e-6] * 3
+        las.x, las.y, las.z = points.T
+        las.classification = classes
+        las.intensity = intensities
+        las.red, las.green, las.blue = 257 * colours.T.astype(np.uint16)
+        las.gps_time = np.arange(len(points))
+        las.write(str(path))
+    elif path.suffix == ".e57":
+        pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
+        with pye57.E57(str(path), mode="w") as file:
+            x, y, z = points.T.copy()
+            columns = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+            columns |= {"intensity": intensities.astype(np.float32)}
+            columns |= {"colorRed": red, "colorGreen": green, "colorBlue": blue}
+            file.write_scan_raw(columns, name="all")
+    else:
+        kinds = "f8 f8 f8 f4 u1 u1 u1 u1 f4"
+        names = "x y z intensity red green blue classification curvature"
+        if path.suffix == ".pcd":
+            kinds = "f8 f8 f8 f4 u4 u4 f4"
+            names = "x y z intensity rgb label curvature"
+            packed = red.astype(np.uint32) << 16 | green.astype(np.uint32) << 8 | blue
+            columns = [*points.T, intensities, packed, classes, np.ones(len(points))]
+        else:
+            columns = [*points.T, intensities, red, green, blue, classes, np.ones(len(points))]
+        rows = np.rec.fromarrays(
+            columns, np.dtype(list(zip(names.split(), kinds.split(), strict=True)))
+        )
+        path.write_bytes(header_of(path.suffix, rows) + content_of(path, rows))
+    return path
+
+
+def header_of(suffix, rows):
+    kinds = [rows.dtype[name] for name in rows.dtype.names]
+    if suffix == ".ply":
+        types = {"f8": "double", "f4": "float", "u1": "uchar"}
+        lines = [
+            f"property {types[k.str[1:]]} {n}" for k, n in zip(kinds, rows.dtype.names, strict=True)
+        ]
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+        return "\n".join([*head, *lines, "end_header\n"]).encode()
+    return "\n".join([
+        "VERSION .7",
+        f"FIELDS {' '.join(rows.dtype.names)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {len(rows)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", "DATA ",
+    ]).encode()  # fmt: skip
+
+
+def content_of(path, rows):
+    if path.suffix == ".ply":
+        return rows.tobytes()
+    if "text" not in path.name:
+        return b"binary\n" + rows.tobytes()
+    lines = [" ".join(repr(value.item()) for value in row) for row in rows]
+    return ("ascii\n" + "\n".join(lines) + "\n").encode()
+
+
 def off_plane(scene, at=(0, 0, 0)):
     x, _, z = (scene.vertices + (scene.origin - at)).T
     return np.abs(z - x / 2).max()
@@ -98,6 +164,92 @@ def test_stray_points_make_no_large_surfels(tmp_path):
     assert sides.max() <= 2 * np.sqrt(2) * 0.3 + 1e-9
 
 
+# Three points in each voxel: two of class 2, and a third that is brighter.
+CLASSES = np.tile([2, 2, 5], len(GRID))
+INTENSITIES = np.tile([10, 20, 60], len(GRID))
+COLOURS = np.tile([[100, 0, 0], [100, 0, 50], [100, 0, 100]], (len(GRID), 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "text.pcd", "a.las", "a.e57"])
+def test_classes_colours_and_intensities_stay_in_the_scene(tmp_path, name):
+    points = plane().repeat(3, axis=0)
+    path = written_with_columns(tmp_path / name, points, CLASSES, INTENSITIES, COLOURS)
+    notes = []
+    scene_of_points(path, voxel_m=0.01, tell=notes.append)
+    for colour in ("rgb", "intensity"):
+        scene = scene_of_points(path, voxel_m=0.01, colour=colour, tell=notes.append)
+        write_scene(tmp_path / "b.glb", scene)
+        again = Scene.load(tmp_path / "b.glb", colours=True, materials=True)
+        assert again.triangles == 2 * len(GRID)
+        (means,) = np.unique(again.colours.means(), axis=0)
+        # Half of a white surface's light, and the mean of 0, 50 and 100 in linear light.
+        expected = [100, 0, 64] if colour == "rgb" else 3 * [188]
+        assert np.abs(means.astype(int) - expected).max() <= 1
+        assert scene.material_names == (() if name == "a.e57" else ("class 2",))
+        assert name == "a.e57" or again.material_names == ("class 2",)
+    assert f"{path}: intensities are not kept, because surfels have a colour" in notes[0] + notes[1]
+    left_out = {"a.las": "gps_time", "a.e57": ""}.get(name, "curvature")
+    assert any(note.endswith(f": {left_out}") for note in notes) == bool(left_out)
+
+
+def test_the_most_frequent_class_of_each_surfel_counts(tmp_path):
+    x = GRID[:, 0]
+    columns = [*plane().repeat(3, axis=0).T, CLASSES]
+    columns[3] = np.where((x < 2).repeat(3), 5, CLASSES)
+    path = tmp_path / "a.ply"
+    kinds = [("x", "f8"), ("y", "f8"), ("z", "f8"), ("class", "u1")]
+    rows = np.rec.fromarrays(columns, np.dtype(kinds))
+    path.write_bytes(header_of(".ply", rows) + rows.tobytes())
+    scene = scene_of_points(path, voxel_m=1e-3)
+    names = np.array(scene.material_names)
+    materials = scene.meshes()[0].materials
+    centres = scene.vertices[scene.faces].mean(axis=1) + scene.origin
+    assert names.tolist() == ["class 2", "class 5"]
+    assert ((materials.index == 1) == (centres[:, 0] < 2)).all()
+
+
+def test_scans_of_an_e57_are_joined_and_face_their_scanners(tmp_path):
+    pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
+    corner = np.array([512_345.678, 5_403_210.123, 250.0])
+    wall = np.column_stack([np.zeros(len(GRID)), GRID[:, 0], GRID[:, 1]])
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # by 90 degrees, w x y z below
+    path = tmp_path / "stations.e57"
+    with pye57.E57(str(path), mode="w") as file:
+        for side in (-3.0, 3.0):  # a wall seen from both sides, 2 m thick
+            scanner = corner + np.array([side, 2, 1.5])
+            face = wall + corner + np.array([side / 3, 0, 0])
+            x, y, z = ((face - scanner) @ turn).T.copy()
+            data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+            file.write_scan_raw(
+                data, rotation=np.array([1, 0, 0, 1]) / np.sqrt(2), translation=scanner
+            )
+    write_scene(tmp_path / "b.glb", scene_of_points(path, voxel_m=1e-3))
+    scene = Scene.load(tmp_path / "b.glb")
+    quads = scene.vertices.reshape(-1, 4, 3)
+    centres = quads.mean(axis=1) + scene.origin - corner
+    half_thickness = np.array([1.0, 0, 0])
+    expected = np.concatenate([wall - half_thickness, wall + half_thickness])
+    order = np.lexsort(np.round(centres, 3).T)
+    assert np.abs(centres[order] - expected[np.lexsort(np.round(expected, 3).T)]).max() < 1e-5
+    normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
+    assert (normals[:, 0] * centres[:, 0] > 0).all(), "fronts face the scanners"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("a.ply", "has no intensities: leave out colour intensity"), ("a.xyz", "has no intensities")],
+)
+def test_missing_intensities_are_an_error(tmp_path, name, words):
+    with pytest.raises(LidarError, match=words):
+        scene_of_points(written(tmp_path / name, plane()), colour="intensity")
+
+
+def test_columns_without_names_are_noted(tmp_path):
+    notes = []
+    scene_of_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
+    assert len(notes) == 1 and notes[0].endswith("no room for them: 1 column after x, y and z")
+
+
 @pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.pcd", "text.pcd", "a.las", "a.laz"])
 def test_cut_files_are_refused(tmp_path, name):
     path = written(tmp_path / name, plane())
@@ -127,6 +279,17 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
         path.write_text(text)
     with pytest.raises(LidarError, match=words):
         scene_of_points(path)
+
+
+def test_the_command_says_what_is_not_kept(tmp_path):
+    columns = [*plane().T, np.ones(len(GRID))]
+    rows = np.rec.fromarrays(
+        columns, np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("intensity", "f4")])
+    )
+    (tmp_path / "a.ply").write_bytes(header_of(".ply", rows) + rows.tobytes())
+    arguments = ["points", str(tmp_path / "a.ply"), str(tmp_path / "b.obj")]
+    outcome = CliRunner().invoke(command, arguments, catch_exceptions=False)
+    assert "note: " in outcome.stderr and "b.obj holds no colours and classes" in outcome.stderr
 
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ import trimesh
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.point_scene import SUFFIXES as CLOUDS
+from lidarpool.scenario.point_files import SUFFIXES as CLOUDS
 from lidarpool.scenario.point_scene import scene_of_points, surfels
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey

@@ -35,7 +35,7 @@ from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.export.format_table import EXPORTS, LAYOUTS
-from lidarpool.scenario import point_scene as points
+from lidarpool.scenario import point_files as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
@@ -249,6 +249,7 @@ EXTRAS = {
     "parquet": r"\bparquet\b",
     "pcd": r"\bpcd\b",
     "e57": r"\be57\b",
+    "osi": r"\bosi\b|\bbetterosi\b",
     "ros": r"\bmcap\b|\brosbag2\b",
     "s3": r"\bs3://",
     "clusters": r"--cluster\b|\bdask_jobqueue\b",

@@ -9,10 +9,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -352,8 +351,15 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     type=click.Choice([*UNITS_M]),
     help="Unit of x, y and z; by default that of a .las or .laz, else m.",
 )
+@click.option(
+    "--colour",
+    type=click.Choice(["rgb", "intensity"]),
+    help="What colours the surfels; by default rgb, else intensity, as the cloud has them.",
+)
 @overwrite
-@click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz")
+@click.argument(
+    "cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz|.e57"
+)
 @_out
 def points(
     cloud: Path,
@@ -361,6 +367,7 @@ def points(
     voxel_m: float | None,
     size: float,
     unit: str | None,
+    colour: Literal["rgb", "intensity"] | None,
     overwrite: bool,
 ) -> None:
     """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
@@ -370,10 +377,21 @@ def points(
       lidarpool scene points scan.ply place.glb
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
       lidarpool scene points scan.xyz place.glb --unit mm
+      lidarpool scene points stations.e57 place.glb --colour intensity
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import scene_of_points
 
-    make = partial(scene_of_points, cloud, voxel_m=voxel_m, size=size, unit=unit)
+    def tell(note: str) -> None:
+        click.echo(f"note: {note}", err=True)
+
+    def make() -> Scene:
+        place = scene_of_points(
+            cloud, voxel_m=voxel_m, size=size, unit=unit, colour=colour, tell=tell
+        )
+        if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
+            tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
+        return place
+
     _write(out, make, overwrite)
 
 

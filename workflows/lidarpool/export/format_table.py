@@ -139,6 +139,7 @@ _E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
 _LABELS = ("object", "intensity", "class")
 _KITTI_COLUMNS = ("object", "reflectivity", "class")
 _RINGS = ("channel", "intensity")
+_OSI = ("object", "channel", "intensity", "reflectance", "radial_velocity", "sensor")
 _BAG_COLUMNS = ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material")
 
 _KITTI_FILES = (
@@ -159,6 +160,19 @@ def _las(name: str) -> FormatRow:
         packages=("laspy", "lazrs"),
         extra="las",
         one_system=True,
+    )
+
+
+def _osi(name: str, file: str) -> FormatRow:
+    return FormatRow(
+        file,
+        "lidarpool.export.osi",
+        f"write_{name}",
+        packages=("betterosi",),
+        extra="osi",
+        needs=("scan", *_OSI[:3]),
+        holds=_OSI,
+        compensates=True,
     )
 
 
@@ -288,6 +302,9 @@ FORMATS = {
         compensates=True,
         with_scene=True,
     ),
+    # Readers take the type of messages from the part «sd» of the file's name.
+    "osi": _osi("osi", "cloud_sd.osi"),
+    "osi_mcap": _osi("osi_mcap", "cloud_osi.mcap"),
     "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
     "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
 }

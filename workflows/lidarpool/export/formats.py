@@ -277,7 +277,8 @@ def save_cloud(
     cloud
         In memory, or the stored points of a result.
     path
-        Its ending is .ply, .las, .laz, .e57, .mcap, .rrd or .parquet, unless there is a `format`.
+        Its ending is .ply, .las, .laz, .e57, .osi, .mcap, .rrd or .parquet, unless there is a
+        `format`.
         Its folder must exist. An existing file is replaced, a folder is not.
     format
         Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",

@@ -1,4 +1,4 @@
-"""Motion in a scenario: sensors on carriers, actors on trajectories, traffic of SUMO."""
+"""Motion in a scenario: sensors on carriers, actors on trajectories, traffic of simulations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 from xml.parsers import expat
 
 import numpy as np
@@ -362,11 +362,15 @@ _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
 class VehicleSection(DeformingSection):
-    """Shapes of vehicles and persons, by their types in SUMO."""
+    """Shapes of vehicles and persons, by their types in SUMO or OSI."""
 
     types: Annotated[
         TextOrTexts,
-        about("types of SUMO, with * and ?; of several entries the first that fits", min_length=1),
+        about(
+            "types of SUMO, or of OSI such as heavy_truck, with * and ?; of several entries the "
+            "first that fits",
+            min_length=1,
+        ),
     ] = ("*",)
     name: Annotated[
         Text | None, about("of its objects, before the identity in brackets; by default the type")
@@ -374,12 +378,20 @@ class VehicleSection(DeformingSection):
 
 
 class TrafficSection(Section):
-    """Vehicles and persons of a SUMO simulation; actors while they are in the simulation."""
+    """Vehicles and persons of a simulation; actors while they are in the simulation."""
 
-    file: Annotated[Text, about("what sumo --fcd-output writes, .xml or .xml.gz")]
-    vehicles: Annotated[
-        Several[VehicleSection], about("shapes of vehicles and persons, by type", min_length=1)
+    file: Annotated[
+        Text,
+        about(
+            "what sumo --fcd-output writes, .xml or .xml.gz; or a trace of OSI with ground truth, "
+            ".osi or .mcap"
+        ),
     ]
+    vehicles: Annotated[
+        Several[VehicleSection],
+        about("shapes of vehicles and persons, by type; of OSI by default boxes of their sizes"),
+    ] = ()
+    host: Annotated[bool, about("of OSI: whether the host vehicle is an actor as well")] = True
     ignore: Annotated[
         TextOrTexts, about("names of attributes in the file to leave out, with * and ?", "battery*")
     ] = ()
@@ -396,15 +408,32 @@ class TrafficSection(Section):
         "linear"
     )
 
-    def shape_of(self, vehicle_type: str) -> VehicleSection:
-        """Return the entry of a type of vehicles; LidarError if no entry fits."""
+    def entry_of(self, vehicle_type: str) -> VehicleSection | None:
+        """Return the first entry that fits a type of vehicles, or None."""
         for entry in self.vehicles:
             if any(fnmatchcase(vehicle_type, pattern) for pattern in entry.types):
                 return entry
-        raise LidarError(
-            f"{self.file} has vehicles of type {vehicle_type!r}, but no entry of traffic.vehicles "
-            f"fits: add one, such as {{types: {vehicle_type!r}, box: [4.5, 1.8, 1.5]}}."
-        )
+        return None
+
+
+class TrafficPassage(Protocol):
+    """A vehicle or person while it is in a simulation without a break."""
+
+    @property
+    def name(self) -> str:
+        """Identity in the simulation."""
+
+    @property
+    def kind(self) -> str:
+        """Type in the simulation."""
+
+    def entry(self, section: TrafficSection) -> VehicleSection:
+        """Return the entry with the shape; LidarError if there is none."""
+
+    def track(
+        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+    ) -> Track:
+        """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,6 +444,33 @@ class Passage:
     kind: str
     times_s: array[float] = field(default_factory=lambda: array("d"))
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` at each time
+
+    def entry(self, section: TrafficSection) -> VehicleSection:
+        """Return the first entry that fits the type; LidarError if there is none."""
+        matching = section.entry_of(self.kind)
+        if matching is not None:
+            return matching
+        raise LidarError(
+            f"{section.file} has vehicles of type {self.kind!r}, but no entry of traffic.vehicles "
+            f"fits: add one, such as {{types: {self.kind!r}, box: [4.5, 1.8, 1.5]}}."
+        )
+
+    def track(
+        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+    ) -> Track:
+        """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
+        times = np.array(self.times_s) + section.offset_s
+        x, y, angle, z, slope = np.array(self.rows).reshape(-1, len(_ROW)).T
+        fronts = np.column_stack([x, y, z]) + section.translation
+        if section.surfaces:
+            fronts[:, 2] = section.translation[2]
+            slope = 0 * slope
+        # Angles are clockwise from north, and slopes positive uphill.
+        rotations = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
+        # SUMO's position is the middle of the front bumper.
+        positions = fronts - rotations[:, :, 0] * mesh.vertices[:, 0].max() - origin
+        smooth = section.interpolation == "smooth"
+        return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
 
 
 class _PassageCollector:
@@ -546,7 +602,7 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
 
 def actors_of(
     section: TrafficSection,
-    passages: list[Passage],
+    passages: Sequence[TrafficPassage],
     shape_of: Callable[[VehicleSection], SceneMesh],
     standing: StandingSurfaces,
     start_s: float,
@@ -556,7 +612,7 @@ def actors_of(
     Parameters
     ----------
     shape_of
-        Returns the mesh of an entry of `section.vehicles`.
+        Returns the mesh of an entry.
     standing
         Surfaces of the scene, for `section.surfaces`; vehicles off these surfaces are not in the
         scene.
@@ -571,9 +627,9 @@ def actors_of(
     actors: list[tuple[Actor, VehicleSection]] = []
     surfaces = section.surfaces and standing.of_objects(section.surfaces)
     for passage in passages:
-        entry = section.shape_of(passage.kind)
+        entry = passage.entry(section)
         mesh = shape_of(entry)
-        track = _passage_track(section, passage, mesh, standing.origin, start_s)
+        track = passage.track(section, mesh, standing.origin, start_s)
         tracks = follow_surfaces(track, surfaces) if surfaces else [track]
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
         # Actors of an entry do not walk in step.
@@ -587,21 +643,3 @@ def actors_of(
                 "survey: make the survey shorter, or simulate a part of the network."
             )
     return actors
-
-
-def _passage_track(
-    section: TrafficSection, passage: Passage, mesh: SceneMesh, origin: Floats, start_s: float
-) -> Track:
-    """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
-    times = np.array(passage.times_s) + section.offset_s
-    x, y, angle, z, slope = np.array(passage.rows).reshape(-1, len(_ROW)).T
-    fronts = np.column_stack([x, y, z]) + section.translation
-    if section.surfaces:
-        fronts[:, 2] = section.translation[2]
-        slope = 0 * slope
-    # Angles are clockwise from north, and slopes positive uphill.
-    rotations = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
-    # SUMO's position is the middle of the front bumper.
-    positions = fronts - rotations[:, :, 0] * mesh.vertices[:, 0].max() - origin
-    smooth = section.interpolation == "smooth"
-    return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")

@@ -44,12 +44,14 @@ from ..plan.planning import Search
 from .actor_motion import (
     ActorSection,
     MountSection,
+    TrafficPassage,
     TrafficSection,
     VehicleSection,
     actors_of,
     read_fcd,
 )
 from .ground import StandingSurfaces
+from .osi_traffic import OSI_SUFFIXES, read_osi
 from .placing import Placing, place_sensor
 from .scenario import Scenario
 from .sections import CopiesSection, MeshFile, SensorSection
@@ -416,16 +418,23 @@ def _traffic_actors(
     file_start_s = start_s - section.offset_s
     findings = shapes.findings
     file = shapes.scenario.path(section.file)
-    passages, count = read_fcd(file, file_start_s, file_start_s + duration_s, section.ignore)
+    file_stop_s = file_start_s + duration_s
+    passages: Sequence[TrafficPassage]
+    if file.suffix.lower() in OSI_SUFFIXES:
+        passages, count, notes = read_osi(file, section, file_start_s, file_stop_s)
+        findings.notes += notes
+        counted = plural(count, "moving object")
+    else:
+        passages, count = read_fcd(file, file_start_s, file_stop_s, section.ignore)
+        counted = f"{plural(count, 'vehicle')} and persons"
     actors = actors_of(section, passages, shapes.mesh_of, standing, start_s)
     if not actors:
         findings.notes.append(
             f"{section.file}: no vehicle or person is in the scene from {file_start_s:g} to "
-            f"{file_start_s + duration_s:g} s of the file: check offset_s, translation and surfaces"
+            f"{file_stop_s:g} s of the file: check offset_s, translation and surfaces"
         )
     findings.sources[section.file] = (
-        f"{plural(len(actors), 'actor')} during the survey, of {plural(count, 'vehicle')} "
-        "and persons until its end"
+        f"{plural(len(actors), 'actor')} during the survey, of {counted} until its end"
     )
     return actors
 

@@ -7,40 +7,36 @@ from, and closed openings, so that a tenth of the ranges were wrong by more than
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
-from itertools import accumulate
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, explained, prefixed
-from lidarsim.base.input_files import check_input, read_input, read_input_text
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
+from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import printable
-from lidarsim.scene.files.las import las_units, open_las
-from lidarsim.scene.files.mesh_formats import advice_on
+from lidarsim.scene.colours import LINEAR, Colours, as_srgb
+from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
-from lidarsim.scene.files.pcd import checked_pcd
-from lidarsim.scene.files.polygon_files import read_ply_points
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..base.open3d_module import load_open3d
+from .point_files import MIN_POINTS, POINT_BYTES, ScannedPoints, read_points
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
-_NEIGHBOURS = 12
+_NEIGHBOURS = MIN_POINTS
 _EXTENT = 0.85
 _MAX_HALF_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
-_BYTES = 700  # for a point while its surfel is made and written
+_MAX_VOXELS = 1 << 62  # of the box around the points: voxels are numbered by 64 bits
+_WHITE_QUANTILE = 0.99  # of intensities that are not brighter than white: mirrors return more
 
 
 @checked
@@ -50,18 +46,24 @@ def scene_of_points(
     voxel_m: float | None = None,
     size: float = 1.0,
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    colour: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Scene:
     """Make a scene of a point cloud, for example a scan of a real place.
 
     A surfel lies where a principal component analysis of the 12 nearest points puts their plane,
-    and is about as large as the gaps between the points in both directions.
+    and is about as large as the gaps between the points in both directions. Its front faces the
+    scanner, where the file has positions of scanners, or has the side of the file's normals.
+
+    A surfel has the mean colour of its points, and as the name of its material the most frequent
+    of their classes, such as «class 2».
 
     Parameters
     ----------
     path
         .ply, .pcd, .xyz (x, y and z are the first numbers of a line), .las or .laz, which need
-        laspy. Z-up; .las and .laz in the units of their coordinate system, others in metres.
+        laspy, or .e57, which needs pye57 and whose scans are joined by their poses. Z-up; .las and
+        .laz in the units of their coordinate system, others in metres.
     voxel_m
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.
@@ -69,8 +71,12 @@ def scene_of_points(
         A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+    colour
+        What colours surfels: red, green and blue, or mean intensities as greys, of which the 99th
+        percentile is white. By default red, green and blue if the file has them.
     tell
-        Called with a line on units that were converted; by default this package's logger warns.
+        Called with a line on converted units, and on what a scene does not keep; by default this
+        package's logger warns.
 
     Returns
     -------
@@ -79,54 +85,162 @@ def scene_of_points(
     Raises
     ------
     LidarError
-        If the file cannot be read, has fewer than 12 points or a coordinate system without lengths,
-        or needs too much memory.
+        If the file cannot be read, has fewer than 12 points, lacks what `colour` names, has a
+        coordinate system without lengths, or needs too much memory.
     """
     path = Path(path)
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} is {value}; it must be a positive number.")
-    return Scene.from_meshes([surfels(path, _read(path, unit, tell), voxel_m, size)])
+    points = _coloured(path, read_points(path, unit, tell), colour, tell)
+    return Scene.from_meshes([_surfels_of(path, points, voxel_m, size)])
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
     """Return the surfels of the points (n, 3) of a file."""
+    return _surfels_of(path, ScannedPoints(points), voxel_m, size)
+
+
+def _coloured(
+    path: Path, points: ScannedPoints, colour: str | None, tell: Callable[[str], None]
+) -> ScannedPoints:
+    """Return points with either colours or intensities; LidarError if the chosen are missing."""
+    present = {"rgb": points.colours is not None, "intensity": points.intensities is not None}
+    if colour is not None and not present[colour]:
+        quantity = "colours" if colour == "rgb" else "intensities"
+        raise LidarError(f"{path} has no {quantity}: leave out colour {colour}.")
+    if not any(present.values()):
+        return points
+    colour = colour or next(name for name, is_present in present.items() if is_present)
+    if all(present.values()):
+        other, choice = ("intensities", "intensity") if colour == "rgb" else ("colours", "rgb")
+        tell(f"{path}: {other} are not kept, because surfels have a colour: choose colour {choice}")
+    if colour == "rgb":
+        return replace(points, intensities=None)
+    return replace(points, colours=None)
+
+
+def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> SceneMesh:
+    """Return the surfels of the points of a file, with their colours and classes."""
     # Covariances of Open3D lose the digits of points far from zero.
-    origin = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
-    points = points - origin
+    positions = points.positions
+    origin = np.round((positions.min(axis=0) + positions.max(axis=0)) / 2)
+    positions = positions - origin
     o3d = load_open3d()
-    voxel_m = voxel_m or _spacing_m(o3d, points)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    del points
+    voxel_m = voxel_m or _spacing_m(o3d, positions)
     if not voxel_m:
         raise LidarError(f"{path} has most of its points in the same places: give voxel_m.")
-    try:
-        cloud = cloud.voxel_down_sample(voxel_m)
-    except RuntimeError as error:
+    voxels = _Voxels.of_points(path, positions, voxel_m)
+    count = len(voxels.counts)
+    if count * POINT_BYTES > memory() // 2:
         raise LidarError(
-            f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
-        ) from error
-    count = len(cloud.points)
-    if count * _BYTES > memory() // 2:
-        raise LidarError(
-            f"{path} makes {count:,} surfels, which take {bytes_of(count * _BYTES)} of memory, of "
-            f"at most {bytes_of(memory() // 2)}: give a larger voxel_m than {voxel_m:.3g}."
+            f"{path} makes {count:,} surfels, which take {bytes_of(count * POINT_BYTES)} of "
+            f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
+            f"{voxel_m:.3g}."
         )
     if count < _NEIGHBOURS:
         raise LidarError(
             f"{path} has {count} points in different voxels of {voxel_m:.3g} m, and at least "
             f"{_NEIGHBOURS} are needed: give a smaller voxel_m, or another cloud."
         )
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
+    outward = None if points.outward is None else voxels.means(_directions(points.outward))
     corners = _surfel_corners(
-        np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size
+        np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
     )
     faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
-    return SceneMesh(path.stem, corners.reshape(-1, 3) + origin, faces.reshape(-1, 3))
+    return SceneMesh(
+        path.stem,
+        corners.reshape(-1, 3) + origin,
+        faces.reshape(-1, 3),
+        colours=_surfel_colours(points, voxels),
+        materials=_surfel_materials(points, voxels),
+    )
 
 
-def _surfel_corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
-    """Return the corners (n, 4, 3) of surfels."""
+@dataclass(frozen=True, eq=False)
+class _Voxels:
+    """Points sorted by the voxels that contain them; only voxels with points are counted."""
+
+    order: Ints  # (n,): indices of the points, voxel by voxel
+    starts: Ints  # (v,): where the points of each voxel start in `order`
+    counts: Ints  # (v,): number of points in each voxel
+
+    @classmethod
+    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> _Voxels:
+        """Sort the points (n, 3) of a file into voxels; LidarError if there are too many voxels."""
+        lower = positions.min(axis=0)
+        spans = (positions.max(axis=0) - lower) / voxel_m + 1
+        if spans.prod() > _MAX_VOXELS:
+            raise LidarError(
+                f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
+            )
+        # The first voxel has the lowest point in its middle.
+        cells = np.floor((positions - lower) / voxel_m + 0.5).astype(np.int64)
+        _, ny, nz = (int(span) + 1 for span in spans)
+        numbers = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
+        order = np.argsort(numbers, kind="stable")
+        ordered = numbers[order]
+        starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+        return cls(order, starts, np.diff(starts, append=len(order)))
+
+    def means(self, values: AnyArray) -> Floats:
+        """Return the means (v, k) in each voxel of values (n, k) of the points."""
+        sums = np.add.reduceat(values[self.order].astype(np.float64), self.starts, axis=0)
+        means: Floats = sums / self.counts[:, None]
+        return means
+
+    def most_frequent(self, numbers: Ints, distinct: int) -> Ints:
+        """Return the most frequent number (v,) in each voxel, of several the lowest.
+
+        `numbers` (n,) of the points are from 0 to below `distinct`.
+        """
+        voxel = np.repeat(np.arange(len(self.counts)), self.counts)
+        pairs, repeats = np.unique(voxel * distinct + numbers[self.order], return_counts=True)
+        voxel_of_pair, number = np.divmod(pairs, distinct)
+        by_frequency = np.lexsort((number, -repeats, voxel_of_pair))
+        _, firsts = np.unique(voxel_of_pair[by_frequency], return_index=True)
+        modes: Ints = number[by_frequency][firsts]
+        return modes
+
+
+def _directions(vectors: Floats) -> Floats:
+    """Return the directions of vectors (n, 3), of length 1 or, of zero vectors, 0."""
+    lengths = np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
+
+
+def _surfel_colours(points: ScannedPoints, voxels: _Voxels) -> Colours | None:
+    """Return the mean colours of surfels in linear light, or greys of their mean intensities."""
+    light: Floats
+    if points.colours is not None:
+        light = voxels.means(LINEAR[points.colours])
+    elif points.intensities is not None:
+        white = np.quantile(points.intensities, _WHITE_QUANTILE)
+        intensities = voxels.means(points.intensities[:, None])
+        light = np.clip(intensities / (white if white > 0 else 1.0), 0, 1).repeat(3, axis=1)
+    else:
+        return None
+    colours: Bytes = as_srgb(light)
+    return Colours.of_faces(colours.repeat(2, axis=0))
+
+
+def _surfel_materials(points: ScannedPoints, voxels: _Voxels) -> FaceMaterials | None:
+    """Return the most frequent classes of surfels as names of materials, such as «class 2»."""
+    if points.classes is None:
+        return None
+    classes, numbers = np.unique(points.classes, return_inverse=True)
+    modes = voxels.most_frequent(numbers, len(classes))
+    present, rows = np.unique(modes, return_inverse=True)
+    names = tuple(f"class {number}" for number in classes[present].tolist())
+    return FaceMaterials(names, rows.astype(np.int32).repeat(2))
+
+
+def _surfel_corners(
+    points: Floats, covariances: Floats, voxel_m: float, size: float, outward: Floats | None
+) -> Floats:
+    """Return the corners (n, 4, 3) of surfels, counter-clockwise seen from `outward` (n, 3)."""
     corners = np.empty((len(points), 4, 3))
     for start in range(0, len(points), 1 << 18):
         block = slice(start, start + (1 << 18))
@@ -134,6 +248,10 @@ def _surfel_corners(points: Floats, covariances: Floats, voxel_m: float, size: f
         halves = size * _EXTENT * np.sqrt(np.maximum(variances[:, 1:], 0))
         halves = np.minimum(halves, _MAX_HALF_VOXELS * voxel_m)
         half_widths, half_lengths = np.moveaxis(axes[:, :, 1:] * halves[:, None], 2, 0)
+        if outward is not None:
+            normals = np.cross(half_lengths, half_widths)
+            inverted = (normals * outward[block]).sum(axis=1) < 0
+            half_widths = np.where(inverted[:, None], -half_widths, half_widths)
         for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
             corners[block, corner] = points[block] + a * half_lengths + b * half_widths
     return corners
@@ -146,99 +264,3 @@ def _spacing_m(o3d: Any, points: Floats) -> float:
     sampled = points[:: -(-len(points) // _SAMPLE)]
     _, squares = tree.knn_search(o3d.core.Tensor(np.ascontiguousarray(sampled)), _NEAREST)
     return float(np.sqrt(np.median(squares.numpy()[:, -1])))
-
-
-def _read(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
-    """Return the finite points of a file, (n, 3), metres."""
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        if advice := advice_on(path):
-            raise LidarError(f"{path} is not read: {advice}.")
-        raise LidarError(
-            f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "
-            f"{' '.join(SUFFIXES)}."
-        )
-    try:
-        with explained(f"{path} cannot be read"), prefixed(path):
-            check_input(path)
-            metres = _unit_lengths_m(path, unit, tell)
-            points = _READERS[suffix](path) * metres
-    except LidarError:
-        raise
-    except Exception as error:  # readers raise whatever they stumble over
-        reason = printable(str(error))[:200] or type(error).__name__
-        raise LidarError(f"{path} is broken or cut short ({reason}).") from error
-    # Depth cameras write NaN for pixels without a return.
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < _NEIGHBOURS:
-        raise LidarError(
-            f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "
-            "cut short, or no point cloud."
-        )
-    if (reach := np.abs(points).max()) > MAX_COORDINATE_M:
-        raise LidarError(
-            f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
-            "broken, or in another unit (--unit, in Python unit=)."
-        )
-    return points
-
-
-def _unit_lengths_m(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
-    """Return the metres in the units of x, y and z of a file, (3,)."""
-    if unit is not None:
-        return np.full(3, UNITS_M[unit])
-    units = las_units(path) if path.suffix.lower() in (".las", ".laz") else None
-    if units is None:
-        return np.ones(3)
-    if note := units.note():
-        tell(f"{path} {note}")
-    return np.array(units.factors)
-
-
-def _read_pcd(path: Path) -> Floats:
-    """Read points of a .pcd; Open3D reads all encodings but text.
-
-    Open3D returns uninitialised memory as points for truncated text.
-    """
-    header = checked_pcd(path)
-    count = int(header["POINTS"][0])
-    if header["DATA"][0] == "ascii":
-        repeats = map(int, header.get("COUNT", ["1"] * len(header["FIELDS"])))
-        starts = dict(zip(header["FIELDS"], accumulate(repeats, initial=0), strict=False))
-        columns = [starts[axis] for axis in "xyz"]
-        _, _, rows = read_input(path).partition(b"\nDATA ascii")
-        points = np.loadtxt(io.BytesIO(rows), usecols=columns, skiprows=1, ndmin=2)
-    else:
-        o3d = load_open3d()
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            points = np.array(o3d.io.read_point_cloud(str(path), remove_nan_points=False).points)
-    if len(points) != count:
-        raise ValueError(f"{count:,} points announced, and {len(points):,} are there")
-    return points
-
-
-def _read_xyz(path: Path) -> Floats:
-    """Read the first three numbers of each line."""
-    return np.loadtxt(io.StringIO(read_input_text(path)), usecols=(0, 1, 2), ndmin=2)
-
-
-def _read_las(path: Path) -> Floats:
-    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
-    with open_las(path) as reader:
-        if (size := reader.header.point_count * _BYTES) > memory():
-            raise LidarError(
-                f"it has {reader.header.point_count:,} points, which take {bytes_of(size)} of "
-                "memory: thin it first."
-            )
-        points = reader.read_points(-1)
-    return np.stack([points.x, points.y, points.z], axis=1)
-
-
-_READERS: dict[str, Callable[[Path], Floats]] = {
-    ".ply": lambda path: read_ply_points(read_input(path)),
-    ".pcd": _read_pcd,
-    ".xyz": _read_xyz,
-    ".las": _read_las,
-    ".laz": _read_las,
-}
-SUFFIXES = tuple(_READERS)

@@ -142,7 +142,7 @@ class Scenario(Section):
     traffic: Annotated[
         TrafficSection | None,
         about(
-            "vehicles and persons of a SUMO simulation, as actors",
+            "vehicles and persons of a simulation with SUMO, or of a trace of OSI, as actors",
             {"file": "fcd.xml", "vehicles": [{"box": [4.5, 1.8, 1.5], "class": 10}]},
         ),
     ] = None

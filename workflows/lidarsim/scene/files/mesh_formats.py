@@ -114,15 +114,10 @@ _NOT_READ = (
         (".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"),
         advice="export it as .glb, for example from Blender",
     ),
-    MeshFormat((".las", ".laz", ".pcd", ".xyz"), advice=_POINTS),
+    MeshFormat((".las", ".laz", ".pcd", ".xyz", ".e57"), advice=_POINTS),
     MeshFormat(
         (".pts",),
         advice=f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
-    ),
-    MeshFormat(
-        (".e57",),
-        advice="it is a point cloud, write it as .las (pdal translate IN.e57 OUT.las) and "
-        f"{_POINTS}",
     ),
     MeshFormat(
         (".pcap", ".mcap", ".bag", ".db3", ".osf"),

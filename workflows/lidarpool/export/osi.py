@@ -1,0 +1,405 @@
+"""Open Simulation Interface (ASAM OSI): a SensorData message for each sweep, through betterosi.
+
+A million detections as objects of the library take 17 s to make and encode. Detections are
+therefore encoded here, by the wire format of Protocol Buffers: all of a sweep have the same fields,
+and thus the same bytes but for the values.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.elementary import arctan2
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
+
+from .boxes import Boxes, SweepBoxes
+
+GROUND_TRUTH_TOPIC = "/ground_truth"
+_GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06: surveys without a date begin there
+# Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.
+_FEATURE_DATA = 26
+_LIDAR_SENSOR = 3
+_HEADER = 1
+_DETECTION = 2
+_DOUBLES = {"intensity": 7, "reflectivity": 10, "radial_velocity": 12}
+_VARINT, _FIXED64, _LENGTH = range(3)  # wire types
+# Types of OSI by the names of actors or words in them, in lower case.
+_PERSONS = {"pedestrian", "person", "walker", "child"}
+_VEHICLES = {
+    **dict.fromkeys(("delivery_van", "van"), "DELIVERY_VAN"),
+    **dict.fromkeys(("car", "taxi"), "CAR"),
+    **dict.fromkeys(("heavy_truck", "truck", "lorry"), "HEAVY_TRUCK"),
+    **dict.fromkeys(("motorbike", "motorcycle"), "MOTORBIKE"),
+    **dict.fromkeys(("bicycle", "cyclist"), "BICYCLE"),
+    **dict.fromkeys(("standup_scooter", "scooter"), "STANDUP_SCOOTER"),
+    **{
+        name: name.upper()
+        for name in (
+            "small_car", "compact_car", "luxury_car", "semitractor", "semitrailer", "trailer",
+            "bus", "tram", "train", "wheelchair",
+        )
+    },
+}  # fmt: skip
+
+
+def write_osi(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write an .osi trace: a message for each sweep, in the order of their starts."""
+    _write(path, ".osi", cloud, sweeps)
+
+
+def write_osi_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write the messages of an .osi trace as MCAP.
+
+    Each sensor has a topic; the ground truth is on `GROUND_TRUTH_TOPIC` as well.
+    """
+    _write(path, ".mcap", cloud, sweeps)
+
+
+def _write(path: Path, suffix: str, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write a trace of the kind of a suffix, by which the library chooses the kind."""
+    osi: Any = import_module("betterosi")  # an extra
+    messages = _Messages(osi, sweeps)
+    options: dict[str, Any] = {}
+    if suffix == ".mcap":
+        stamp = datetime.fromtimestamp(messages.start_ns / 1e9, UTC)
+        options["metadata"] = {"creation_time": stamp.strftime("%Y-%m-%dT%H:%M:%SZ")}
+    suffixed = path.with_name(path.name + suffix)
+    writer = osi.Writer(str(suffixed), **options)
+    try:
+        with writer:
+            _write_messages(writer, messages, cloud, sweeps)
+    finally:
+        writer.file.close()  # the library leaves the file open if its end cannot be written
+    suffixed.replace(path)
+
+
+def _write_messages(writer: Any, messages: _Messages, cloud: CloudLike, sweeps: Sweeps) -> None:
+    topics = [f"/{name}/sensor_data" if name else "/sensor_data" for name in _names(sweeps)]
+    for sweep in np.argsort(sweeps.begins_ns, kind="stable").tolist():
+        (points,) = sweeps.points(cloud, sweep, sweep + 1)
+        boxes = Boxes.from_points(sweeps, sweep, points)
+        truth = messages.ground_truth(sweep, boxes)
+        time_ns = messages.time_ns(sweep)
+        if writer.write_mcap:
+            writer.add(truth, topic=GROUND_TRUTH_TOPIC, log_time=time_ns)
+        data = messages.sensor_data(sweep, points, boxes, truth)
+        writer.add(data, topic=topics[sweeps.sensor[sweep]], log_time=time_ns)
+
+
+def _names(sweeps: Sweeps) -> list[str]:
+    """Return the names of the sensors for topics; "" for a single sensor without a name."""
+    return plain_names(sweeps.sensors) if any(sweeps.sensors) else ["" for _ in sweeps.sensors]
+
+
+@dataclass(frozen=True)
+class _EncodedMessage:
+    """A message with further fields that are encoded already; the library writes both."""
+
+    message: Any
+    encoded_fields: bytes
+
+    @property
+    def timestamp(self) -> Any:
+        """Timestamp of the message."""
+        return self.message.timestamp
+
+    @property
+    def version(self) -> Any:
+        """Version of OSI."""
+        return self.message.version
+
+    def has_field(self, name: str) -> bool:
+        """Return True if the message has a field."""
+        return bool(self.message.has_field(name))
+
+    def desc(self) -> Any:
+        """Return the descriptor of the message's type."""
+        return self.message.desc()
+
+    def to_binary(self) -> bytes:
+        """Return all fields in the wire format, in which the order of fields is free."""
+        data: bytes = self.message.to_binary()
+        return data + self.encoded_fields
+
+
+class _Messages:
+    """Makes the messages of sweeps.
+
+    Identifiers are the numbers of objects in the column `object`; the host vehicle, which is the
+    carrier, has the next number. Its frame is the carrier's.
+    """
+
+    def __init__(self, osi: Any, sweeps: Sweeps) -> None:
+        self._osi = osi
+        self._sweeps = sweeps
+        self.start_ns = _GPS_NS if sweeps.start_ns is None else sweeps.start_ns
+        self._host = osi.Identifier(value=len(sweeps.all_names))
+        major, minor, patch = map(int, osi.__version_osi__.split("."))
+        self._version = osi.InterfaceVersion(
+            version_major=major, version_minor=minor, version_patch=patch
+        )
+        self._types = [_type_fields(osi, name) for name in sweeps.actor_types]
+
+    def time_ns(self, sweep: int) -> int:
+        """Return the start of a sweep by the sensor's clock, ns from 1970 or the survey's start."""
+        return max(0, (self._sweeps.start_ns or 0) + self._sweeps.stamp_ns(sweep))
+
+    def _timestamp(self, sweep: int) -> Any:
+        seconds, nanos = divmod(self.time_ns(sweep), 10**9)
+        return self._osi.Timestamp(seconds=seconds, nanos=nanos)
+
+    def _base(self, position: Floats, quaternion: Floats, size: Floats | None = None) -> Any:
+        """Return position (3,), orientation and size (3,) of a moving object."""
+        osi = self._osi
+        base = osi.BaseMoving(
+            position=_vector(osi, position), orientation=_orientation(osi, quaternion)
+        )
+        if size is not None:
+            length, width, height = size.tolist()
+            base.dimension = osi.Dimension3d(length=length, width=width, height=height)
+        return base
+
+    def ground_truth(self, sweep: int, boxes: Boxes) -> Any:
+        """Return the poses of the host vehicle and the actors in the world."""
+        osi = self._osi
+        sweeps = self._sweeps
+        carrier = sweeps.carrier
+        zero = np.zeros(3)
+        attributes = osi.MovingObject.VehicleAttributes(bbcenter_to_rear=_vector(osi, zero))
+        host = osi.MovingObject(
+            id=self._host,
+            base=self._base(carrier.positions[sweep], carrier.quaternions[sweep]),
+            type=osi.MovingObject.Type.VEHICLE,
+            vehicle_attributes=attributes,
+        )
+        actors = []
+        for actor in np.flatnonzero(boxes.present).tolist():
+            base = self._base(boxes.centres[actor], boxes.quaternions[actor], boxes.sizes[actor])
+            base.velocity = _vector(osi, self._velocity(sweep, actor))
+            actors.append(
+                osi.MovingObject(
+                    id=osi.Identifier(value=len(sweeps.objects) + actor),
+                    base=base,
+                    model_reference=sweeps.actors[actor],
+                    **self._types[actor],
+                )
+            )
+        return osi.GroundTruth(
+            version=self._version,
+            timestamp=self._timestamp(sweep),
+            host_vehicle_id=self._host,
+            moving_object=[host, *actors],
+        )
+
+    def _velocity(self, sweep: int, actor: int) -> Floats:
+        """Return the mean velocity of an actor during a sweep, world, m/s; 0 within one firing."""
+        sweeps = self._sweeps
+        positions = sweeps.actor_poses.positions[actor]
+        span_s = (sweeps.ends_ns[sweep] - sweeps.begins_ns[sweep]) / 1e9
+        travelled = positions[sweep + len(sweeps)] - positions[sweep]
+        velocity: Floats = travelled / span_s if span_s > 0 else 0 * travelled
+        return velocity
+
+    def sensor_data(self, sweep: int, points: Cloud, boxes: Boxes, truth: Any) -> _EncodedMessage:
+        """Return the detections and detected actors of a sweep, with the ground truth."""
+        osi = self._osi
+        sweeps = self._sweeps
+        number = int(sweeps.sensor[sweep])
+        sensor = osi.Identifier(value=number)
+        timestamp = self._timestamp(sweep)
+        mount = osi.MountingPosition(
+            position=_vector(osi, sweeps.mounts.positions[number]),
+            orientation=_orientation(osi, sweeps.mounts.quaternions[number]),
+        )
+        common = {"version": self._version, "timestamp": timestamp, "sensor_id": sensor}
+        view = osi.SensorView(**common, host_vehicle_id=self._host, global_ground_truth=truth)
+        message = osi.SensorData(
+            **common,
+            mounting_position=mount,
+            last_measurement_time=timestamp,
+            sensor_view=[view],
+            moving_object=self._detected(sweep, boxes),
+        )
+        header = osi.SensorDetectionHeader(
+            measurement_time=timestamp,
+            cycle_counter=int(sweeps.numbers[sweep]),
+            mounting_position=mount,
+            data_qualifier=osi.SensorDetectionHeader.DataQualifier.AVAILABLE,
+            number_of_valid_detections=len(points),
+            sensor_id=sensor,
+        )
+        positions = sweeps.compensated(sweep, points)
+        detections = _field(_HEADER, header.to_binary()) + encoded_detections(positions, points)
+        return _EncodedMessage(message, _field(_FEATURE_DATA, _field(_LIDAR_SENSOR, detections)))
+
+    def _detected(self, sweep: int, boxes: Boxes) -> list[Any]:
+        """Return the actors that have points in a sweep, in the sensor frame."""
+        osi = self._osi
+        sweeps = self._sweeps
+        in_sensor = SweepBoxes.select(sweeps, boxes.inward(sweeps.pose, sweep))
+        detected = []
+        for row in np.flatnonzero(in_sensor.points).tolist():
+            number = osi.Identifier(value=int(in_sensor.objects[row]))
+            header = osi.DetectedItemHeader(
+                tracking_id=number,
+                ground_truth_id=[number],
+                existence_probability=1.0,
+                measurement_state=osi.DetectedItemHeader.MeasurementState.MEASURED,
+            )
+            type_fields = self._types[int(in_sensor.objects[row]) - len(sweeps.objects)]
+            candidate = osi.DetectedMovingObject.CandidateMovingObject(
+                probability=1.0, **type_fields
+            )
+            base = self._base(
+                in_sensor.centres[row], in_sensor.quaternions[row], in_sensor.sizes[row]
+            )
+            detected.append(
+                osi.DetectedMovingObject(header=header, base=base, candidate=[candidate])
+            )
+        return detected
+
+
+def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
+    """Return the fields of a moving object's type, by the type in the name of an actor."""
+    kind = osi.MovingObject.Type
+    words = [name.lower(), *re.findall("[a-z]+", name.lower())]
+    if not _PERSONS.isdisjoint(words):
+        return {"type": kind.PEDESTRIAN}
+    vehicle = next((_VEHICLES[word] for word in words if word in _VEHICLES), None)
+    if vehicle is None:
+        return {"type": kind.OTHER}
+    classification = osi.MovingObject.VehicleClassification
+    value = getattr(classification.Type, vehicle)
+    return {"type": kind.VEHICLE, "vehicle_classification": classification(type=value)}
+
+
+def _vector(osi: Any, vector: Floats) -> Any:
+    """Return a vector (3,) as a message."""
+    x, y, z = vector.tolist()
+    return osi.Vector3d(x=x, y=y, z=z)
+
+
+def _orientation(osi: Any, quaternion: Floats) -> Any:
+    """Return roll, pitch and yaw of a rotation x, y, z, w as a message, radians."""
+    rotation = matrices(quaternion[None])[0]
+    level = np.hypot(rotation[0, 0], rotation[1, 0])
+    roll, pitch, yaw = arctan2(
+        np.array([rotation[2, 1], -rotation[2, 0], rotation[1, 0]]),
+        np.array([rotation[2, 2], level, rotation[0, 0]]),
+    ).tolist()
+    return osi.Orientation3d(roll=roll, pitch=pitch, yaw=yaw)
+
+
+def encoded_detections(positions: Floats, points: Cloud) -> bytes:
+    """Return the detections of points as fields of LidarDetectionData.
+
+    Azimuth and elevation are rotations about z and the turned y axis by the right-hand rule, as
+    Spherical3d of OSI defines them: points above the sensor have a negative elevation.
+
+    Parameters
+    ----------
+    positions
+        float64 (n, 3), metres, sensor frame.
+    points
+        The columns `object` and `channel`; `intensity`, `reflectance` and `radial_velocity` if
+        present.
+    """
+    x, y, z = positions.T
+    across = np.sqrt(x * x + y * y)
+    columns = points.columns
+    values = {}
+    if "intensity" in columns:
+        values["intensity"] = 100 * np.clip(columns["intensity"].astype(np.float64), 0, 1)
+    if "reflectance" in columns:
+        values["reflectivity"] = columns["reflectance"].astype(np.float64)
+    if "radial_velocity" in columns:  # of OSI, towards the sensor
+        values["radial_velocity"] = -columns["radial_velocity"].astype(np.float64)
+    position = _Record()
+    position.add_double(1, np.sqrt(across * across + z * z))
+    position.add_double(2, arctan2(y, x))
+    position.add_double(3, arctan2(-z, across))
+    detection = _Record()
+    detection.add_record(2, _identifiers(columns["object"].astype(np.int64)))
+    detection.add_record(3, position)
+    for name, column in values.items():
+        detection.add_double(_DOUBLES[name], column)
+    detection.add_record(13, _identifiers(columns["channel"].astype(np.int64)))
+    detections = _Record()
+    detections.add_record(_DETECTION, detection)
+    return detections.rows().tobytes()
+
+
+class _Record:
+    """Messages of the same fields and lengths, encoded column by column."""
+
+    def __init__(self) -> None:
+        self._parts: list[AnyArray | bytes] = []  # uint8 (n, k), or bytes of all messages
+
+    def add_double(self, number: int, values: Floats) -> None:
+        """Add a field of real numbers (n,)."""
+        self._parts.append(_key(number, _FIXED64))
+        self._parts.append(np.ascontiguousarray(values, "<f8").view(np.uint8).reshape(-1, 8))
+
+    def add_varint(self, number: int, values: Ints) -> None:
+        """Add a field of integers (n,), not negative, each in as many bytes as the largest.
+
+        The wire format allows groups of zeros above the highest bit.
+        """
+        largest = int(values.max()) if len(values) else 0
+        size = max(1, -(-largest.bit_length() // 7))
+        groups = values[:, None] >> (7 * np.arange(size)) & 127
+        groups[:, :-1] |= 128
+        self._parts.append(_key(number, _VARINT))
+        self._parts.append(groups.astype(np.uint8))
+
+    def add_record(self, number: int, record: _Record) -> None:
+        """Add a field of messages."""
+        rows = record.rows()
+        self._parts.append(_key(number, _LENGTH) + _varint(rows.shape[1]))
+        self._parts.append(rows)
+
+    def rows(self) -> AnyArray:
+        """Return the bytes of the messages, uint8 (n, k)."""
+        count = next(len(part) for part in self._parts if not isinstance(part, bytes))
+        columns = [
+            np.tile(np.frombuffer(part, np.uint8), (count, 1)) if isinstance(part, bytes) else part
+            for part in self._parts
+        ]
+        return np.concatenate(columns, axis=1)
+
+
+def _identifiers(values: Ints) -> _Record:
+    """Return messages Identifier."""
+    record = _Record()
+    record.add_varint(1, values)
+    return record
+
+
+def _key(number: int, wire_type: int) -> bytes:
+    """Return the bytes that start a field."""
+    return _varint(number << 3 | wire_type)
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """Return a field that contains a message."""
+    return _key(number, _LENGTH) + _varint(len(content)) + content
+
+
+def _varint(value: int) -> bytes:
+    """Return an integer in groups of seven bits, the lowest first."""
+    groups = bytearray()
+    while value > 127:
+        groups.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*groups, value])

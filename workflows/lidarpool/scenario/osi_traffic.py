@@ -1,0 +1,248 @@
+"""Moving objects of traces of the Open Simulation Interface (ASAM OSI), as actors."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import need, reading
+from lidarsim.base.input_files import input_size
+from lidarsim.base.words import plural
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor import Track
+from lidarsim.sensor.trajectory import quaternions_of, rotations_of
+
+from .actor_motion import TrafficSection, VehicleSection
+
+OSI_SUFFIXES = (".osi", ".mcap")
+_MAX_SIZE_M = 1e4  # of a moving object: ships and trains are shorter
+_ROW = 6  # x, y, z of the box's centre, metres; yaw, pitch and roll, radians
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPassage:
+    """Consecutive messages of a trace that contain a moving object."""
+
+    name: str  # its identity
+    kind: str  # its type, such as «heavy_truck»
+    size: tuple[float, float, float] | None  # length, width and height, metres; None if unknown
+    times_s: array[float] = field(default_factory=lambda: array("d"))
+    rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` numbers at each time
+
+    def entry(self, section: TrafficSection) -> VehicleSection:
+        """Return the first entry that fits the type, or else a box of the object's size."""
+        matching = section.entry_of(self.kind)
+        if matching is not None:
+            return matching
+        assert self.size is not None, "objects without a size and an entry are left out"
+        return VehicleSection(box=self.size)
+
+    def track(
+        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+    ) -> Track:
+        """Return the local trajectory of a mesh, above `section.surfaces` if there are any.
+
+        OSI gives the middle of the object's box. The mesh stands on the bottom of the box, its
+        middle under that of the box.
+        """
+        rows = np.array(self.rows).reshape(-1, _ROW)
+        centres = rows[:, :3] + section.translation
+        angles_deg = np.degrees(rows[:, 3:])
+        lower, upper = mesh.bounds
+        height_m = upper[2] - lower[2] if self.size is None else self.size[2]
+        offset = np.array([*(lower[:2] + upper[:2]) / 2, lower[2] + height_m / 2])
+        if section.surfaces:
+            centres[:, 2] = section.translation[2] + offset[2]
+            angles_deg[:, 1:] = 0.0
+        rotations = rotations_of(angles_deg)
+        positions = centres - rotations @ offset - origin
+        smooth = section.interpolation == "smooth"
+        times = np.array(self.times_s) + section.offset_s
+        return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
+
+
+class TraceContent(NamedTuple):
+    """Moving objects of a trace between two times."""
+
+    passages: list[ObjectPassage]  # in the order of their starts
+    object_count: int  # number of moving objects until the end
+    notes: list[str]  # on what is left out
+
+
+class _PassageCollector:
+    """Collects passages from messages; of those before the first time, the last is kept."""
+
+    def __init__(self, section: TrafficSection, first_s: float) -> None:
+        self.passages: list[ObjectPassage] = []
+        self.travellers: dict[int, tuple[int, ObjectPassage]] = {}  # {id: (last message, passage)}
+        self.shapeless: dict[int, str] = {}  # {id: type} of objects without a size and an entry
+        self.time_s = -np.inf
+        self.message = -1
+        self._section = section
+        self._first_s = first_s
+
+    def add(self, truth: Any) -> None:
+        """Add the moving objects of a message GroundTruth; ValueError if it is not valid."""
+        if truth.timestamp is None:
+            raise ValueError("a message has no timestamp")
+        time_s = truth.timestamp.seconds + truth.timestamp.nanos / 1e9
+        if time_s < self.time_s:
+            raise ValueError(f"the time {time_s:g} comes before {self.time_s:g} s")
+        if time_s == self.time_s:  # of another topic, or of another sensor
+            return
+        self.time_s = time_s
+        self.message += 1
+        host = None if truth.host_vehicle_id is None else truth.host_vehicle_id.value
+        for moving in truth.moving_object:
+            identity = 0 if moving.id is None else int(moving.id.value)
+            if self._section.host or identity != host:
+                self._add_object(identity, moving)
+
+    def _add_object(self, identity: int, moving: Any) -> None:
+        passage = self._passage(identity, moving)
+        if passage is None:
+            return
+        if self.time_s <= self._first_s:
+            del passage.times_s[:], passage.rows[:]
+        row = _pose_of(moving)
+        if not np.isfinite(row).all():
+            raise ValueError(f"moving object {identity} has no finite pose at {self.time_s:g} s")
+        passage.times_s.append(self.time_s)
+        passage.rows.extend(row)
+
+    def _passage(self, identity: int, moving: Any) -> ObjectPassage | None:
+        """Return the passage that an object continues, or a new one; None without a shape."""
+        last_message, passage = self.travellers.get(identity, (-2, None))
+        if passage is None or last_message < self.message - 1:
+            kind = _kind_of(moving)
+            size = _size_of(moving)
+            if size is None and self._section.entry_of(kind) is None:
+                self.shapeless[identity] = kind
+                return None
+            passage = ObjectPassage(str(identity), kind, size)
+            self.passages.append(passage)
+        self.travellers[identity] = self.message, passage
+        return passage
+
+
+def read_osi(path: Path, section: TrafficSection, first_s: float, last_s: float) -> TraceContent:
+    """Read the moving objects of a trace between two times, and the messages before and after.
+
+    Only these messages stay in memory.
+
+    Raises
+    ------
+    LidarError
+        If betterosi is missing, or the file cannot be read or has no ground truth.
+    """
+    need("betterosi", "osi", f"{path} is read")
+    collector = _PassageCollector(section, first_s)
+    stationary = 0
+    for truth in _ground_truths(path):
+        previous_s = collector.time_s
+        with reading(str(path)):
+            collector.add(truth)
+        stationary = max(stationary, len(truth.stationary_object))
+        if previous_s > last_s:  # the first message after the last time is needed as well
+            break
+    if collector.message < 0:
+        raise LidarError(
+            f"{path} has no ground truth: give a trace of messages GroundTruth, or SensorView that "
+            "contain them."
+        )
+    notes = []
+    if collector.shapeless:
+        kinds = ", ".join(sorted(set(collector.shapeless.values())))
+        notes.append(
+            f"{section.file}: {plural(len(collector.shapeless), 'moving object')} without "
+            f"dimensions left out ({kinds}): give entries of traffic.vehicles for these types"
+        )
+    if stationary:
+        notes.append(
+            f"{section.file}: {plural(stationary, 'stationary object')} left out: only moving "
+            "objects are actors"
+        )
+    present = [
+        passage
+        for passage in collector.passages
+        if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
+    ]
+    return TraceContent(present, len(collector.travellers), notes)
+
+
+def _ground_truths(path: Path) -> Iterator[Any]:
+    """Yield the ground truth of each message of a trace; LidarError if it has none."""
+    osi: Any = import_module("betterosi")
+    with reading(str(path)):
+        if not input_size(path):
+            raise LidarError("it is empty.")
+        is_mcap = path.suffix.lower() == ".mcap"
+        kind = None if is_mcap else _message_type(osi, path)
+        messages = osi.read(str(path), return_ground_truth=True, osi_message_type=kind)
+        try:
+            truth = next(messages, None)
+        except ValueError as error:
+            if is_mcap or kind is not None:
+                raise
+            raise LidarError(
+                "its first message is neither GroundTruth nor SensorView, or might be both: name "
+                "the file as in town_gt.osi or town_sv.osi."
+            ) from error
+    while truth is not None:
+        yield truth
+        with reading(str(path)):
+            truth = next(messages, None)
+
+
+def _message_type(osi: Any, path: Path) -> str | None:
+    """Return the type of messages by the name of a trace; None if the content must tell.
+
+    LidarError if the name tells of messages without ground truth.
+    """
+    kind: str | None = osi.io.osi_message_type_from_filename(path)
+    if kind in (None, "GroundTruth", "SensorView"):
+        return kind
+    raise LidarError(
+        f"it has messages {kind} by its name: give a trace of GroundTruth or SensorView."
+    )
+
+
+def _pose_of(moving: Any) -> list[float]:
+    """Return the numbers of a row of `ObjectPassage`; NaN without a position."""
+    base = moving.base
+    if base is None or base.position is None:
+        return _ROW * [np.nan]
+    position = base.position
+    angles = base.orientation
+    rotation = [0.0, 0.0, 0.0] if angles is None else [angles.yaw, angles.pitch, angles.roll]
+    return [position.x, position.y, position.z, *rotation]
+
+
+def _size_of(moving: Any) -> tuple[float, float, float] | None:
+    """Return length, width and height; None without dimensions. ValueError if they are absurd."""
+    size = None if moving.base is None else moving.base.dimension
+    if size is None:
+        return None
+    sides = (size.length, size.width, size.height)
+    if sides == (0.0, 0.0, 0.0):
+        return None
+    if not all(0 < side <= _MAX_SIZE_M for side in sides):
+        raise ValueError(f"a moving object has the dimensions {sides}, metres")
+    return sides
+
+
+def _kind_of(moving: Any) -> str:
+    """Return the type of a moving object in lower case: of vehicles, that of the classification."""
+    kind = getattr(moving.type, "name", "").lower()
+    if kind == "vehicle" and moving.vehicle_classification is not None:
+        vehicle = getattr(moving.vehicle_classification.type, "name", "").lower()
+        return kind if vehicle in ("", "unknown", "other") else vehicle
+    return kind if kind not in ("", "unknown") else "object"

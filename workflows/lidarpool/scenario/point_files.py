@@ -1,0 +1,399 @@
+"""Point clouds in files: positions, where they were seen from, classes, intensities and colours."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance, bytes_of, memory
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints
+from lidarsim.base.errors import LidarError, explained, prefixed
+from lidarsim.base.extras import need
+from lidarsim.base.input_files import check_input, input_size, read_input, read_input_text
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import plural, printable
+from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.mesh_formats import advice_on
+from lidarsim.scene.files.pcd import checked_pcd
+from lidarsim.scene.files.polygon_files import read_ply_columns
+from lidarsim.scene.scene_instances import MAX_COORDINATE_M
+from lidarsim.scene.transform import affine
+
+from ..base.open3d_module import load_open3d
+
+MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
+POINT_BYTES = 700  # peak memory per point while surfels are computed and written
+_E57_BYTES = 24  # of the coordinates of a point, at least
+# Names of columns in files of various programs; the first name that a file has is read.
+_CLASSES = (
+    "class", "classification", "scalar_Classification", "scalar_classification", "label",
+    "scalar_Label", "scalar_label",
+)  # fmt: skip
+_INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectivity", "i")
+_COLOURS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
+_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+_ORIGINS = (("origin_x", "origin_y", "origin_z"),)
+
+Columns = dict[str, AnyArray]  # {name in the file: (n,)}
+Vectors = tuple[str, str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class ScannedPoints:
+    """Points of a file, in metres, and the quantities that surfels keep; None for those without.
+
+    Attributes
+    ----------
+    positions
+        float64 (n, 3), finite, metres.
+    outward
+        float64 (n, 3): direction to the scanner, or the normal of the file; zero if unknown.
+    classes
+        int64 (n,).
+    intensities
+        float64 (n,), in the scale of the file.
+    colours
+        uint8 (n, 3), sRGB.
+    """
+
+    positions: Floats
+    outward: Floats | None = None
+    classes: Ints | None = None
+    intensities: Floats | None = None
+    colours: Bytes | None = None
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def take(self, rows: Indices) -> ScannedPoints:
+        """Return selected points."""
+        return ScannedPoints(
+            self.positions[rows],
+            None if self.outward is None else self.outward[rows],
+            None if self.classes is None else self.classes[rows],
+            None if self.intensities is None else self.intensities[rows],
+            None if self.colours is None else self.colours[rows],
+        )
+
+
+@dataclass
+class _FileContent:
+    """Points in the units of a file, its further columns, and what was read and has no use."""
+
+    positions: Floats  # (n, 3)
+    columns: Columns
+    scanners: Floats | None = None  # (n, 3): NaN where unknown
+    ignored: list[str] = field(default_factory=list)
+
+
+def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> ScannedPoints:
+    """Return the finite points of a file.
+
+    Parameters
+    ----------
+    path
+        A file of `SUFFIXES`.
+    unit
+        Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+    tell
+        Called with a line on converted units, and a line on the columns that are left out.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read, is too large, or has fewer than `MIN_POINTS` points.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        if advice := advice_on(path):
+            raise LidarError(f"{path} is not read: {advice}.")
+        raise LidarError(
+            f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "
+            f"{' '.join(SUFFIXES)}."
+        )
+    try:
+        with explained(f"{path} cannot be read"), prefixed(path):
+            check_input(path)
+            metres = _unit_lengths_m(path, unit, tell)
+            content = _READERS[suffix](path)
+            points = _scanned_points(content, metres)
+    except LidarError:
+        raise
+    except Exception as error:  # readers raise whatever they stumble over
+        reason = printable(str(error).partition("\n")[0])[:200] or type(error).__name__
+        raise LidarError(f"{path} is broken or cut short ({reason}).") from error
+    _check_points(path, points)
+    if names := _left_out(content):
+        tell(f"{path}: not kept, because surfels have no room for them: {', '.join(names)}")
+    return points
+
+
+def _check_points(path: Path, points: ScannedPoints) -> None:
+    """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
+    if len(points) < MIN_POINTS:
+        raise LidarError(
+            f"{path} has {len(points)} points, and at least {MIN_POINTS} are needed: it is empty, "
+            "cut short, or no point cloud."
+        )
+    if (reach := np.abs(points.positions).max()) > MAX_COORDINATE_M:
+        raise LidarError(
+            f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
+            "broken, or in another unit (--unit, in Python unit=)."
+        )
+
+
+def _scanned_points(content: _FileContent, metres: Floats) -> ScannedPoints:
+    """Return the finite points of a file's content in metres, with the columns that are kept."""
+    columns = content.columns
+    positions = content.positions * metres
+    colours = _first_vectors(columns, _COLOURS)
+    outward = _first_vectors(columns, _NORMALS)
+    scanners = content.scanners
+    if scanners is None:
+        scanners = _first_vectors(columns, _ORIGINS)
+    if scanners is not None:
+        outward = scanners * metres - positions
+    classes = _first(columns, _CLASSES)
+    intensities = _first(columns, _INTENSITIES)
+    points = ScannedPoints(
+        positions,
+        None if outward is None else np.nan_to_num(outward.astype(np.float64)),
+        None if classes is None else _as_integers(classes),
+        None if intensities is None else np.nan_to_num(intensities.astype(np.float64)),
+        None if colours is None else _as_srgb_bytes(colours),
+    )
+    # Depth cameras write NaN for pixels without a return.
+    finite = np.isfinite(positions).all(axis=1)
+    return points if finite.all() else points.take(np.flatnonzero(finite))
+
+
+def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
+    """Return the first column that a file has and that is not zero throughout; else None.
+
+    LAS has a column for each quantity, zero where the quantity was not measured.
+    """
+    present = (columns[name] for name in names if name in columns)
+    return next((values for values in present if values.any()), None)
+
+
+def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | None:
+    """Return the first three columns of vectors that a file has, (n, 3); None without any."""
+    for axes in names:
+        if all(name in columns for name in axes):
+            vectors = np.stack([columns[name] for name in axes], axis=1)
+            if vectors.any():
+                return vectors
+    return None
+
+
+def _as_integers(classes: AnyArray) -> Ints:
+    """Return classes as integers; ValueError if a class is no whole number."""
+    numbers = classes.astype(np.int64)
+    if not np.array_equal(numbers, classes):
+        raise ValueError("classes of its points are not whole numbers")
+    return numbers
+
+
+def _as_srgb_bytes(colours: AnyArray) -> Bytes:
+    """Return colours (n, 3) as bytes: of 8 or 16 bits, or real numbers from 0 to 1 or 255."""
+    if colours.dtype == np.uint8:
+        return colours
+    values = np.nan_to_num(colours.astype(np.float64))
+    highest = values.max()
+    if highest <= 1 and colours.dtype.kind == "f":
+        values = 255 * values
+    elif highest > 255:
+        values = values / 257  # 16 bits; several programs write 8 bits into the 16 of LAS
+    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
+
+
+def _left_out(content: _FileContent) -> list[str]:
+    """Return the names of the columns that surfels do not keep and that are not zero."""
+    columns = content.columns
+    used: set[str] = set()
+    for names in (_CLASSES, _INTENSITIES):
+        used.update([name for name in names if name in columns][:1])
+    for axes in (*_COLOURS, *_NORMALS, *_ORIGINS):
+        used.update(axes)
+    remaining = [name for name, values in columns.items() if name not in used and np.any(values)]
+    return [printable(name) for name in [*remaining, *content.ignored]]
+
+
+def _unit_lengths_m(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
+    """Return the metres in the units of x, y and z of a file, (3,)."""
+    if unit is not None:
+        return np.full(3, UNITS_M[unit])
+    units = las_units(path) if path.suffix.lower() in (".las", ".laz") else None
+    if units is None:
+        return np.ones(3)
+    if note := units.note():
+        tell(f"{path} {note}")
+    return np.array(units.factors)
+
+
+def _from_columns(columns: Columns) -> _FileContent:
+    """Return the content of columns that include x, y and z; ValueError if an axis is missing."""
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its vertices have no {', '.join(missing)}")
+    positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
+    return _FileContent(positions, columns)
+
+
+def _read_ply(path: Path) -> _FileContent:
+    """Read the vertices of a .ply."""
+    return _from_columns(read_ply_columns(read_input(path)))
+
+
+def _read_pcd(path: Path) -> _FileContent:
+    """Read points of a .pcd; Open3D reads all encodings but text.
+
+    Open3D returns uninitialised memory as points for truncated text.
+    """
+    header = checked_pcd(path)
+    count = int(header["POINTS"][0])
+    if header["DATA"][0] == "ascii":
+        content = _from_columns(_read_pcd_text(path, header))
+    else:
+        o3d = load_open3d()
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            cloud = o3d.t.io.read_point_cloud(str(path), format="pcd")
+        content = _from_columns(_open3d_columns(cloud))
+    if len(content.positions) != count:
+        raise ValueError(f"{count:,} points announced, and {len(content.positions):,} are there")
+    return content
+
+
+def _open3d_columns(cloud: Any) -> Columns:
+    """Return the columns of a cloud of Open3D, with x, y and z, nx, ny and nz, red, green, blue."""
+    vectors = {"positions": "xyz", "normals": _NORMALS[0], "colors": _COLOURS[0]}
+    columns: Columns = {}
+    for name, tensor in cloud.point.items():
+        values = tensor.numpy()
+        for axis, values_of_axis in enumerate(values.T):
+            columns[vectors[name][axis] if name in vectors else name] = values_of_axis
+    return columns
+
+
+def _read_pcd_text(path: Path, header: Mapping[str, list[str]]) -> Columns:
+    """Return the columns of a .pcd of text."""
+    repeats = list(map(int, header.get("COUNT", ["1"] * len(header["FIELDS"]))))
+    starts = accumulate(repeats, initial=0)
+    _, _, rows = read_input(path).partition(b"\nDATA ascii")
+    values = np.loadtxt(io.BytesIO(rows), skiprows=1, ndmin=2)
+    columns = dict(zip(header["FIELDS"], values.T[list(starts)[:-1]], strict=True))
+    for name in ("rgb", "rgba"):  # bits 0x00RRGGBB, as an integer or as a real number
+        if name not in columns:
+            continue
+        is_real = header["TYPE"][header["FIELDS"].index(name)] == "F"
+        packed = columns.pop(name)
+        bits = packed.astype("<f4").view("<u4") if is_real else packed.astype(np.uint32)
+        for shift, colour in zip((16, 8, 0), _COLOURS[0], strict=True):
+            columns[colour] = (bits >> shift & 255).astype(np.uint8)
+    return columns
+
+
+def _read_xyz(path: Path) -> _FileContent:
+    """Read the first three numbers of each line."""
+    text = read_input_text(path)
+    positions = np.loadtxt(io.StringIO(text), usecols=(0, 1, 2), ndmin=2)
+    lines = (line.split("#")[0].split() for line in text.splitlines())
+    surplus = len(next((words for words in lines if words), ())) - 3
+    ignored = [f"{plural(surplus, 'column')} after x, y and z"] if surplus > 0 else []
+    return _FileContent(positions, {}, ignored=ignored)
+
+
+def _check_count(count: int) -> None:
+    """Raise LidarError if points would exceed the memory."""
+    if (size := count * POINT_BYTES) > memory():
+        raise LidarError(
+            f"it has {count:,} points, which take {bytes_of(size)} of memory: thin it first."
+        )
+
+
+def _read_las(path: Path) -> _FileContent:
+    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
+    with open_las(path) as reader:
+        _check_count(reader.header.point_count)
+        points = reader.read_points(-1)
+    names = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    positions = np.stack([points.x, points.y, points.z], axis=1)
+    columns = {name: np.asarray(points[name]) for name in names}
+    return _FileContent(positions, {n: c for n, c in columns.items() if c.ndim == 1})
+
+
+def _read_e57(path: Path) -> _FileContent:
+    """Read all scans of an E57, joined in the frame of the file, with their scanners' positions."""
+    need("pye57", "e57", "it is read")
+    file = import_module("pye57").E57(str(path))
+    try:
+        headers = [file.get_header(number) for number in range(file.scan_count)]
+        count = sum(header.point_count for header in headers)
+        _check_count(count)
+        Allowance(input_size(path), "thin it first").take(_E57_BYTES * count)
+        scans = [_read_scan(file, number, header) for number, header in enumerate(headers)]
+    finally:
+        file.close()
+    if not scans:
+        raise ValueError("it has no scans")
+    # A quantity that only some scans have is zero in the others.
+    columns = {
+        name: np.concatenate(
+            [scan.columns.get(name, np.zeros(len(scan.positions), values.dtype)) for scan in scans]
+        )
+        for name, values in {n: c for scan in scans for n, c in scan.columns.items()}.items()
+    }
+    positions = np.concatenate([scan.positions for scan in scans])
+    scanners = np.concatenate([scan.scanners for scan in scans if scan.scanners is not None])
+    ignored = list(dict.fromkeys(name for scan in scans for name in scan.ignored))
+    has_pose = np.isfinite(scanners).any()
+    return _FileContent(positions, columns, scanners if has_pose else None, ignored)
+
+
+def _read_scan(file: Any, number: int, header: Any) -> _FileContent:
+    """Return a scan of an E57 in the frame of the file."""
+    columns = file.read_scan_raw(number, ignore_unsupported_fields=True)
+    ignored = [name for name in header.point_fields if name not in columns]
+    kind = "cartesian" if "cartesianX" in columns else "spherical"
+    positions = _positions_of_scan(columns, kind)
+    invalid = columns.pop(f"{kind}InvalidState", None)
+    if invalid is not None and invalid.any():
+        rows = np.flatnonzero(invalid == 0)
+        positions = positions[rows]
+        columns = {name: values[rows] for name, values in columns.items()}
+    scanner = np.full(3, np.nan)
+    if header.has_pose():
+        pose = affine(header.rotation_matrix, header.translation)
+        positions = positions @ pose[:3, :3].T + pose[:3, 3]
+        scanner = pose[:3, 3]
+    return _FileContent(positions, columns, np.tile(scanner, (len(positions), 1)), ignored)
+
+
+def _positions_of_scan(columns: Columns, kind: str) -> Floats:
+    """Take the coordinates of an E57 scan out of its columns; return Cartesian positions (n, 3)."""
+    if kind == "cartesian":
+        return np.stack([columns.pop(f"cartesian{axis}") for axis in "XYZ"], axis=1)
+    range_m = columns.pop("sphericalRange")
+    azimuth = columns.pop("sphericalAzimuth")
+    elevation = columns.pop("sphericalElevation")
+    across = range_m * np.cos(elevation)
+    return np.stack(
+        [across * np.cos(azimuth), across * np.sin(azimuth), range_m * np.sin(elevation)], axis=1
+    )
+
+
+_READERS: dict[str, Callable[[Path], _FileContent]] = {
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
+    ".xyz": _read_xyz,
+    ".las": _read_las,
+    ".laz": _read_las,
+    ".e57": _read_e57,
+}
+SUFFIXES = tuple(_READERS)
