@@ -14,7 +14,7 @@ from typing import Any
 
 
 class UsdServer:
-    """Takes the place of `subprocess.Popen` for `lidarscenes.files.usd`."""
+    """Takes the place of `subprocess.Popen` for `lidarscenes.files.child_process`."""
 
     def __init__(self) -> None:
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -21,7 +21,7 @@ from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarscenes.files import usd
+from lidarscenes.files import child_process, usd
 from lidarsim.base import allowance
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.table import COLOURS
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core
 def forked(server, monkeypatch):
     """Processes of one that has imported usd-core once."""
     names = {name: getattr(subprocess, name) for name in ("DEVNULL", "PIPE")}
-    monkeypatch.setattr(usd, "subprocess", SimpleNamespace(Popen=server, **names))
+    monkeypatch.setattr(child_process, "subprocess", SimpleNamespace(Popen=server, **names))
 
 
 @pytest.fixture(scope="module")
@@ -629,7 +629,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
 def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
-    monkeypatch.setattr(usd, "subprocess", subprocess)
+    monkeypatch.setattr(child_process, "subprocess", subprocess)
     monkeypatch.setattr(usd, "USD_CORE_BYTES", 0)
     monkeypatch.setattr(usd, "memory_share", lambda: 60 * 2**20)
     with pytest.raises(LidarError, match=r"m\.usda is broken or cut short \("):

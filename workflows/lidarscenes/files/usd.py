@@ -7,11 +7,7 @@ to other files are resolved by usd-core; content from outside the scene's folder
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import signal
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -23,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance, bytes_of, memory_share
+from lidarsim.base.allowance import Allowance, memory_share
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.vectors import inverse, matmul
 from lidarsim.base.words import plural
@@ -54,6 +50,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
 
+from .child_process import ChildReader, Frame, child_frames, environment_without
 from .usd_materials import MeshLook, UsdMaterials, material_pieces
 
 _LIMITS = {
@@ -64,8 +61,6 @@ _LIMITS = {
 USD_CORE_BYTES = 512 * 2**20  # bytes that usd-core takes for any file
 _LATEST_S = 9e8
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
-
-_Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
 def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -85,7 +80,7 @@ def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _contents(
-    frames: Iterator[_Frame],
+    frames: Iterator[Frame],
     stage: dict[str, Any],
     stem: str,
     options: ReadOptions,
@@ -109,56 +104,27 @@ def _contents(
                 materials.coloured = False  # all poses have the colours of the first
 
 
-def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[_Frame]:
+def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[Frame]:
     """Read a file in a process of its own, and yield the frames of its standard output."""
-    script = Path(__file__).with_name("usd_child.py")
-    memory = memory_share() + USD_CORE_BYTES
-    # The user's plug-ins and search paths would change the scene.
-    environment = {name: text for name, text in os.environ.items() if not name.startswith("PXR_")}
-    # A thread that is refused for the memory limit would be waited for until the alarm. One thread
-    # takes a sixth longer for 100 layers.
-    environment |= {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
-    request = options._asdict() | {"most": _LIMITS, "memory": memory, "rate_hz": RATE_HZ}
-    with subprocess.Popen(
-        # -P: our modules must not take the place of the library's.
-        [sys.executable, "-P", script, path.absolute(), json.dumps(request, default=str)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=path.parent,
-        env=environment,
-    ) as child:
-        assert child.stdout
-        try:
-            while line := child.stdout.readline():
-                frame = json.loads(line)
-                arrays = []
-                for kind, shape in frame["arrays"]:
-                    size = np.dtype(kind).itemsize * math.prod(shape)
-                    if frame["what"] == "image":
-                        allowance.grow(size)
-                    allowance.take(size)
-                    arrays.append(np.frombuffer(child.stdout.read(size), kind).reshape(shape))
-                match frame["what"]:
-                    case "error":
-                        raise ValueError(frame["reason"])
-                    case "too many":
-                        limit = f"{_LIMITS[frame['of']]:,} {frame['of']}"
-                        raise MeshFileError(f"has more than {limit}: export it in parts")
-                for file in map(Path, frame.get("files", ())):
-                    if not (options.allows(file) or file.samefile(path)):
-                        raise MeshFileError(outside(os.path.relpath(file, path.resolve().parent)))
-                    allowance.add_file(file)
-                yield frame, arrays
-            code = child.wait()
-        finally:
-            child.kill()
-    if code == -signal.SIGALRM:
-        raise ValueError("usd-core takes too long for it")
-    status = signal.Signals(-code).name if code < 0 else f"status {code}"
-    raise ValueError(
-        f"usd-core ended with {status}, or needs more than {bytes_of(memory)} of memory"
+    reader = ChildReader(
+        script="usd_child.py",
+        library="usd-core",
+        max_bytes=memory_share() + USD_CORE_BYTES,
+        # The user's plug-ins and search paths would change the scene. One thread takes a sixth
+        # longer for 100 layers.
+        environment=environment_without("PXR_") | {"PXR_WORK_THREAD_LIMIT": "1"},
     )
+    request = options._asdict() | {"most": _LIMITS, "rate_hz": RATE_HZ}
+    with closing(child_frames(reader, path, request, allowance)) as frames:
+        for frame, arrays in frames:
+            if frame["what"] == "too many":
+                limit = f"{_LIMITS[frame['of']]:,} {frame['of']}"
+                raise MeshFileError(f"has more than {limit}: export it in parts")
+            for file in map(Path, frame.get("files", ())):
+                if not (options.allows(file) or file.samefile(path)):
+                    raise MeshFileError(outside(os.path.relpath(file, path.resolve().parent)))
+                allowance.add_file(file)
+            yield frame, arrays
 
 
 def _polygon_mesh(
