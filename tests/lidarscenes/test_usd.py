@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from tests.usd_server import UsdServer
+from tests.child_server import ChildServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarpool.scenario.advice import advice
@@ -43,7 +43,7 @@ def forked(server, monkeypatch):
 
 @pytest.fixture(scope="module")
 def server():
-    with closing(UsdServer()) as server:
+    with closing(ChildServer("pxr")) as server:
         yield server
 
 

@@ -45,7 +45,7 @@ from .sections import (
 )
 
 # Fields of a mesh file's entry that are options of `load_objects`, with the same names.
-_READING_FIELDS = {"unit", "up_axis", "opacity", "step_m", "window", "sag_m", "geometry"}
+_READING_FIELDS = {"unit", "up_axis", "opacity", "step_m", "window", "sag_m", "storeys", "geometry"}
 # Fields of a mesh file's entry that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
 

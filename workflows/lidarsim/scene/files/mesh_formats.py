@@ -54,6 +54,8 @@ class MeshFormat:
         Whether files may have shapes for collisions, see `ReadOptions.collisions`.
     roads
         Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
+    storeys
+        Whether files are buildings, whose reader takes `ReadOptions.storeys`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -68,6 +70,7 @@ class MeshFormat:
     raster: bool = False
     collisions: bool = False
     roads: bool = False
+    storeys: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -134,10 +137,6 @@ _NOT_READ = (
     MeshFormat(
         (".dwg", ".skp"),
         advice="export it as .dae, .obj or .glb from the program that wrote it",
-    ),
-    MeshFormat(
-        (".ifc", ".ifczip"),
-        advice="it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb",
     ),
     MeshFormat(
         (".gml",),

@@ -1,5 +1,6 @@
-"""A process that has imported usd-core, and forks itself for each file: a quarter of the time."""
+"""A process that has imported a library, and forks itself for each file: a quarter of the time."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -13,12 +14,12 @@ from types import SimpleNamespace
 from typing import Any
 
 
-class UsdServer:
+class ChildServer:
     """Takes the place of `subprocess.Popen` for `lidarscenes.files.child_process`."""
 
-    def __init__(self) -> None:
+    def __init__(self, library: str) -> None:
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self._process = subprocess.Popen([sys.executable, "-P", __file__], **pipes)
+        self._process = subprocess.Popen([sys.executable, "-P", __file__, library], **pipes)
 
     def close(self) -> None:
         self._process.communicate()
@@ -35,11 +36,22 @@ class UsdServer:
             wait()
 
 
-def serve() -> None:
+def warm_up_pxr() -> None:
+    """Load most of usd-core."""
     from pxr import Usd, UsdGeom, UsdUtils
 
-    UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of the library
+    UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")
     UsdUtils.CoalescingDiagnosticDelegate()
+
+
+def warm_up_ifcopenshell() -> None:
+    """Load what a reader of buildings imports."""
+    for module in ("geom", "util.geolocation", "util.unit"):
+        importlib.import_module(f"ifcopenshell.{module}")
+
+
+def serve(library: str) -> None:
+    globals()[f"warm_up_{library}"]()
     compiled = cache(lambda path: compile(Path(path).read_text(), path, "exec"))
     for line in sys.stdin:
         args, cwd, env, pipe = json.loads(line)
@@ -56,4 +68,4 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
-    serve()
+    serve(sys.argv[1])
