@@ -56,8 +56,8 @@ _CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
 }
 _OTHER_CLASS = (1, "unclassified")
 
-_MIN_MEMORY = 1024 * 2**20  # bytes that ifcopenshell and its process may take for any file
-_MEMORY_TIMES = 30  # of the file's bytes
+MIN_MEMORY_BYTES = 1024 * 2**20  # bytes that ifcopenshell and its process may take for any file
+MEMORY_TIMES = 30  # of the file's bytes
 _END = b"END-ISO-10303-21"
 _END_BYTES = 200  # bytes of a file that contain its end
 _MAX_SCALE_ERROR = 0.1  # of a map conversion: metres of a map are metres of a building, nearly
@@ -79,16 +79,16 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     size = path.stat().st_size
     allowance = Allowance(size, _ADVICE)
     # Packed files are about a tenth.
-    memory = _MIN_MEMORY + _MEMORY_TIMES * (10 * size if is_packed else size)
+    memory = MIN_MEMORY_BYTES + MEMORY_TIMES * (10 * size if is_packed else size)
     reader = ChildReader(
         script="ifc_child.py",
         library="ifcopenshell",
-        max_bytes=min(memory, _MIN_MEMORY + memory_share()),
+        max_bytes=min(memory, MIN_MEMORY_BYTES + memory_share()),
         environment=environment_without("IFCOPENSHELL_"),
     )
     request = {
         "storeys": options.storeys,
-        "max_unpacked": min(UNPACKED_TIMES * size, memory_share() // _MEMORY_TIMES),
+        "max_unpacked": min(UNPACKED_TIMES * size, memory_share()),
     }
     shapes = _Shapes(options, allowance)
     building: dict[str, Any] = {}
