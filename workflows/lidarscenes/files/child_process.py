@@ -44,7 +44,7 @@ def child_frames(
     Raises
     ------
     ValueError
-        If the script reports an error, or ends without closing its output by its reader.
+        If the script reports an error, or ends while further frames are read.
     """
     command = json.dumps(request | {"memory": reader.max_bytes}, default=str)
     with subprocess.Popen(

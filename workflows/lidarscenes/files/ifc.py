@@ -69,7 +69,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the elements of a building, all or of the storeys in `options`."""
     is_packed = path.suffix.lower() == ".ifczip"
     if not is_packed and b"ISO-10303-21" not in data:
-        raise MeshFileError("is not IFC: it does not begin with ISO-10303-21")
+        raise ValueError("it does not begin with ISO-10303-21")
     if find_spec("ifcopenshell") is None:
         raise MeshFileError('is IFC, which ifcopenshell reads: pip install "lidarpool[ifc]"')
     if sys.platform == "win32":  # where a process has no limits of memory
@@ -141,9 +141,7 @@ class _Shapes:
 
         `plain_material` is the name of the material of faces without a style.
         """
-        if not self._options.materials:
-            plain_material = ""
-        key = (number, plain_material)
+        key = (number, plain_material if self._options.materials else "")
         if key not in self._meshes:
             self._meshes[key] = self._mesh(number, name, plain_material)
         return self._meshes[key]
@@ -163,9 +161,7 @@ class _Shapes:
             if self._options.colours and material["colour"] is not None:
                 colour = as_bytes(material["colour"]).reshape(1, 1, 3)
                 colours = Colours.plain(colour, len(style_faces))
-            material_name = material["name"] or plain_material
-            if not self._options.materials:
-                material_name = ""
+            material_name = material["name"] or plain_material if self._options.materials else ""
             pieces.append(Piece(vertices, style_faces, None, colours, material_name))
         return join_pieces(name, pieces, self._allowance)
 
