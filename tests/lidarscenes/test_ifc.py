@@ -1,8 +1,9 @@
 """IFC: places, names, classes, storeys, openings, styles and units of elements."""
 
+import io
 import subprocess
 import zipfile
-from contextlib import closing
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -401,4 +402,21 @@ def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
     path = tmp_path / "a.ifc"
     path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
     with pytest.raises(LidarError, match=r"ifcopenshell reads: pip install \"lidarpool\[ifc\]\""):
+        load_meshes(path)
+
+
+@pytest.mark.parametrize("cut", [10, 60])
+def test_a_process_that_dies_within_a_frame_is_reported(tmp_path, monkeypatch, cut):
+    output = b'{"what": "shape", "arrays": [["<f8", [4, 3]]]}\n' + bytes(96)
+
+    @contextmanager
+    def dying(command, **options):
+        yield SimpleNamespace(stdout=io.BytesIO(output[:cut]), wait=lambda: -11, kill=lambda: None)
+
+    library = SimpleNamespace(Popen=dying, DEVNULL=None, PIPE=None)
+    monkeypatch.setattr(child_process, "subprocess", library)
+    monkeypatch.setattr(reader, "find_spec", lambda name: True)
+    path = tmp_path / "a.ifc"
+    path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
+    with pytest.raises(LidarError, match="ifcopenshell ended with SIGSEGV"):
         load_meshes(path)

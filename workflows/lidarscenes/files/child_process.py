@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -64,15 +64,8 @@ def child_frames(
     ) as child:
         assert child.stdout
         try:
-            while line := child.stdout.readline():
-                frame = json.loads(line)
-                arrays = []
-                for kind, shape in frame["arrays"]:
-                    size = np.dtype(kind).itemsize * math.prod(shape)
-                    if frame["what"] == "image":
-                        allowance.grow(size)
-                    allowance.take(size)
-                    arrays.append(np.frombuffer(child.stdout.read(size), kind).reshape(shape))
+            while content := _next_frame(child.stdout, allowance):
+                frame, arrays = content
                 if frame["what"] == "error":
                     raise ValueError(frame["reason"])
                 yield frame, arrays
@@ -86,6 +79,25 @@ def child_frames(
         f"{reader.library} ended with {status}, or needs more than {bytes_of(reader.max_bytes)} of "
         "memory"
     )
+
+
+def _next_frame(stream: IO[bytes], allowance: Allowance) -> Frame | None:
+    """Read a frame; None at the end, also of a process that ended within a frame."""
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        return None
+    frame = json.loads(line)
+    arrays = []
+    for kind, shape in frame["arrays"]:
+        size = np.dtype(kind).itemsize * math.prod(shape)
+        if frame["what"] == "image":
+            allowance.grow(size)
+        allowance.take(size)
+        data = stream.read(size)
+        if len(data) < size:
+            return None
+        arrays.append(np.frombuffer(data, kind).reshape(shape))
+    return frame, arrays
 
 
 def environment_without(prefix: str) -> dict[str, str]:
