@@ -18,6 +18,8 @@ UsdGeom.Mesh.Define(Usd.Stage.CreateInMemory(), "/Mesh")  # which loads most of 
 UsdUtils.CoalescingDiagnosticDelegate()
 """
 
+IFCOPENSHELL = "import ifcopenshell.geom, ifcopenshell.util.geolocation, ifcopenshell.util.unit"
+
 
 class ForkServer:
     """Takes the place of `subprocess.Popen` for `lidarscenes.files.child_process`."""

@@ -63,9 +63,9 @@ def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distr
 
 
 def test_a_plugin_reads_what_the_table_has_only_advice_for(tmp_path, distribution):
-    assert "IfcConvert" in refused(load_meshes, write(tmp_path / "b.ifczip", "anything"))
-    mesh(distribution, "ifc-mesh", "ifc", TRIANGLE.format(ending="ifc"))
-    assert len(load_meshes(write(tmp_path / "b.ifc", "anything"))) == 1
+    assert "FreeCAD" in refused(load_meshes, write(tmp_path / "b.stp", "anything"))
+    mesh(distribution, "step-mesh", "step", TRIANGLE.format(ending="step"))
+    assert len(load_meshes(write(tmp_path / "b.step", "anything"))) == 1
 
 
 def test_an_unknown_ending_lists_those_of_plugins(tmp_path, distribution):

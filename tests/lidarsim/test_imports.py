@@ -34,7 +34,7 @@ import lidarsim
 
 for package in (lidarsim, lidarscenes):
     for module in walk_packages(package.__path__, package.__name__ + "."):
-        if not module.name.endswith("usd_child"):  # which runs in a process of its own
+        if not module.name.endswith("_child"):  # which run in processes of their own
             import_module(module.name)
 from lidarsim import Noise, Pose, Returns, Scanner, Scene, load_sensor
 

@@ -255,6 +255,7 @@ EXTRAS = {
     "clusters": r"--cluster\b|\bdask_jobqueue\b",
     "fit": r"\blidarpool fit\b|\.pcap\b",
     "usd": r"\.usd[acz]?\b",
+    "ifc": r"\.ifc\b",
     "geo": r"\.tiff?\b|\bepsg\b",
 }
 
@@ -306,7 +307,13 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
 
 @pytest.mark.parametrize(
     ("page", "package"),
-    [("openusd", "pxr"), ("cityjson", "json"), ("roads", "json"), ("terrain", "rasterio")],
+    [
+        ("openusd", "pxr"),
+        ("cityjson", "json"),
+        ("roads", "json"),
+        ("ifc", "ifcopenshell"),
+        ("terrain", "rasterio"),
+    ],
 )
 def test_a_scene_is_checked_as_shown(lidarpool, page, package):
     pytest.importorskip(package)
@@ -402,6 +409,7 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
                 "how-to/cityjson",
                 "how-to/openusd",
                 "how-to/roads",
+                "how-to/ifc",
             ),
             endings(),
         ),

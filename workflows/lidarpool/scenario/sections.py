@@ -85,9 +85,9 @@ class MeshFile(Section):
         str,
         about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), roads of "
-            "OpenDRIVE (.xodr), voxels of AMAPVox (.vox), a world of Gazebo (.sdf), a model of "
-            "MuJoCo (.xml), a robot that stands still (.urdf), or a raster of heights: .tif .asc "
-            ".hgt .img .dem .dt2; from the scenario's folder",
+            "OpenDRIVE (.xodr), buildings of IFC (.ifc), voxels of AMAPVox (.vox), a world of "
+            "Gazebo (.sdf), a model of MuJoCo (.xml), a robot that stands still (.urdf), or a "
+            "raster of heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -122,6 +122,10 @@ class MeshFile(Section):
     sag_m: Annotated[
         float | None,
         about("of roads (.xodr): largest distance of triangles from curves, metres", gt=0, le=1),
+    ] = None
+    storeys: Annotated[
+        Several[Text] | None,
+        about("of a building (.ifc): take only the elements of these storeys"),
     ] = None
     opacity: Annotated[
         OpacityMode,

@@ -52,6 +52,7 @@ _READING_FIELDS = {
     "step_m",
     "window",
     "sag_m",
+    "storeys",
     "geometry",
     "keyframe",
     "groups",

@@ -15,7 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -75,14 +75,8 @@ class Child(NamedTuple):
         ) as process:
             assert process.stdout
             try:
-                while line := process.stdout.readline():
-                    frame = json.loads(line)
-                    arrays = []
-                    for kind, shape in frame["arrays"]:
-                        size = np.dtype(kind).itemsize * math.prod(shape)
-                        take(frame, size)
-                        content = process.stdout.read(size)
-                        arrays.append(np.frombuffer(content, kind).reshape(shape))
+                while content := _next_frame(process.stdout, take):
+                    frame, arrays = content
                     if frame["what"] == "error":
                         raise ValueError(frame["reason"])
                     yield frame, arrays
@@ -106,3 +100,20 @@ class Child(NamedTuple):
         status = signal.Signals(-code).name if code < 0 else f"status {code}"
         limit = bytes_of(self.max_bytes)
         return f"{self.library} ended with {status}, or needs more than {limit} of memory"
+
+
+def _next_frame(stream: IO[bytes], take: Callable[[dict[str, Any], int], None]) -> Frame | None:
+    """Read a frame; None at the end, also of a process that has ended within a frame."""
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        return None
+    frame = json.loads(line)
+    arrays = []
+    for kind, shape in frame["arrays"]:
+        size = np.dtype(kind).itemsize * math.prod(shape)
+        take(frame, size)
+        content = stream.read(size)
+        if len(content) < size:
+            return None
+        arrays.append(np.frombuffer(content, kind).reshape(shape))
+    return frame, arrays

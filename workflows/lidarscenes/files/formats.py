@@ -6,6 +6,7 @@ from lidarsim.scene.files.mesh_formats import MeshFormat
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
 ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
+BUILDINGS = (".ifc", ".ifczip")
 WORLDS = (".sdf", ".world")  # of Gazebo
 MODELS = (".xml",)  # of MuJoCo
 
@@ -36,5 +37,12 @@ MESH_FORMATS = (
     MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
     MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
     MeshFormat(MODELS, "lidarscenes.mujoco.model_file:read_mjcf", models=True),
+    MeshFormat(
+        BUILDINGS,
+        "lidarscenes.files.ifc:read_ifc",
+        from_path=True,
+        storeys=True,
+        signatures=(b"ISO-10303-21;",),
+    ),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

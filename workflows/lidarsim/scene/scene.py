@@ -142,6 +142,7 @@ class Scene:
         window: Window | None = None,
         epsg: int | None = None,
         sag_m: float | None = None,
+        storeys: Sequence[str] | None = None,
         assets: str | Path | None = None,
         geometry: Geometry | None = None,
         keyframe: str | None = None,
@@ -149,7 +150,7 @@ class Scene:
         exclude: Sequence[str] = (),
         same_names: SameNames = "number",
     ) -> Scene:
-        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, or a raster (.tif).
+        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, .ifc, or a raster (.tif).
 
         Parameters
         ----------
@@ -168,17 +169,19 @@ class Scene:
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj, .usd). With "ignore", triangles are solid, and no image is read.
         colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
-            and .xodr without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off,
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON,
+            .xodr and .ifc without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off,
             .usd).
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
-            CityJSON, .xodr), by which `Material` may choose them.
+            CityJSON, .xodr, .ifc), by which `Material` may choose them.
         step_m, window, epsg
             Options of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
         sag_m
             Of roads (.xodr): largest distance of triangles from curves in plan, metres; None takes
             0.01.
+        storeys
+            Of a building (.ifc): names of the storeys whose elements are read. None takes all.
         assets
             A folder: further files that the scene file names are read from this folder and from
             the folder of the scene file, and from the folders below. Of a world of Gazebo, models
@@ -217,6 +220,7 @@ class Scene:
             window=window,
             epsg=epsg,
             sag_m=sag_m,
+            storeys=storeys,
             assets=assets,
             geometry=geometry,
             keyframe=keyframe,

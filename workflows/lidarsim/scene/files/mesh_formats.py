@@ -56,6 +56,8 @@ class MeshFormat:
         Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
     models
         Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
+    storeys
+        Whether files are buildings, whose reader takes `ReadOptions.storeys`.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -71,6 +73,7 @@ class MeshFormat:
     collisions: bool = False
     roads: bool = False
     models: bool = False
+    storeys: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -131,10 +134,6 @@ _NOT_READ = (
     MeshFormat(
         (".dwg", ".skp"),
         advice="export it as .dae, .obj or .glb from the program that wrote it",
-    ),
-    MeshFormat(
-        (".ifc", ".ifczip"),
-        advice="it is a building, make a mesh of it: IfcConvert IN.ifc OUT.glb",
     ),
     MeshFormat(
         (".gml",),

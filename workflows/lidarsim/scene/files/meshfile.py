@@ -104,6 +104,7 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     sag_m: Annotated[float, Field(gt=0, le=1)] | None = None,
+    storeys: Annotated[Sequence[str], Field(min_length=1)] | None = None,
     assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
     geometry: Geometry | None = None,
@@ -135,6 +136,8 @@ def load_objects(
     sag_m
         Of roads (.xodr): largest distance of triangles from curves in plan, metres, above 0 to 1;
         heights are ten times as exact. None takes 0.01.
+    storeys
+        Of a building (.ifc): names of the storeys whose elements are read. None takes all elements.
     animation
         Name of the animation to play by the meshes, or the number of an animation without a name;
         "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
@@ -172,6 +175,11 @@ def load_objects(
             f"({' '.join(endings(lambda row: row.roads))})."
         )
     model = _model_options(path, row, keyframe, groups, exclude)
+    if storeys is not None and not row.storeys:
+        raise LidarError(
+            f"{path} has no storeys: leave out storeys, or give a building "
+            f"({' '.join(endings(lambda row: row.storeys))})."
+        )
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
@@ -185,6 +193,7 @@ def load_objects(
         collisions=geometry == "collision",
         sag_m=sag_m,
         model=model,
+        storeys=None if storeys is None else tuple(storeys),
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):

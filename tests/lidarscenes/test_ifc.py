@@ -1,0 +1,422 @@
+"""IFC: places, names, classes, storeys, openings, styles and units of elements."""
+
+import io
+import subprocess
+import zipfile
+from contextlib import closing, contextmanager
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tests.fork_server import IFCOPENSHELL, ForkServer
+
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from lidarscenes.files import child_process
+from lidarscenes.files import ifc as reader
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.meshfile import load_meshes, load_objects
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_instances import SceneInstance
+
+needs_ifcopenshell = pytest.mark.skipif(
+    find_spec("ifcopenshell") is None, reason="needs ifcopenshell, an extra"
+)
+
+
+@pytest.fixture(scope="module")
+def server():
+    if find_spec("ifcopenshell") is None:
+        pytest.skip("needs ifcopenshell, an extra")
+    with closing(ForkServer(IFCOPENSHELL)) as server:
+        yield server
+
+
+@pytest.fixture
+def forked(server, monkeypatch):
+    """Processes of a process that has imported ifcopenshell once."""
+    names = {name: getattr(subprocess, name) for name in ("DEVNULL", "PIPE")}
+    monkeypatch.setattr(child_process, "subprocess", SimpleNamespace(Popen=server, **names))
+
+
+class Model:
+    """A building of boxes.
+
+    Parameters
+    ----------
+    schema
+        Version of IFC.
+    prefix
+        Prefix of the unit, such as MILLI; None for metres, "" for no unit at all.
+    """
+
+    def __init__(self, schema="IFC4", prefix=None):
+        import ifcopenshell
+
+        self._new_id = ifcopenshell.guid.new
+        self.file = ifcopenshell.file(schema=schema)
+        create = self.file.create_entity
+        self.frame = create("IfcAxis2Placement3D", Location=self.point(0, 0, 0))
+        self.context = create(
+            "IfcGeometricRepresentationContext",
+            ContextType="Model",
+            CoordinateSpaceDimension=3,
+            Precision=1e-5,
+            WorldCoordinateSystem=self.frame,
+        )
+        units = [create("IfcSIUnit", UnitType="PLANEANGLEUNIT", Name="RADIAN")]
+        if prefix != "":
+            units.append(create("IfcSIUnit", UnitType="LENGTHUNIT", Prefix=prefix, Name="METRE"))
+        self.project = self.rooted(
+            "IfcProject",
+            "Project",
+            RepresentationContexts=[self.context],
+            UnitsInContext=create("IfcUnitAssignment", Units=units),
+        )
+        self.site = self.rooted("IfcSite", "Site", ObjectPlacement=self.placement(0, 0, 0))
+        self.building = self.rooted("IfcBuilding", "House")
+        self.aggregate(self.project, self.site)
+        self.aggregate(self.site, self.building)
+
+    def rooted(self, kind, name, **attributes):
+        return self.file.create_entity(kind, GlobalId=self._new_id(), Name=name, **attributes)
+
+    def point(self, *numbers):
+        return self.file.create_entity("IfcCartesianPoint", Coordinates=[*map(float, numbers)])
+
+    def placement(self, *at, relative=None):
+        frame = self.file.create_entity("IfcAxis2Placement3D", Location=self.point(*at))
+        return self.file.create_entity(
+            "IfcLocalPlacement", PlacementRelTo=relative, RelativePlacement=frame
+        )
+
+    def aggregate(self, whole, *parts):
+        self.rooted("IfcRelAggregates", None, RelatingObject=whole, RelatedObjects=parts)
+
+    def storey(self, name, height):
+        storey = self.rooted(
+            "IfcBuildingStorey", name, ObjectPlacement=self.placement(0, 0, height)
+        )
+        self.aggregate(self.building, storey)
+        return storey
+
+    def solid(self, *size):
+        """Return a representation of a box on its lower middle."""
+        create = self.file.create_entity
+        profile = create(
+            "IfcRectangleProfileDef",
+            ProfileType="AREA",
+            Position=create("IfcAxis2Placement2D", Location=self.point(0, 0)),
+            XDim=float(size[0]),
+            YDim=float(size[1]),
+        )
+        item = create(
+            "IfcExtrudedAreaSolid",
+            SweptArea=profile,
+            Position=self.frame,
+            ExtrudedDirection=create("IfcDirection", DirectionRatios=(0.0, 0.0, 1.0)),
+            Depth=float(size[2]),
+        )
+        return create(
+            "IfcShapeRepresentation",
+            ContextOfItems=self.context,
+            RepresentationIdentifier="Body",
+            RepresentationType="SweptSolid",
+            Items=[item],
+        )
+
+    def element(self, kind, name, size=(1, 1, 1), at=(0, 0, 0), storey=None, solid=None, **more):
+        """Add an element: a box on a storey, or in no storey."""
+        below = None if storey is None else storey.ObjectPlacement
+        element = self.rooted(
+            kind,
+            name,
+            ObjectPlacement=self.placement(*at, relative=below),
+            Representation=self.file.create_entity(
+                "IfcProductDefinitionShape", Representations=[solid or self.solid(*size)]
+            ),
+            **more,
+        )
+        if storey is not None and kind != "IfcOpeningElement":
+            self.rooted(
+                "IfcRelContainedInSpatialStructure",
+                None,
+                RelatedElements=[element],
+                RelatingStructure=storey,
+            )
+        return element
+
+    def paint(self, element, name, colour, transparency=0.0):
+        create = self.file.create_entity
+        shading = create(
+            "IfcSurfaceStyleRendering",
+            SurfaceColour=create("IfcColourRgb", None, *colour),
+            Transparency=transparency,
+            ReflectanceMethod="FLAT",
+        )
+        style = create("IfcSurfaceStyle", Name=name, Side="BOTH", Styles=[shading])
+        (item,) = element.Representation.Representations[0].Items
+        create("IfcStyledItem", Item=item, Styles=[style])
+
+    def write(self, path):
+        self.file.write(str(path))
+        return path
+
+
+def two_storeys():
+    """Return a house of two storeys, with a door in a wall of the lower storey."""
+    model = Model()
+    ground = model.storey("Ground floor", 0)
+    upper = model.storey("Upper floor", 3)
+    model.element("IfcSlab", "Floor", (6, 4, 0.2), (0, 0, -0.2), ground)
+    wall = model.element("IfcWall", "South", (6, 0.3, 3), (0, -2, 0), ground)
+    opening = model.element("IfcOpeningElement", "Hole", (1, 1, 2), (1, -2, 0), ground)
+    model.rooted(
+        "IfcRelVoidsElement", None, RelatingBuildingElement=wall, RelatedOpeningElement=opening
+    )
+    door = model.element("IfcDoor", "Door", (1, 0.05, 2), (1, -2, 0))
+    model.rooted(
+        "IfcRelFillsElement", None, RelatingOpeningElement=opening, RelatedBuildingElement=door
+    )
+    model.element("IfcSpace", "Kitchen", (5, 3, 3), (0, 0, 0))
+    model.element("IfcAnnotation", "Note", (1, 1, 1), (0, 0, 0), ground)
+    model.element("IfcWall", "North", (6, 0.3, 2), (0, 2, 0), upper)
+    model.paint(wall, "Brick", (0.6, 0.2, 0.2))
+    model.paint(door, "Glass", (0.0, 0.5, 1.0), 0.9)
+    return model
+
+
+def named(path, **options):
+    return {mesh.name: mesh for mesh in load_meshes(path, tell=[].append, **options)}
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory):
+    pytest.importorskip("ifcopenshell")
+    return two_storeys().write(tmp_path_factory.mktemp("house") / "house.ifc")
+
+
+def test_elements_are_objects_where_the_file_places_them(house, forked):
+    meshes = named(house)
+    assert [*meshes] == ["IfcSlab Floor", "IfcWall South", "IfcDoor Door", "IfcWall North"]
+    assert meshes["IfcSlab Floor"].bounds == pytest.approx(
+        np.array([(-3, -2, -0.2), (3, 2, 0)]), abs=1e-9
+    )
+    assert meshes["IfcWall North"].bounds == pytest.approx(
+        np.array([(-3, 1.85, 3), (3, 2.15, 5)]), abs=1e-9
+    )
+
+
+def test_openings_are_cut_out_of_walls(house, forked):
+    wall = named(house)["IfcWall South"]
+    a, b, c = (wall.vertices[wall.faces[:, k]] for k in range(3))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(0.3 * (6 * 3 - 1 * 2))
+
+
+def test_storeys_are_selected_by_name(house, forked, tmp_path):
+    lower = named(house, storeys=["Ground floor"])
+    assert [*lower] == ["IfcSlab Floor", "IfcWall South", "IfcDoor Door"]  # the door by its hole
+    scene = Scene.load(house, storeys=["Upper floor"])
+    assert scene.names == ("IfcWall North",)
+    with pytest.raises(
+        LidarError, match="has no storey 'Attic'; it has the storeys 'Ground floor', 'Upper floor'"
+    ):
+        Scene.load(house, storeys=["Upper floor", "Attic"])
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(LidarError, match="has no storeys: leave out storeys, or give a building"):
+        Scene.load(tmp_path / "a.obj", storeys=["Upper floor"])
+
+
+def test_a_scenario_takes_a_storey_and_has_classes(house, forked):
+    data = {
+        "scene": {"files": [{"file": str(house), "storeys": ["Ground floor"]}]},
+        "sensor": {"model": "velodyne/vlp16"},
+        "poses": [[0, 0, 1.5]],
+        "cloud": {"columns": ["class"]},
+    }
+    built = build(Scenario.from_data(data))
+    assert built.scene.names == ("IfcSlab Floor", "IfcWall South", "IfcDoor Door")
+    assert built.survey.classes == {73: "wall", 74: "slab", 78: "door"}
+
+
+def test_styles_are_colours_and_materials(house, forked):
+    notes = []
+    objects = load_objects(house, colours=True, materials=True, tell=notes.append)
+    meshes = {mesh.name: mesh for mesh in objects.static}
+    wall = meshes["IfcWall South"]
+    assert wall.materials.names == ("Brick",)
+    assert wall.colours.images[0].tolist() == [[[153, 51, 51]]]
+    assert meshes["IfcSlab Floor"].colours is None
+    [note] = notes
+    assert "has transparent materials without holes, taken as solid: Glass" in note
+
+
+@pytest.mark.parametrize(("schema", "prefix", "unit_m"), [
+    ("IFC2X3", "MILLI", 1e-3), ("IFC4", None, 1), ("IFC4X3_ADD2", "DECI", 0.1), ("IFC4", "", 1),
+])  # fmt: skip
+def test_units_are_those_of_the_project(forked, tmp_path, schema, prefix, unit_m):
+    model = Model(schema, prefix)
+    wall = model.element("IfcWall", "W", (2 / unit_m, 1, 1), (5 / unit_m, 0, 0))
+    material = model.file.create_entity("IfcMaterial", Name="Concrete")
+    model.rooted("IfcRelAssociatesMaterial", None, RelatedObjects=[wall], RelatingMaterial=material)
+    notes = []
+    path = model.write(tmp_path / "a.ifc")
+    (mesh,) = load_meshes(path, materials=True, tell=notes.append)
+    assert mesh.bounds[:, 0] == pytest.approx([4, 6])
+    assert mesh.materials.names == ("Concrete",)
+    assert ["states no unit of length" in note for note in notes] == [True] * (prefix == "")
+
+
+def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
+    model = Model(prefix="MILLI")
+    model.element("IfcWall", "W")
+    create = model.file.create_entity
+    system = create(
+        "IfcProjectedCRS",
+        Name="EPSG:25832",
+        MapUnit=create("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE"),
+    )
+    conversion = create(
+        "IfcMapConversion",
+        SourceCRS=model.context,
+        TargetCRS=system,
+        Eastings=691000.5,
+        Northings=5336000.25,
+        OrthogonalHeight=500.0,
+        XAxisAbscissa=0.0,
+        XAxisOrdinate=1.0,
+        Scale=0.001,
+    )
+    path = tmp_path / "a.ifc"
+    notes = []
+    load_meshes(model.write(path), tell=notes.append)
+    assert notes == [
+        f"{path} has a map conversion, which is not applied: translation [691000.5, 5336000.25, "
+        "500] and rotation_deg [0, 0, 90] move it into EPSG:25832"
+    ]
+    conversion.Scale = 1.0
+    load_meshes(model.write(path), tell=notes.append)
+    assert notes[1].endswith("into EPSG:25832 whose scale, 1000, does not fit its units")
+    model.file.remove(conversion)
+    model.site.RefLatitude = (48, 8, 15)
+    model.site.RefLongitude = (-11, -34, -30)
+    load_meshes(model.write(path), tell=notes.append)
+    assert notes[2].endswith("the position of its site, 48.1375° N, 11.575° W, which is not used")
+
+
+def test_equal_shapes_are_shared(forked, tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarsim.scene.files.scene_graph.SHARED_TRIANGLES", 12)
+    model = Model()
+    solid = model.solid(1, 1, 1)
+    for number in range(3):
+        model.element("IfcColumn", f"C{number}", at=(2 * number, 0, 0), solid=solid)
+    columns = load_objects(model.write(tmp_path / "a.ifc")).static
+    assert all(isinstance(column, SceneInstance) for column in columns)
+    assert [column.matrix[0, 3] for column in columns] == [0, 2, 4]
+
+
+def test_elements_without_triangles_are_noted(forked, tmp_path):
+    model = Model()
+    model.element("IfcWall", "W")
+    model.element("IfcBeam", "Thin", (1, 1, 0))
+    notes = []
+    load_meshes(model.write(tmp_path / "a.ifc"), tell=notes.append)
+    [note] = notes
+    assert note.endswith(
+        "is read without 1 element of which ifcopenshell makes no triangles: 'IfcBeam Thin'"
+    )
+
+
+def test_packed_files_are_read(house, forked, tmp_path):
+    path = tmp_path / "house.ifczip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(house, "house.ifc")
+    assert [*named(path)] == [*named(house)]
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("zeros.ifc", bytes(5 * 10**6))
+    with pytest.raises(LidarError, match="unpacks to more than"):
+        load_meshes(path)
+
+
+def test_broken_files_are_refused_in_a_line(house, forked, tmp_path):
+    text = house.read_text()
+    path = tmp_path / "a.ifc"
+    for broken, reason in (
+        ("solid ice", "it does not begin with ISO-10303-21"),
+        (text[: len(text) // 2], "the end of the file is missing"),
+        (text.replace("'IFC4'", "'IFC9'"), "IFC9"),
+        (two_storeys_without_elements(text), "holds no elements with a shape"),
+    ):
+        path.write_text(broken)
+        with pytest.raises(LidarError) as caught:
+            load_meshes(path)
+        assert reason in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def two_storeys_without_elements(text):
+    """Return a file whose products have no shapes."""
+    return "\n".join(
+        line for line in text.splitlines() if not any(
+            kind in line for kind in ("IFCSLAB(", "IFCWALL(", "IFCDOOR(")
+        )
+    )  # fmt: skip
+
+
+def test_unknown_entities_are_noted(house, forked, tmp_path):
+    path = tmp_path / "a.ifc"
+    path.write_text(house.read_text().replace("IFCSLAB(", "IFCSLEB("))
+    notes = []
+    assert len(load_meshes(path, tell=notes.append)) == 3
+    assert any("without which ifcopenshell reads it" in n and "IFCSLEB" in n for n in notes)
+
+
+def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
+    random = np.random.default_rng(7)
+    data = np.frombuffer(house.read_bytes(), np.uint8)
+    path = tmp_path / "a.ifc"
+    for _ in range(40):
+        garbled = data.copy()
+        rows = random.integers(0, len(data), random.integers(1, 6))
+        garbled[rows] = random.choice(np.frombuffer(b"0123456789.-#$*(),;'E", np.uint8), len(rows))
+        path.write_bytes(garbled.tobytes())
+        notes = []
+        try:
+            load_meshes(path, tell=notes.append)
+        except LidarError as error:
+            notes.append(str(error))
+        assert not any("\n" in note for note in notes)
+
+
+@needs_ifcopenshell
+def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
+    monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)
+    with pytest.raises(LidarError, match=r"\(ifcopenshell ended with .*, or needs more than"):
+        load_meshes(house)
+
+
+def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setattr(reader, "find_spec", lambda name: None)
+    path = tmp_path / "a.ifc"
+    path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
+    with pytest.raises(LidarError, match=r"ifcopenshell reads: pip install \"lidarpool\[ifc\]\""):
+        load_meshes(path)
+
+
+@pytest.mark.parametrize("cut", [10, 60])
+def test_a_process_that_dies_within_a_frame_is_reported(tmp_path, monkeypatch, cut):
+    output = b'{"what": "shape", "arrays": [["<f8", [4, 3]]]}\n' + bytes(96)
+
+    @contextmanager
+    def dying(command, **options):
+        yield SimpleNamespace(stdout=io.BytesIO(output[:cut]), wait=lambda: -11, kill=lambda: None)
+
+    library = SimpleNamespace(Popen=dying, DEVNULL=None, PIPE=None)
+    monkeypatch.setattr(child_process, "subprocess", library)
+    monkeypatch.setattr(reader, "find_spec", lambda name: True)
+    path = tmp_path / "a.ifc"
+    path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
+    with pytest.raises(LidarError, match="ifcopenshell ended with SIGSEGV"):
+        load_meshes(path)

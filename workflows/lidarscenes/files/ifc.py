@@ -1,0 +1,253 @@
+"""Buildings of IFC, .ifc and .ifczip, through ifcopenshell (licence LGPL-3.0-or-later).
+
+`ifc_child.py` reads the files in a process of its own. Shapes of elements are those of the geometry
+iterator of ifcopenshell, with openings cut out.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import defaultdict
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
+from lidarsim.base.arrays import AnyArray
+from lidarsim.base.words import plural
+from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.files.scene_graph import (
+    Content,
+    MeshFileError,
+    ObjectClass,
+    Piece,
+    PlacedNode,
+    ReadOptions,
+    join_pieces,
+    placed_content,
+)
+from lidarsim.scene.masks import MaskNotes
+from lidarsim.scene.scene_mesh import SceneMesh
+from raybeam.installation import install_command
+
+from .child_process import Child
+
+# {number: name, and classes of IFC with their subclasses}. Numbers are of ASPRS LAS 1.4, from 64
+# on free to use; 64 to 72 are of roads.
+_CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
+    2: (
+        "ground",
+        ("IfcSite", "IfcGeographicElement", "IfcGeotechnicalElement", "IfcEarthworksElement"),
+    ),
+    73: ("wall", ("IfcWall", "IfcCurtainWall", "IfcPlate")),
+    74: ("slab", ("IfcSlab",)),
+    75: ("covering", ("IfcCovering",)),
+    76: ("roof", ("IfcRoof",)),
+    77: ("column or beam", ("IfcColumn", "IfcBeam", "IfcMember")),
+    78: ("door", ("IfcDoor",)),
+    79: ("window", ("IfcWindow",)),
+    80: ("stair or ramp", ("IfcStair", "IfcStairFlight", "IfcRamp", "IfcRampFlight")),
+    81: ("railing", ("IfcRailing",)),
+    82: ("furniture", ("IfcFurnishingElement",)),
+    83: ("pipe, duct or device", ("IfcDistributionElement",)),
+}
+_OTHER_CLASS = (1, "unclassified")
+
+MIN_MEMORY_BYTES = 1024 * 2**20  # bytes that ifcopenshell and its process may take for any file
+MEMORY_TIMES = 30  # of the file's bytes
+_END = b"END-ISO-10303-21"
+_END_BYTES = 200  # bytes of a file that contain its end
+_MAX_SCALE_ERROR = 0.1  # of a map conversion: metres of a map are metres of a building, nearly
+_ADVICE = "export it in parts"
+_EMPTY = "holds no elements with a shape, such as walls and slabs, or none in these storeys"
+
+
+def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
+    """Read the elements of a building, all or of the storeys in `options`."""
+    is_packed = path.suffix.lower() == ".ifczip"
+    if not is_packed and b"ISO-10303-21" not in data:
+        raise ValueError("it does not begin with ISO-10303-21")
+    if find_spec("ifcopenshell") is None:
+        command = install_command("lidarpool[ifc]")
+        raise MeshFileError(f"is IFC, which ifcopenshell reads: {command}")
+    if sys.platform == "win32":  # where a process has no limits of memory
+        raise MeshFileError("is IFC, which is not read on Windows: export it as .glb")
+    if not is_packed:
+        _check_end(path)
+    size = path.stat().st_size
+    allowance = Allowance(size, _ADVICE)
+    # Packed files are about a tenth.
+    memory = MIN_MEMORY_BYTES + MEMORY_TIMES * (10 * size if is_packed else size)
+    child = Child(
+        Path(__file__).with_name("ifc_child.py"),
+        "ifcopenshell",
+        min(memory, MIN_MEMORY_BYTES + memory_share()),
+        path.parent,
+        hidden=("IFCOPENSHELL_",),
+    )
+    request = {
+        "storeys": options.storeys,
+        "max_unpacked": min(UNPACKED_TIMES * size, memory_share()),
+    }
+    shapes = _Shapes(options, allowance)
+    building: dict[str, Any] = {}
+    with closing(child.frames(path, request, lambda _, size: allowance.take(size))) as frames:
+        for frame, arrays in frames:
+            match frame["what"]:
+                case "building":
+                    building = frame
+                    _check_storeys(options.storeys, frame["storeys"])
+                case "shape":
+                    shapes.add(frame, arrays)
+                case "elements":
+                    return _content(building, frame, arrays[0], shapes)
+    raise ValueError("ifcopenshell gave no elements")
+
+
+def _check_end(path: Path) -> None:
+    """Check that a file has its last line: ifcopenshell reads files cut short in silence."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - _END_BYTES, 0))
+        if _END not in stream.read():
+            raise ValueError("the end of the file is missing")
+
+
+def _check_storeys(wanted: tuple[str, ...] | None, storeys: list[str]) -> None:
+    """Check that a building has all storeys asked for; MeshFileError with their names if not."""
+    missing = [name for name in wanted or () if name not in storeys]
+    if missing:
+        names = ", ".join(repr(name[:80]) for name in dict.fromkeys(storeys[:50]))
+        has = f"has the storeys {names}" if names else "has no storeys: leave out storeys"
+        raise MeshFileError(f"has no storey {missing[0][:80]!r}; it {has}")
+
+
+class _Shapes:
+    """Meshes of the shapes of a file, which elements share."""
+
+    def __init__(self, options: ReadOptions, allowance: Allowance) -> None:
+        self.notes = MaskNotes()
+        self._options = options
+        self._allowance = allowance
+        self._frames: list[tuple[dict[str, Any], list[AnyArray]]] = []
+        self._meshes: dict[tuple[int, str], list[SceneMesh]] = {}
+
+    def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
+        """Add a shape."""
+        self._frames.append((frame, arrays))
+
+    def meshes(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
+        """Return the mesh of a shape, in a list; an empty list without triangles.
+
+        `plain_material` is the name of the material of faces without a style.
+        """
+        key = (number, plain_material if self._options.materials else "")
+        if key not in self._meshes:
+            self._meshes[key] = self._mesh(number, name, plain_material)
+        return self._meshes[key]
+
+    def _mesh(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
+        """Return the mesh of a shape, with colours and materials if asked for."""
+        frame, (vertices, faces, styles) = self._frames[number]
+        pieces = []
+        for style in np.unique(styles).tolist():
+            style_faces = faces[styles == style].astype(np.int64)
+            material: dict[str, Any] = {"name": plain_material, "colour": None, "transparency": 0}
+            if 0 <= style < len(frame["materials"]):
+                material = frame["materials"][style]
+            if material["transparency"] > 0 and self._options.masks:
+                self.notes.glass[material["name"]] = None
+            colours = None
+            if self._options.colours and material["colour"] is not None:
+                colour = as_bytes(material["colour"]).reshape(1, 1, 3)
+                colours = Colours.plain(colour, len(style_faces))
+            material_name = material["name"] or plain_material if self._options.materials else ""
+            pieces.append(Piece(vertices, style_faces, None, colours, material_name))
+        return join_pieces(name, pieces, self._allowance)
+
+
+def _content(
+    building: dict[str, Any], frame: dict[str, Any], matrices: AnyArray, shapes: _Shapes
+) -> Content:
+    """Place the shapes of elements, and add classes and notes."""
+    placed = [
+        PlacedNode(mesh, matrix, name)
+        for (name, _, number, material), matrix in zip(frame["elements"], matrices, strict=True)
+        for mesh in shapes.meshes(number, name, material)
+    ]
+    missing = ""
+    if count := frame["missing_count"]:
+        names = ", ".join(map(repr, frame["missing"])) + ", …" * (count > len(frame["missing"]))
+        missing = (
+            f"is read without {plural(count, 'element')} of which ifcopenshell makes no triangles: "
+            f"{names}"
+        )
+    if not placed:
+        raise MeshFileError(missing.replace("is read without", "holds only") or _EMPTY)
+    content = placed_content(placed)
+    content.unit_m = 1.0
+    content.up_axis = "z"
+    content.classes = _classes({row[1] for row in frame["elements"]}, frame["ancestors"])
+    content.notes = [*_reference_notes(building), *shapes.notes.lines()]
+    if missing:
+        content.notes.append(missing)
+    if building["errors"]:
+        content.notes.append(
+            f"has {plural(building['errors'], 'error')}, without which ifcopenshell reads it, "
+            f"such as: {building['first_error']}"
+        )
+    if not building["unit_stated"]:
+        content.unit_note = "states no unit of length and is taken in metres, as ifcopenshell does"
+    return content
+
+
+def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, ObjectClass]:
+    """Return the semantic classes of the classes of IFC in a file."""
+    patterns: dict[tuple[int, str], list[str]] = defaultdict(list)
+    for name in sorted(names):
+        matches = (
+            (number, title)
+            for number, (title, members) in _CLASSES.items()
+            if not set(members).isdisjoint(ancestors[name])
+        )
+        patterns[next(matches, _OTHER_CLASS)].append(f"{name} *")
+    return {
+        number: ObjectClass(title, tuple(rows))
+        for (number, title), rows in sorted(patterns.items())
+    }
+
+
+def _reference_notes(building: dict[str, Any]) -> list[str]:
+    """Return notes on the coordinate system that a file states."""
+    conversion = building["map"]
+    if conversion is None:
+        if building["site"] is None:
+            return []
+        latitude, longitude = building["site"]
+        position = (
+            f"{abs(latitude):.6g}° {'S' if latitude < 0 else 'N'}, "
+            f"{abs(longitude):.6g}° {'W' if longitude < 0 else 'E'}"
+        )
+        return [f"states the position of its site, {position}, which is not used"]
+    epsg = re.search(r"(?i)\bepsg:{1,2}(\d{4,6})\b", conversion["system"])
+    system = f"EPSG:{epsg[1]}" if epsg else repr(conversion["system"])
+    where = system if conversion["system"] else "its coordinate system"
+    scale = conversion["scale"]
+    if not abs(scale - 1) < _MAX_SCALE_ERROR:
+        return [f"has a map conversion into {where} whose scale, {scale:g}, does not fit its units"]
+    turn = conversion["heading_deg"]
+    if not (any(conversion["offset"]) or turn or abs(scale - 1) > 1e-9):
+        return [f"is in EPSG:{epsg[1]}: <cloud.epsg={epsg[1]}> writes that to LAS"] if epsg else []
+    x, y, z = conversion["offset"]
+    moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
+    if turn:
+        moves.append(f"rotation_deg [0, 0, {turn:.9g}]")
+    if abs(scale - 1) > 1e-9:
+        moves.append(f"scale {scale:.9g}")
+    verb = "moves" if len(moves) == 1 else "move"
+    return [
+        f"has a map conversion, which is not applied: {' and '.join(moves)} {verb} it into {where}"
+    ]

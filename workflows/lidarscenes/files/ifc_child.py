@@ -1,0 +1,301 @@
+"""Reads an IFC building with ifcopenshell, in a process that `ifc.py` starts: a script.
+
+ifcopenshell ends its process on some broken files; here this process only. The script imports
+nothing of lidarpool. Standard output gets frames, see `child_process.py`: first of the building,
+then of each shape that elements share, last of the elements.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import signal
+import sys
+import zipfile
+from collections.abc import Iterable
+from typing import Any
+
+import ifcopenshell
+import ifcopenshell.geom
+import numpy as np
+from ifcopenshell.util.geolocation import get_crs, get_helmert_transformation_parameters
+from ifcopenshell.util.unit import calculate_unit_scale, get_unit_scale
+from numpy.typing import NDArray
+
+MAX_WAIT_S = 300  # from one shape to the next; broken files may take for ever
+_MAX_PARENTS = 100  # of an element in the tree of a building; broken files have cycles
+
+# Classes, with their subclasses, that have shapes and reflect no light.
+_UNREAD = {
+    "IfcSpatialElement",
+    "IfcSpatialStructureElement",  # of IFC2X3
+    "IfcFeatureElementSubtraction",  # openings
+    "IfcAnnotation",
+    "IfcGrid",
+    "IfcVirtualElement",
+    "IfcPort",
+    "IfcPositioningElement",
+    "IfcLinearPositioningElement",
+    "IfcStructuralActivity",
+    "IfcStructuralItem",
+}
+_TERRAIN = "IfcSite"
+# Relations of an element: attribute of the element, attribute of the relation with its parent.
+_PARENTS = (
+    ("ContainedInStructure", "RelatingStructure"),
+    ("Decomposes", "RelatingObject"),
+    ("Nests", "RelatingObject"),
+    ("FillsVoids", "RelatingOpeningElement"),
+    ("VoidsElements", "RelatingBuildingElement"),
+    ("AdheresToElement", "RelatingElement"),
+)
+
+
+class Building:
+    """The elements of a file."""
+
+    def __init__(self, path: str, request: dict[str, Any], write: Any) -> None:
+        self._file = _open(path, request["max_unpacked"])
+        errors = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error")]
+        self._errors = [re.sub(r"^(\[[^]]*\] *)+", "", line)[:150] for line in errors]
+        self._schema = ifcopenshell.schema_by_name(self._file.schema_identifier)
+        self._storeys = request["storeys"]
+        self._write = write
+        self._ancestors: dict[str, list[str]] = {}  # {class: itself and its superclasses}
+
+    def read(self) -> None:
+        """Write the frames of the building."""
+        storeys = self._file.by_type("IfcBuildingStorey")
+        self._write(
+            {
+                "what": "building",
+                "storeys": [storey.Name or storey.GlobalId for storey in storeys],
+                "errors": len(self._errors),
+                "first_error": next(iter(self._errors), ""),
+                "unit_stated": self._states_unit(),
+                "map": self._map_conversion(),
+                "site": self._position_of_site(),
+            }
+        )
+        elements = {element.id(): element for element in self._elements()}
+        if elements:
+            self._write_shapes(elements)
+        else:
+            self._write_elements([], [], [])
+
+    def _elements(self) -> Iterable[Any]:
+        """Yield the elements with a shape that reflects light, of the storeys asked for."""
+        for product in self._file.by_type("IfcProduct"):
+            ancestors = self._ancestors_of(product.is_a())
+            if product.Representation is None:
+                continue
+            if not _UNREAD.isdisjoint(ancestors) and _TERRAIN not in ancestors:
+                continue
+            if self._storeys is None or self._storey_of(product) in self._storeys:
+                yield product
+
+    def _ancestors_of(self, name: str) -> list[str]:
+        """Return the name of a class and of its superclasses."""
+        if name not in self._ancestors:
+            names = []
+            declaration = self._schema.declaration_by_name(name).as_entity()
+            while declaration:
+                names.append(declaration.name())
+                declaration = declaration.supertype()
+            self._ancestors[name] = names
+        return self._ancestors[name]
+
+    def _storey_of(self, element: Any) -> str | None:
+        """Return the name of the storey that contains an element, or None."""
+        for _ in range(_MAX_PARENTS):
+            if element is None:
+                return None
+            if element.is_a("IfcBuildingStorey"):
+                return str(element.Name or element.GlobalId)
+            element = _parent(element)
+        raise ValueError("its elements contain each other")
+
+    def _write_shapes(self, elements: dict[int, Any]) -> None:
+        """Write shapes and elements."""
+        settings = ifcopenshell.geom.settings()
+        settings.set("no-normals", True)
+        settings.set("apply-default-materials", False)
+        iterator = ifcopenshell.geom.iterator(
+            settings, self._file, 1, include=list(elements.values())
+        )
+        shapes: dict[str, int] = {}  # {id of a shape: number}
+        matrices = []
+        rows = []
+        is_valid = iterator.initialize()
+        while is_valid:
+            placed = iterator.get()
+            geometry = placed.geometry
+            number = shapes.setdefault(geometry.id, len(shapes))
+            element = elements.get(placed.id)
+            if element is not None:
+                if number == len(shapes) - 1:
+                    self._write_shape(number, geometry)
+                rows.append([_name(element), element.is_a(), number, _material_of(element)])
+                matrices.append(np.frombuffer(placed.transformation_buffer, np.float64))
+                elements.pop(placed.id)
+            is_valid = iterator.next()
+        # Sites may have an outline without a terrain.
+        missing = [_name(item) for item in elements.values() if not item.is_a(_TERRAIN)]
+        self._write_elements(rows, matrices, missing)
+
+    def _write_elements(
+        self, rows: list[Any], matrices: list[NDArray[Any]], missing: list[str]
+    ) -> None:
+        """Write the frame of all elements, and names of elements without triangles."""
+        self._write(
+            {
+                "what": "elements",
+                "elements": rows,
+                "ancestors": self._ancestors,
+                "missing": missing[:3],
+                "missing_count": len(missing),
+            },
+            np.array(matrices).reshape(-1, 4, 4).transpose(0, 2, 1),
+        )
+
+    def _write_shape(self, number: int, geometry: Any) -> None:
+        """Write the triangles and materials of a shape."""
+        self._write(
+            {
+                "what": "shape",
+                "number": number,
+                "materials": [self._material(style) for style in geometry.materials],
+            },
+            np.frombuffer(geometry.verts_buffer, np.float64).reshape(-1, 3),
+            np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3),
+            np.frombuffer(geometry.material_ids_buffer, np.int32),
+        )
+
+    def _material(self, style: Any) -> dict[str, Any]:
+        """Return the name, colour and transparency of a style; a colour is None if not stated."""
+        colour = style.get_color()
+        shares = [colour.r(), colour.g(), colour.b()]
+        transparency = style.transparency
+        number = style.instance_id()
+        name = getattr(self._file.by_id(number), "Name", None) if number > 0 else None
+        return {
+            "name": name or "",
+            "colour": shares if np.isfinite(shares).all() else None,
+            "transparency": transparency if np.isfinite(transparency) else 0.0,
+        }
+
+    def _states_unit(self) -> bool:
+        """Return True if the project states a unit of length."""
+        units = [unit for entry in self._file.by_type("IfcUnitAssignment") for unit in entry.Units]
+        return any(getattr(unit, "UnitType", None) == "LENGTHUNIT" for unit in units)
+
+    def _map_conversion(self) -> dict[str, Any] | None:
+        """Return the map conversion of the file, in metres, or None."""
+        if not self._file.by_type("IfcProject"):
+            return None
+        conversion = get_helmert_transformation_parameters(self._file)
+        if conversion is None:
+            return None
+        system = get_crs(self._file) or {}
+        unit_m = calculate_unit_scale(self._file)
+        map_unit = system.get("MapUnit")
+        # Without a unit, numbers of a map are in the unit of the project.
+        map_unit_m = unit_m
+        if map_unit is not None and not isinstance(map_unit, str):
+            map_unit_m = get_unit_scale(map_unit)
+        return {
+            "system": str(system.get("Name") or "")[:80],
+            "offset": [
+                float(number) * map_unit_m for number in (conversion.e, conversion.n, conversion.h)
+            ],
+            "heading_deg": float(np.degrees(np.arctan2(conversion.xao, conversion.xaa))),
+            "scale": float(conversion.scale) * map_unit_m / unit_m,
+        }
+
+    def _position_of_site(self) -> list[float] | None:
+        """Return the latitude and longitude of the site, degrees, or None."""
+        for site in self._file.by_type("IfcSite"):
+            angles = [site.RefLatitude, site.RefLongitude]
+            if all(angles) and any(map(any, angles)):
+                weights = (1, 1 / 60, 1 / 3600, 1 / 3600e6)
+                return [
+                    sum(n * weight for n, weight in zip(angle, weights, strict=False))
+                    for angle in angles
+                ]
+        return None
+
+
+def _open(path: str, max_unpacked: int) -> Any:
+    """Open a file; an .ifczip is unpacked in memory."""
+    if not path.lower().endswith(".ifczip"):
+        return ifcopenshell.open(path, ".ifc")
+    with zipfile.ZipFile(path) as archive:
+        entries = [e for e in archive.infolist() if e.filename.lower().endswith(".ifc")]
+        if len(entries) != 1:
+            raise ValueError(f"it holds {len(entries)} files .ifc, not one")
+        if entries[0].file_size > max_unpacked:
+            raise ValueError(f"it unpacks to more than {max_unpacked:,} bytes")
+        with archive.open(entries[0]) as stream:
+            data = stream.read(max_unpacked)
+    if b"END-ISO-10303-21" not in data[-200:]:
+        raise ValueError("the end of the file is missing")
+    return ifcopenshell.file.from_string(data.decode("latin-1"))
+
+
+def _parent(element: Any) -> Any:
+    """Return the element or spatial structure that contains an element, or None."""
+    for attribute, parent in _PARENTS:
+        relations = getattr(element, attribute, None)
+        if relations:
+            return getattr(relations[0], parent, None)
+    return None
+
+
+def _name(element: Any) -> str:
+    """Return the class and name of an element."""
+    return f"{element.is_a()} {element.Name or element.GlobalId}"
+
+
+def _material_of(element: Any) -> str:
+    """Return the name of the single material of an element; empty for layers and the like."""
+    for relation in getattr(element, "HasAssociations", None) or ():
+        if relation.is_a("IfcRelAssociatesMaterial"):
+            material = relation.RelatingMaterial
+            if material is not None and material.is_a("IfcMaterial"):
+                return material.Name or ""
+    return ""
+
+
+def main(path: str, request: dict[str, Any]) -> None:
+    """Read a file, and write frames to standard output."""
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+    def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
+        """Write a frame: a line of JSON, and the bytes of arrays."""
+        signal.alarm(0)  # who reads this may take long
+        kinds = [(array.dtype.str, array.shape) for array in arrays]
+        output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")
+        for array in arrays:
+            output.write(np.ascontiguousarray(array).tobytes())
+        signal.alarm(MAX_WAIT_S)
+
+    try:
+        Building(path, request, write).read()
+    except Exception as error:  # of any type, as readers of broken files are
+        reason = " ".join(str(error).replace(path, os.path.basename(path)).split())  # noqa: PTH119
+        write({"what": "error", "reason": (reason or type(error).__name__)[:300]})
+    output.flush()
+
+
+if __name__ == "__main__":
+    message = json.loads(sys.argv[2])
+    signal.alarm(MAX_WAIT_S)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
+    max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
+    resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
+    main(sys.argv[1], message)
+    os._exit(0)  # at once: taking a large building down takes long
