@@ -529,7 +529,7 @@ def test_classes_and_materials(tmp_path):
         ("<geoReference>+proj=tmerc +lat_0=48</geoReference>", "which is not used"),
         (
             '<geoReference>EPSG:25833</geoReference><offset x="1000" y="-5" z="2" hdg="0"/>',
-            "an offset, which is not applied",
+            "is not applied: translation [1000, -5, 2] moves it into EPSG:25833",
         ),
     ],
 )

@@ -194,11 +194,13 @@ def _reference_notes(header: Element) -> list[str]:
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
     if any(shift):
         x, y, z, heading = shift
-        turn = f" and <file.rotation_deg=[0, 0, {np.degrees(heading):.9g}]>" if heading else ""
+        moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
+        if heading:
+            moves.append(f"rotation_deg [0, 0, {np.degrees(heading):.9g}]")
+        verb = "move" if heading else "moves"
         where = system if text else "its coordinate system"
         return [
-            f"has an offset, which is not applied: <file.translation=[{x:.12g}, {y:.12g}, {z:.9g}]>"
-            f"{turn} moves it into {where}"
+            f"has an offset, which is not applied: {' and '.join(moves)} {verb} it into {where}"
         ]
     if epsg:
         return [f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS"]
