@@ -512,6 +512,7 @@ def test_a_full_turn_has_no_direction_twice_and_other_lidars_are_told(tmp_path):
 
 
 def test_garbled_worlds_give_objects_or_a_line(tmp_path):
+    peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     add_model(tmp_path, "crate")
     shapes = "".join(shape(text) for text in SHAPES)
     nested = model("n", link(inside=shapes), include("model://crate"), "<frame name='f'/>")
@@ -531,4 +532,5 @@ def test_garbled_worlds_give_objects_or_a_line(tmp_path):
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 2 < read < 95
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 * 2**20  # kilobytes
+    # Kilobytes; tests before may have taken more.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss <= max(peak_before, 2 * 2**20)

@@ -324,6 +324,7 @@ def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch
 
 
 def test_garbled_models_give_objects_or_a_line(room):
+    peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     whole = ROOM.encode()
     rng = np.random.default_rng(0)
     read = 0
@@ -338,4 +339,5 @@ def test_garbled_models_give_objects_or_a_line(room):
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 2 < read < 95
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2 * 2**20  # kilobytes
+    # Kilobytes; tests before may have taken more.
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss <= max(peak_before, 2 * 2**20)

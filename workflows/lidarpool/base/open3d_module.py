@@ -9,8 +9,8 @@ from threading import Lock
 from typing import Any
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.interrupts import deferred_interrupts
-from raybeam.installation import install_command
 
 _LOCK = Lock()  # a second thread would find the temporary package
 

@@ -153,7 +153,7 @@ class _LiveCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the words of the command line."""
         values = {_PAGE, *VIEWERS}
-        followers = [*args[1:], ""]
+        followers = [*args[1:], ""][: len(args)]
         return super().parse_args(
             ctx,
             [

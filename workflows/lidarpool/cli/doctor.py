@@ -17,10 +17,10 @@ from distributed.system import MEMORY_LIMIT
 from packaging.requirements import Requirement
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 from raybeam.compiled import HAS_CACHE
-from raybeam.installation import install_command
 
 from ..base.open3d_module import load_open3d
 from ..report.report import versions

@@ -22,11 +22,11 @@ from pydantic import Field
 
 from lidarsim.base.archives import open_archive
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from raybeam.installation import install_command
 
 from ..base.sealed import unsealed
 from ..export.boxes import Boxes

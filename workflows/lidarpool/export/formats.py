@@ -13,12 +13,12 @@ import numpy as np
 
 from lidarsim.base.declared import about
 from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
-from raybeam.installation import install_command
 
 from ..columns.parts import StoredCloud
 from .folder import staging

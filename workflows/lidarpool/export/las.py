@@ -21,12 +21,12 @@ import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
-from raybeam.installation import install_command
 
 from .flight_lines import FlightLines
 

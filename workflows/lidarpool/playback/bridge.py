@@ -9,11 +9,11 @@ from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, Self
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.words import did_you_mean
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
-from raybeam.installation import install_command
 
 from ..export.formats import Format
 from .schedule import Schedule

@@ -83,7 +83,7 @@ def play(
     >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=packets.columns)
     >>> lateness = play(scanner, Pose((0, 0, 1)), duration_s=0.3)
     >>> lateness.sent
-    241
+    242
     """
     packets = Packets.of_scanner(scanner, start)
     names = {column.name for column in scanner.survey.stored_columns}

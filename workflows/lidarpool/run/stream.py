@@ -22,6 +22,7 @@ import numpy as np
 from distributed import Client
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import AXES, SCAN
@@ -30,7 +31,6 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.simulator.scene_caster import check_backend_here
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
-from raybeam.installation import install_command
 
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from raybeam.installation import install_command
+from lidarsim.base.extras import install_command
 
 from ..export.shown_sweeps import ShownSweep, Surroundings
 from .table import VIEWERS

@@ -18,6 +18,7 @@ import numpy as np
 
 from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.base.arrays import AnyArray
+from lidarsim.base.extras import install_command
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.files.scene_graph import (
@@ -32,7 +33,6 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.scene_mesh import SceneMesh
-from raybeam.installation import install_command
 
 from .child_process import Child
 

@@ -23,6 +23,7 @@ import numpy as np
 from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
 from lidarsim.base.elementary import decade
+from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
@@ -35,7 +36,6 @@ from lidarsim.scene.files.scene_graph import (
     Window,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
-from raybeam.installation import install_command
 
 DRIVERS = {  # {ending: GDAL's name of the driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",

@@ -21,6 +21,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance, memory_share
 from lidarsim.base.arrays import AnyArray
+from lidarsim.base.extras import install_command
 from lidarsim.base.vectors import inverse, matmul
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import box
@@ -49,7 +50,6 @@ from lidarsim.scene.scene_instances import SceneInstance, scales_of
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
-from raybeam.installation import install_command
 
 from .child_process import Child, Frame
 from .usd_materials import MeshLook, UsdMaterials, material_pieces

@@ -20,6 +20,7 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.words import did_you_mean, listed
 from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
 from lidarsim.mujoco.model_bodies import (
@@ -84,7 +85,8 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
     allowance = Allowance(0, _ADVICE)
     check_sources(data, path, options, allowance)
     if find_spec("mujoco") is None:
-        raise MeshFileError("is a model of MuJoCo, which MuJoCo reads: pip install mujoco")
+        command = install_command("mujoco")
+        raise MeshFileError(f"is a model of MuJoCo, which MuJoCo reads: {command}")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise MeshFileError("is a model of MuJoCo, which is not read on Windows")
     request = {"keyframe": options.model.keyframe, "colours": options.colours}

@@ -6,10 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from raybeam.installation import install_command
-
 from .errors import LidarError, explained, prefixed
 from .words import printable
+
+
+def install_command(*requirements: str) -> str:
+    """Return the command that installs requirements, such as ``lidarpool[las]``, here."""
+    from raybeam.installation import install_command  # raybeam imports NumPy
+
+    return install_command(*requirements)
 
 
 def need(package: str, extra: str, purpose: str) -> None:

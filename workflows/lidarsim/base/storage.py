@@ -20,9 +20,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
-from raybeam.installation import install_command
-
 from .errors import LidarError
+from .extras import install_command
 from .input_files import open_input
 
 _BLOCK_BYTES = 1 << 20  # read at a time of a file that is copied or checked

@@ -14,10 +14,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from raybeam.installation import install_command
-
 from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarError
+from ..base.extras import install_command
 from ..base.validation import as_array, checked, checked_fields, shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms

@@ -23,13 +23,12 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, Strict
 
-from raybeam.installation import install_command
-
 from ..base.arrays import Floats, Ints
 from ..base.declared import MinMax, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
 from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarError
+from ..base.extras import install_command
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .random_numbers import Purpose, named_seed, normal

@@ -11,10 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from raybeam.installation import install_command
-
 from ...base.allowance import Allowance
 from ...base.errors import LidarError
+from ...base.extras import install_command
 from ...base.input_files import open_input
 from .las_units import CoordinateUnits, units_of
 

@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from raybeam.installation import install_command
-
 from ...base.errors import LidarError
+from ...base.extras import install_command
 
 # Records of LASF_Projection, by ASPRS LAS 1.4.
 _WKT = 2112

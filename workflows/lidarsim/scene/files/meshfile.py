@@ -13,11 +13,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from raybeam.installation import install_command
-
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
 from ...base.errors import LidarError, prefixed
+from ...base.extras import install_command
 from ...base.input_files import open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
