@@ -576,7 +576,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     ("name", "way"),
     [
         ("a.mjcf", "MuJoCo reads its models from .xml"),
-        ("a.ifc", "it is a building"),
+        ("a.osm", "it is a map"),
     ],
 )
 def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way):
