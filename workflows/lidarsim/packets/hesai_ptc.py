@@ -7,10 +7,6 @@ tier4/nebula, hesai hardware interface.
 from __future__ import annotations
 
 import asyncio
-import errno
-import os
-import socket
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,17 +14,15 @@ from dataclasses import dataclass
 from functools import partial
 from ipaddress import IPv4Address
 from struct import Struct, pack
-from typing import Self
 from zlib import crc32
 
-from ..base.errors import LidarError
-from .service import Destination, Service
+from .service import Destination
+from .tcp_service import TcpService
 
 PTC_PORT = 9347
 _MARK = b"\x47\x74"  # first bytes of requests and answers
 _HEADER = Struct(">2sBBI")  # mark, command, code of the answer, bytes that follow
 _MAX_REQUEST_BYTES = 1024
-_MAX_CONNECTIONS = 16  # one more closes the connection that was silent longest
 _WITHIN_S = 5.0  # from the start of a request to its end, and for its answer
 
 _GET_CALIBRATION = 0x05
@@ -116,18 +110,21 @@ class _RefusedError(Exception):
         self.code = code
 
 
-class PtcService(Service):
-    """Answers commands on a thread of its own; a connection may send any number of commands.
+class PtcService(TcpService):
+    """Answers commands; a connection may send any number of commands.
 
     Parameters
     ----------
     device
         What the answers state.
-    address
-        HOST:PORT to listen at; HOST alone for port 9347, or for a free port if port 9347 is taken.
-    destination, send_to
-        As of `Service`.
+    address, destination, send_to
+        As of `TcpService`.
     """
+
+    name = "Hesai's commands (PTC)"
+    usual_port = PTC_PORT
+    example_port = 9348
+    max_connections = 16  # one more closes the connection that was silent longest
 
     def __init__(
         self,
@@ -136,74 +133,22 @@ class PtcService(Service):
         destination: Destination,
         send_to: Callable[[Destination], None],
     ) -> None:
-        super().__init__(destination, send_to)
-        self._host, _, port = address.partition(":")
+        super().__init__(address, destination, send_to)
         self._device = device
-        self._ports = [int(port)] if port else [PTC_PORT, 0]  # to try, of which 0 is a free port
-        self._port = self._ports[0]
         self._started_s = time.monotonic()
         self._connections: dict[asyncio.Task[None], None] = {}  # the longest silent is first
-        self._loop: asyncio.AbstractEventLoop
-        self._thread: threading.Thread
-        self._server: asyncio.Server
 
     @property
     def description(self) -> str:
         """The address of the commands."""
-        return f"Hesai's commands (PTC) at {self._host}:{self._port}"
+        return f"{self.name} at {self.host}:{self.port}"
 
-    def __enter__(self) -> Self:
-        listener = self._listening_socket()
-        self._port = listener.getsockname()[1]
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(
-            target=self._loop.run_forever, name="Hesai PTC", daemon=True
-        )
-        self._thread.start()
-        starting = asyncio.start_server(self._serve, sock=listener)
-        self._server = asyncio.run_coroutine_threadsafe(starting, self._loop).result()
-        return self
-
-    def __exit__(self, *problem: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
-
-    def _listening_socket(self) -> socket.socket:
-        """Return a socket at the address; LidarError if the address cannot be used."""
-        for port in self._ports:
-            listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listener.bind((self._host, port))
-                listener.listen(_MAX_CONNECTIONS)
-            except OSError as problem:
-                listener.close()
-                if problem.errno == errno.EADDRINUSE and port != self._ports[-1]:
-                    continue
-                raise LidarError(
-                    f"Hesai's commands (PTC) cannot listen at {self._host}:{port} "
-                    f"({os.strerror(problem.errno or 0)}): give another address, such as --api "
-                    "127.0.0.1:9348."
-                ) from problem
-            return listener
-        raise AssertionError("the last port returns or raises")
-
-    async def _close(self) -> None:
-        """Close the address and all connections."""
-        self._server.close()
-        tasks = list(self._connections)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the commands of a connection until it ends, or sends bytes that are none."""
         task = asyncio.current_task()
         assert task is not None
         self._connections[task] = None
-        if len(self._connections) > _MAX_CONNECTIONS:
+        if len(self._connections) > self.max_connections:
             silent = next(iter(self._connections))
             del self._connections[silent]
             silent.cancel()

@@ -8,28 +8,23 @@ request. A browser's page of another site is refused, as the protocols have no p
 from __future__ import annotations
 
 import asyncio
-import errno
 import json
-import os
-import socket
-import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from ipaddress import AddressValueError, IPv4Address
-from typing import Any, ClassVar, Self
+from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
-from ..base.errors import LidarError
-from .service import Destination, Service
+from .service import Destination
+from .tcp_service import TcpService
 
 HTTP_PORT = 80
 BROADCAST = "255.255.255.255"
 _MAX_HEAD_BYTES = 16 << 10  # of the request line and headers
 _MAX_BODY_BYTES = 64 << 10
-_MAX_CONNECTIONS = 32
 _WITHIN_S = 5.0  # from the connection to the answer
 _METHODS = ("GET", "POST", "PUT", "DELETE", "HEAD")
 
@@ -78,30 +73,19 @@ class RefusedError(Exception):
         self.answer = Answer({"error": reason}, status)
 
 
-class HttpService(Service):
-    """Answers requests of HTTP on a thread of its own.
+class HttpService(TcpService):
+    """Answers requests of HTTP; parameters are those of `TcpService`."""
 
-    Parameters
-    ----------
-    address
-        HOST:PORT to listen at; HOST alone for port 80, or for a free port if port 80 cannot be had.
-    destination, send_to
-        As of `Service`.
-    """
-
-    name: ClassVar[str]  # what is served, for messages
+    usual_port = HTTP_PORT
+    example_port = 8080
+    max_connections = 32
+    buffer_bytes = _MAX_HEAD_BYTES
 
     def __init__(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> None:
-        super().__init__(destination, send_to)
-        self.host, _, port = address.partition(":")
-        self.port = int(port) if port else None  # None until a port is found
-        self._socket: socket.socket | None = None
+        super().__init__(address, destination, send_to)
         self._connections = 0
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._ended = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
 
     @abstractmethod
     def answer(self, request: Request) -> Answer:
@@ -115,62 +99,11 @@ class HttpService(Service):
             words += f" (for clients: http_proxy=http://{self.host}:{self.port})"
         return words
 
-    def __enter__(self) -> Self:
-        self._socket = self._listening_socket()
-        self.port = self._socket.getsockname()[1]
-        self._loop = asyncio.new_event_loop()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        assert self._loop is not None
-        self._loop.call_soon_threadsafe(self._ended.set)
-        self._thread.join()
-
-    def _listening_socket(self) -> socket.socket:
-        """Return a socket at the address; LidarError if the address cannot be used."""
-        ports = [HTTP_PORT, 0] if self.port is None else [self.port]
-        for port in ports:
-            listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listener.bind((self.host, port))
-                listener.listen(_MAX_CONNECTIONS)
-            except OSError as error:
-                listener.close()
-                is_taken = error.errno in (errno.EACCES, errno.EADDRINUSE)
-                if is_taken and port != ports[-1]:
-                    continue
-                raise LidarError(
-                    f"{self.name} cannot listen at {self.host}:{port} "
-                    f"({os.strerror(error.errno or 0)}): give another address, such as --api "
-                    "127.0.0.1:8080."
-                ) from error
-            return listener
-        raise AssertionError("the last port returns or raises")
-
-    def _run(self) -> None:
-        """Serve until the context ends."""
-        loop = self._loop
-        assert loop is not None
-        loop.run_until_complete(self._serve_all())
-        loop.close()
-
-    async def _serve_all(self) -> None:
-        """Answer connections until the context ends; then drop all that are open."""
-        server = await asyncio.start_server(self._serve, sock=self._socket, limit=_MAX_HEAD_BYTES)
-        await self._ended.wait()
-        server.close()
-        tasks = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the request of a connection, and close it; drop a connection too many."""
         self._connections += 1
         try:
-            if self._connections <= _MAX_CONNECTIONS:
+            if self._connections <= self.max_connections:
                 with suppress(OSError, TimeoutError, asyncio.IncompleteReadError):
                     async with asyncio.timeout(_WITHIN_S):
                         writer.write((await self._answered(reader, writer)).encode())

@@ -1,0 +1,94 @@
+"""Services over TCP, such as HTTP, on a thread with an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import socket
+import threading
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Self
+
+from ..base.errors import LidarError
+from .service import Destination, Service
+
+
+class TcpService(Service):
+    """Serves connections on a thread; an end of the context drops all that are open.
+
+    Parameters
+    ----------
+    address
+        HOST:PORT to listen at; HOST alone for the usual port, or for a free port if the usual port
+        cannot be had.
+    destination, send_to
+        As of `Service`.
+    """
+
+    name: ClassVar[str]  # what is served, for messages
+    usual_port: ClassVar[int]
+    example_port: ClassVar[int]  # for advice
+    max_connections: ClassVar[int]
+    buffer_bytes: ClassVar[int] = 1 << 16  # of a connection
+
+    def __init__(
+        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
+    ) -> None:
+        super().__init__(destination, send_to)
+        self.host, _, port = address.partition(":")
+        self.port = int(port) if port else None  # None until a port is found
+        self._loop: asyncio.AbstractEventLoop
+        self._thread: threading.Thread
+        self._server: asyncio.Server
+
+    @abstractmethod
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the requests of a connection, and close the connection."""
+
+    def __enter__(self) -> Self:
+        listener = self._listening_socket()
+        self.port = listener.getsockname()[1]
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name=self.name, daemon=True)
+        self._thread.start()
+        starting = asyncio.start_server(self.serve, sock=listener, limit=self.buffer_bytes)
+        self._server = asyncio.run_coroutine_threadsafe(starting, self._loop).result()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _listening_socket(self) -> socket.socket:
+        """Return a socket at the address; LidarError if the address cannot be used."""
+        ports = [self.usual_port, 0] if self.port is None else [self.port]
+        for port in ports:
+            listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((self.host, port))
+                listener.listen(self.max_connections)
+            except OSError as error:
+                listener.close()
+                is_taken = error.errno in (errno.EACCES, errno.EADDRINUSE)
+                if is_taken and port != ports[-1]:
+                    continue
+                raise LidarError(
+                    f"{self.name} cannot listen at {self.host}:{port} "
+                    f"({os.strerror(error.errno or 0)}): give another address, such as --api "
+                    f"127.0.0.1:{self.example_port}."
+                ) from error
+            return listener
+        raise AssertionError("the last port returns or raises")
+
+    async def _close(self) -> None:
+        """Close the address and all connections."""
+        self._server.close()
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
