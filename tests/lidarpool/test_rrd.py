@@ -15,6 +15,8 @@ import pytest
 pytest.importorskip("rerun", reason="needs rerun-sdk, 500 MB")
 
 from rerun.chunk import RrdReader
+from tests.lidarpool.test_viewers import ROOM
+from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
 from lidarpool import Cloud, LidarError
 from lidarpool.export.boxes import Boxes
@@ -23,22 +25,7 @@ from lidarpool.playback.sources import open_source
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
 
-SCENARIO = """
-sensors:
-  roof: {model: velodyne/vlp16, rate_hz: 20, mount: {position: [0.5, 0, 0.4], yaw_deg: 30}}
-  rear: {layers: 2, rays_per_revolution: 90, mount: {position: [-1, 0, 0], yaw_deg: 180}}
-scene: room.obj
-trajectory:
-  points: [{time_s: 0, position: [-1, 0, 1]}, {time_s: 1, position: [1, 0.5, 1]}]
-  duration_s: 0.15
-actors:
-  - name: Car 1
-    box: [4.5, 1.8, 1.5]
-    trajectory: {points: [{time_s: 0, position: [5, -5, 0]}, {time_s: 1, position: [5, 5, 0]}]}
-cloud: {start: 2026-05-04T10:20:30.5Z, keep_every: 1, columns: [intensity, time, range]}
-planning: {enabled: false}
-"""
-ROOM = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nv 9 -9 4\nv 9 9 4\nf 1 2 3 4\nf 2 3 6 5\n"
+SCENARIO = VIEWED.replace("cloud: {", "cloud: {start: 2026-05-04T10:20:30.5Z, ")
 UTM = np.array([431_000.0, 5_812_000.0, 40.0])
 
 

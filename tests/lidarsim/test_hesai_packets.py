@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from tests.packet_surveys import encoded, points_of
 from tests.shapes import box, room, wall
 
 from lidarpool import (
@@ -25,13 +26,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("ray", "range", "reflectivity", "time", "azimuth", "return_number", "returns")
 MODES = {"first": 0x33, "strongest": 0x37, "last": 0x38, "dual": 0x39}
@@ -237,22 +234,6 @@ def scanned(model: str, mode: str):
         returns=Returns(mode, subrays=7, divergence_mrad=20.0),
     )  # fmt: skip
     return survey, *points_of(survey, posts_before_walls())
-
-
-def points_of(survey, scene):
-    rig = Rig(scene, survey, "embree")
-    part = columns_of(list(rig.cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    return cloud, Sweeps.from_survey(survey, scene)
-
-
-def encoded(cloud, sweeps):
-    """Return the groups of datagrams of all sweeps of a survey with one sensor."""
-    encoder = encoder_of(PacketSource.of_sensor(sweeps, 0))
-    groups = []
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        groups += encoder.encode(Shots.from_points(sweeps, sweep, points, encoder.columns))
-    return groups + encoder.finish()
 
 
 def data_of(groups):

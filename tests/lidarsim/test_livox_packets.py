@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from tests.packet_surveys import encoded, payloads_to, points_of
 from tests.shapes import Cart, box, room, wall
 
 from lidarpool import (
@@ -26,13 +27,9 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.navigation_files import write_instruments
-from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("ray", "range", "reflectivity", "time", "azimuth", "elevation")
 RATE_HZ = 10
@@ -143,26 +140,6 @@ def scanned(model: str, kind: int):
         columns=COLUMNS, keep_every=1, precision_m=1e-6, noise=Noise(range_m=0.02),
     )  # fmt: skip
     return survey, *points_of(survey, posts_before_walls())
-
-
-def points_of(survey, scene):
-    rig = Rig(scene, survey, "embree")
-    part = columns_of(list(rig.cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    return cloud, Sweeps.from_survey(survey, scene)
-
-
-def encoded(cloud, sweeps):
-    """Return the groups of datagrams of all sweeps of a survey with one sensor."""
-    encoder = encoder_of(PacketSource.of_sensor(sweeps, 0))
-    groups = []
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        groups += encoder.encode(Shots.from_points(sweeps, sweep, points, encoder.columns))
-    return groups + encoder.finish()
-
-
-def payloads_to(port, groups):
-    return np.concatenate([group.payloads for group in groups if group.port == port])
 
 
 @cache

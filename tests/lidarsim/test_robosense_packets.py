@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.shapes import box, room, wall
+from tests.packet_surveys import encoded, payloads_to, points_of, posts_before_walls
+from tests.shapes import room
 
 from lidarpool import (
     Fault,
@@ -20,18 +21,13 @@ from lidarpool import (
     Noise,
     Pose,
     Returns,
-    Scene,
     Survey,
     Track,
     load_sensor,
 )
-from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("ray", "range", "reflectivity", "signal", "time", "azimuth", "return_number", "returns")
 RATE_HZ = 10.0
@@ -171,15 +167,6 @@ def device_data(payload, model: str) -> DeviceData:
 
 
 @cache
-def posts_before_walls() -> Scene:
-    """Two walls with a gap between, and a row of posts that beams meet in part."""
-    posts = [box(f"post {n}", (4, n / 2, -2), (4.05, n / 2 + 0.1, 2)) for n in range(-9, 10)]
-    return Scene.from_meshes(
-        [wall("left", 8, (1, 9), (-4, 4)), wall("right", 9, (-12, 0), (-4, 4)), *posts]
-    )
-
-
-@cache
 def scanned(model: str, mode: str):
     """Return a survey of some degrees, its points and its sweeps."""
     survey = Survey(
@@ -188,26 +175,6 @@ def scanned(model: str, mode: str):
         returns=Returns(mode, subrays=7, divergence_mrad=20.0),
     )  # fmt: skip
     return survey, *points_of(survey, posts_before_walls())
-
-
-def points_of(survey, scene):
-    rig = Rig(scene, survey, "embree")
-    part = columns_of(list(rig.cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    return cloud, Sweeps.from_survey(survey, scene)
-
-
-def encoded(cloud, sweeps):
-    """Return the groups of datagrams of all sweeps of a survey with one sensor."""
-    encoder = encoder_of(PacketSource.of_sensor(sweeps, 0))
-    groups = []
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        groups += encoder.encode(Shots.from_points(sweeps, sweep, points, encoder.columns))
-    return groups + encoder.finish()
-
-
-def payloads_to(port, groups):
-    return np.concatenate([group.payloads for group in groups if group.port == port])
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What an environment offers to lidarpool, and the one thing to fix first."""
+"""Examination of an environment, and the fault to fix first."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _MIN_DISK_GIB = 1.0
 
 
 def examine() -> dict[str, Any]:
-    """Return what is here, as plain data for JSON; `fix_first` is "" if nothing is wrong."""
+    """Return the findings as plain data for JSON; `fix_first` is "" without a fault."""
     figures: dict[str, Any] = {
         "versions": versions(),
         "machine": {
@@ -73,7 +73,7 @@ def _open3d_state() -> str:
 
 
 def _extras() -> dict[str, str]:
-    """Return `READY`, or the command that installs what is missing, of each extra by its name."""
+    """Return the state of each extra by its name: `READY`, or the command that installs it."""
     try:
         names = metadata("lidarpool").get_all("Provides-Extra") or []
     except PackageNotFoundError:  # a checkout that is not installed
@@ -81,14 +81,14 @@ def _extras() -> dict[str, str]:
     requirements = [Requirement(text) for text in requires("lidarpool") or ()]
     states = {}
     for name in sorted({*names} - {*_FOR_DEVELOPERS}):
-        needed = [
+        requirements_of_extra = [
             requirement
             for requirement in requirements
             if requirement.marker is not None
             and requirement.marker.evaluate({"extra": name})
             and not requirement.marker.evaluate({"extra": ""})
         ]
-        is_ready = all(map(_is_installed, needed))
+        is_ready = all(map(_is_installed, requirements_of_extra))
         states[name] = READY if is_ready else install_command(f"lidarpool[{name}]")
     return states
 
@@ -113,7 +113,7 @@ def _port_state(port: int) -> str:
 
 
 def _fix_first(figures: dict[str, Any]) -> str:
-    """Return the most urgent advice; "" if nothing is wrong."""
+    """Return the most urgent advice; "" without a fault."""
     return next(_advice(figures), "")
 
 
@@ -155,7 +155,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
         "memory": memory,
         "disk": disks,
         "GPUs here": ", ".join(figures["gpus"]) or "none",
-        "open3d": figures["open3d"],
+        "writing clouds": figures["open3d"],
     }
     lines = [f"{name:<14} {value}" for name, value in rows.items()]
     for title, states in (("backends", figures["backends"]), ("extras", figures["extras"])):
@@ -169,6 +169,6 @@ def in_words(figures: dict[str, Any]) -> list[str]:
 
 
 def advice_in_words(figures: dict[str, Any]) -> str:
-    """Return the last line of the report: what to fix first."""
+    """Return the last line of the report: the fault to fix first."""
     advice = figures["fix_first"]
     return f"fix first: {advice}." if advice else "nothing needs to be fixed."

@@ -73,7 +73,7 @@ def play(
     now: bool,
     **settings: Any,
 ) -> None:
-    """Play a result or scenario as its sensors would send it, at its own time.
+    """Play a result or scenario as its sensors would send the sweeps, at their own times.
 
     SOURCE: the folder of a result; a scenario, campaign or mesh file, whose sweeps are cast as they
     are due; or packets in a .pcap file.
@@ -97,24 +97,24 @@ def play(
     keep_freed_memory()
     terminal = Terminal()
     kind = bridge_class(bridge_name)
-    given = {name: value for name, value in settings.items() if value not in (None, ())}
-    if unknown := [name for name in given if name not in kind.settings]:
+    bridge_settings = {name: value for name, value in settings.items() if value not in (None, ())}
+    if unknown := [name for name in bridge_settings if name not in kind.settings]:
         raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
     if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() == RECORDING:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
-        _play_recording(source, to, schedule, given, loop=loop)
+        _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return
     with ExitStack() as stack:
         with terminal.status("reading the source", logged=False):
-            played = stack.enter_context(open_source(source, kind.format_of(given)))
+            played = stack.enter_context(open_source(source, kind.format_of(bridge_settings)))
         sweeps = played.sweeps
         start_at_ns = 0
         if now:
             start_at_ns = time.time_ns() + _NOW_NS
             sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
-        bridge_options = BridgeOptions(to, played.period_ns if loop else 0, given)
+        bridge_options = BridgeOptions(to, played.period_ns if loop else 0, bridge_settings)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
         with _summarized(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
