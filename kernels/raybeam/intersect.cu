@@ -59,6 +59,7 @@ typedef long long Count;
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
 #define RECORD 20                   // doubles of an instance
+#define MISSED 1e30f                // distance of a box that the ray does not meet
 #define SPAN 32                     // times for each box of a moving body
 #define UNIT_SLACK 1e-14            // see rays.py
 
@@ -325,7 +326,7 @@ struct Walk {
     float ox, oy, oz, dx, dy, dz;  // start and direction
     float ix, iy, iz;              // 1 / direction
     float sx, sy, sz;              // start / direction
-    int nx, ny, nz;                // float4 of a node that holds the nearer planes
+    unsigned nx, ny, nz;           // float4 of a node that holds the nearer planes
     double entry;                  // distance of the start from the origin
     float from, to;                // limits of the distance of a hit from the start
 };
@@ -387,24 +388,25 @@ __device__ __forceinline__ bool begin(
     w.sx = w.ox * w.ix;
     w.sy = w.oy * w.iy;
     w.sz = w.oz * w.iz;
-    w.nx = w.ix < 0.0f ? 3 : 0;
-    w.ny = w.iy < 0.0f ? 4 : 1;
-    w.nz = w.iz < 0.0f ? 5 : 2;
+    w.nx = w.ix < 0.0f ? 3u : 0u;
+    w.ny = w.iy < 0.0f ? 4u : 1u;
+    w.nz = w.iz < 0.0f ? 5u : 2u;
     w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -ACROSS);
     w.to = limit(t_max, entry);
     return true;
 }
 
-// Return the distance at which the ray enters a child's box; a large number for a miss, or beyond
-// `to`.
+// Return the distance at which the ray enters a child's box. `met` becomes whether the ray meets
+// the box before `to`.
 __device__ __forceinline__ float enter(
-    const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz)
+    const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz, bool& met)
 {
     const float near = fmaxf(fmaxf(fmaf(nx, w.ix, -w.sx), fmaf(ny, w.iy, -w.sy)),
                              fmaxf(fmaf(nz, w.iz, -w.sz), 0.0f));
     const float far = fminf(fminf(fmaf(fx, w.ix, -w.sx), fmaf(fy, w.iy, -w.sy)),
                             fminf(fmaf(fz, w.iz, -w.sz), w.to));
-    return near <= far ? near : 1e30f;
+    met = near <= far;
+    return near;
 }
 
 // Swap two children if the second is nearer.
@@ -429,7 +431,7 @@ struct alignas(8) Waiting {
 // and every push would wait for it.
 __device__ __forceinline__ void push(Waiting* stack, int& top, int node, float t)
 {
-    if (t < 1e30f) {
+    if (t < MISSED) {
         const Waiting entry = {node, t};
         stack[top++] = entry;
     }
@@ -450,19 +452,25 @@ __device__ __forceinline__ int descend(
     const float4* nodes, int node, const Walk& w, Waiting* stack, int& top, int bottom)
 {
     SEEN(NODE);
-    const float4* line = nodes + 8 * (Count)node;
-    const float4 nx = line[w.nx], ny = line[w.ny], nz = line[w.nz];
-    const float4 fx = line[3 - w.nx], fy = line[5 - w.ny], fz = line[7 - w.nz];
-    const float4 codes = line[6];
-    float t0 = enter(w, nx.x, ny.x, nz.x, fx.x, fy.x, fz.x);
-    float t1 = enter(w, nx.y, ny.y, nz.y, fx.y, fy.y, fz.y);
-    float t2 = enter(w, nx.z, ny.z, nz.z, fx.z, fy.z, fz.z);
-    float t3 = enter(w, nx.w, ny.w, nz.w, fx.w, fy.w, fz.w);
+    // Of 32 bits, since there are fewer than 2^28 nodes: a sum of 64 bits takes two instructions.
+    const unsigned line = 8u * (unsigned)node;
+    const float4 nx = nodes[line + w.nx], ny = nodes[line + w.ny], nz = nodes[line + w.nz];
+    const float4 fx = nodes[line + 3u - w.nx], fy = nodes[line + 5u - w.ny];
+    const float4 fz = nodes[line + 7u - w.nz];
+    const float4 codes = nodes[line + 6u];
+    bool met0, met1, met2, met3;
+    float t0 = enter(w, nx.x, ny.x, nz.x, fx.x, fy.x, fz.x, met0);
+    float t1 = enter(w, nx.y, ny.y, nz.y, fx.y, fy.y, fz.y, met1);
+    float t2 = enter(w, nx.z, ny.z, nz.z, fx.z, fy.z, fz.z, met2);
+    float t3 = enter(w, nx.w, ny.w, nz.w, fx.w, fy.w, fz.w, met3);
     int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
     int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
-    const bool met0 = t0 < 1e30f, met1 = t1 < 1e30f, met2 = t2 < 1e30f, met3 = t3 < 1e30f;
     // Usually all rays of a warp hit a single child or none: no sort is needed then.
-    if (met0 + met1 + met2 + met3 > 1) {
+    if ((met0 & met1) | (met2 & met3) | ((met0 | met1) & (met2 | met3))) {
+        t0 = met0 ? t0 : MISSED;
+        t1 = met1 ? t1 : MISSED;
+        t2 = met2 ? t2 : MISSED;
+        t3 = met3 ? t3 : MISSED;
         order(t0, c0, t1, c1);
         order(t2, c2, t3, c3);
         order(t0, c0, t2, c2);
