@@ -84,7 +84,8 @@ def rates(
     def pack() -> None:
         groups = Groups(scan.groups, 1)
         for (start, _), hit in zip(parts, hit_parts, strict=True):
-            engine._pack(hit, start, groups, 1.0, engine._no_counters, engine._no_other_hits)
+            chunk = engine._counted(start, None, hit, groups, engine._no_other_hits)
+            engine._pack(chunk, groups, 1.0, engine._no_counters)
 
     calls: dict[str, tuple[Any, Callable[[], object]]] = {
         "rays": (milliseconds, rays),

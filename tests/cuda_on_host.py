@@ -174,6 +174,7 @@ HOST = Module(
     empty=poisoned,
     empty_like=np.empty_like,
     copyto=np.copyto,
+    full=lambda shape, value, dtype: np.full(shape, value, dtype).view(Array),
     zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
     cumsum=np.cumsum,
     flatnonzero=lambda a: np.flatnonzero(a).view(Array),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.resources
 import importlib.util
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, partial
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,8 +15,8 @@ import numpy as np
 from .arrays import AnyArray, Ints
 from .backend import Backend, ClosestHits
 from .crossing import Nearest, TimedBodies
-from .device import DeviceHits, OtherHits, to_device
-from .hits import Counted, Part, ScanReturns, join_hits
+from .device import DeviceHits, HitTransfer, OtherHits, PendingCopy, to_device
+from .hits import Counted, ScanReturns
 from .installation import install_command
 from .instances import Scene
 from .layout import lay_out, lay_out_instances
@@ -26,11 +26,26 @@ from .poses import Poses
 from .rays import Rays
 from .scan import Groups, Scan
 
+T = TypeVar("T")
+
 _BLOCK = 128  # threads, as in intersect.cu
 _STACK_STEP = 32
 # Tables that are not read where all triangles are opaque.
 NO_MASKS = np.zeros((1, 6), np.float32), np.zeros(1, np.uint8), np.zeros((1, 4), np.int64)
 _MAX_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than the rays of a chunk
+
+
+class _CastChunk(NamedTuple):
+    """Hits of consecutive rays on the device, and counts of the hits on their way to the host."""
+
+    start: int  # number of the first ray
+    rays: tuple[Any, Any]  # origins and directions, float64 (3, n) each
+    hits: tuple[Any, Any, Any]  # local distance, row and instance, (n,) each
+    other_hits: tuple[Any, ...]  # arguments of the kernel `pack`
+    sums: Any  # int32 (n,): number of hits up to each ray
+    span: slice  # groups of the rays
+    later_starts: Ints  # first ray of each of these groups but the first, counted from `start`
+    cuts: PendingCopy  # hits up to the end of each group
 
 
 class CudaBackend(Backend):
@@ -158,7 +173,8 @@ class CudaBackend(Backend):
             table = self._ray_table(rays)
             hits = self._cast(table, n, (rays.t_min, rays.t_max))
             groups = Groups(np.zeros(1, np.int64), 1)
-            packed = self._pack(hits, 0, groups, 1.0, self._no_counters, self._no_other_hits)
+            chunk = self._counted(0, table, hits, groups, self._no_other_hits)
+            packed = self._pack(chunk, groups, 1.0, self._no_counters)
             u, v = self._weights(hits, table, packed[0])
             ray, distance, triangle, instance = packed
             columns = (ray, distance, triangle, u, v, instance)
@@ -190,9 +206,13 @@ class CudaBackend(Backend):
             return super().scan(scan)
         if scan.room is not None:
             scan.rays(0, len(scan))  # writes the rays
-        parts: list[Part] = []
-        hits, counted = self.visit(scan, lambda part: parts.append(part.get()))
-        ray, distance, triangle, instance = join_hits(parts)
+        with self._device:
+            max_hits = -(-len(scan) // scan.keep_every) + len(scan.groups)
+            transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.nested)
+            try:
+                hits, counted = self.visit(scan, transfer.send)
+            finally:  # else the device would write to memory that goes back to the pool
+                ray, distance, triangle, instance = transfer.finish()
         tally = None
         if counted is not None:
             tally = np.zeros(self._scene.face_count, np.int64)
@@ -215,12 +235,17 @@ class CudaBackend(Backend):
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
-            for start, stop in scan.chunks(self.chunk):
-                rays = self._make_rays(scan, start, stop)
-                hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
-                replacing = self._replace(hits, start, stop - start, other_hits)
-                packed = self._pack(hits, start, groups, scene.frame.scale, counting, replacing)
-                use(DeviceHits(*packed, cp, partial(_listed_rays, start, rays)))
+            chunks = (
+                self._cast_chunk(scan, start, stop, groups, other_hits)
+                for start, stop in scan.chunks(self.chunk)
+            )
+            try:
+                for chunk in _one_behind(chunks):
+                    packed = self._pack(chunk, groups, scene.frame.scale, counting)
+                    use(DeviceHits(*packed, cp, partial(_listed_rays, chunk.start, chunk.rays)))
+            except BaseException:  # the device still writes to the counts of the next chunk
+                cp.cuda.get_current_stream().synchronize()
+                raise
             return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
     def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
@@ -358,31 +383,52 @@ class CudaBackend(Backend):
         self._run("cast_table", n, *scene, *arguments)
         return t, row, instance
 
-    def _pack(
-        self,
-        hits: tuple[Any, Any, Any],
-        start: int,
-        groups: Groups,
-        scale: float,
-        counting: tuple[Any, np.int32, Any],
-        other_hits: tuple[Any, ...],
-    ) -> tuple[Any, Any, Any, Any]:
-        """Count the hits of a cast, and close up the hits to keep, all on the device.
+    def _cast_chunk(
+        self, scan: Scan, start: int, stop: int, groups: Groups, other_hits: OtherHits | None
+    ) -> _CastChunk:
+        """Cast rays `start` to `stop` of a scan, and count the hits; nothing is waited for."""
+        rays = self._make_rays(scan, start, stop)
+        hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
+        replacing = self._replace(hits, start, stop - start, other_hits)
+        return self._counted(start, rays, hits, groups, replacing)
 
-        Distances are divided by `scale`. `counting` and `other_hits` are arguments of the kernel
-        `pack`. Returns numbers of the rays, from `start` on, distances, the caller's triangles, and
-        instances.
+    def _counted(
+        self,
+        start: int,
+        rays: tuple[Any, Any],
+        hits: tuple[Any, Any, Any],
+        groups: Groups,
+        other_hits: tuple[Any, ...],
+    ) -> _CastChunk:
+        """Count the hits of a cast up to each ray, and start to copy those of groups to the host.
+
+        Hits are closed up by these sums in ray order, not by atomics: the same bytes on every run.
         """
         cp = self._cupy
         n = len(hits[1])
-        # Closed up by sums in ray order, not by atomics: the same bytes on every run.
         sums = cp.cumsum(hits[1] != -1, dtype=np.int32)
         span, later_starts = groups.spans(start, start + n)
-        cuts = np.append(0, sums[cp.asarray(np.append(later_starts, n) - 1)].get())
-        cuts = cuts.astype(np.int64)
-        first_kept, kept_counts = groups.count(span, np.diff(cuts))
+        cuts = PendingCopy(cp, sums[cp.asarray(np.append(later_starts, n) - 1)])
+        return _CastChunk(start, rays, hits, other_hits, sums, span, later_starts, cuts)
+
+    def _pack(
+        self,
+        chunk: _CastChunk,
+        groups: Groups,
+        scale: float,
+        counting: tuple[Any, np.int32, Any],
+    ) -> tuple[Any, Any, Any, Any]:
+        """Count the hits of a chunk in `groups`, and close up the hits to keep, on the device.
+
+        Distances are divided by `scale`. `counting` are arguments of the kernel `pack`. Returns
+        numbers of the rays, distances, the caller's triangles, and instances.
+        """
+        cp = self._cupy
+        n = len(chunk.hits[1])
+        cuts = np.append(0, chunk.cuts.values()).astype(np.int64)
+        first_kept, kept_counts = groups.count(chunk.span, np.diff(cuts))
         offsets = np.cumsum(kept_counts) - kept_counts
-        starts = np.append(0, later_starts)
+        starts = np.append(0, chunk.later_starts)
         table = np.minimum([starts, cuts[:-1] + first_kept, offsets], _MAX_INT)
         kinds = (np.uint32, np.float64, np.int32, np.int32)
         packed = tuple(cp.empty(int(kept_counts.sum()), kind) for kind in kinds)
@@ -390,12 +436,12 @@ class CudaBackend(Backend):
             "pack",
             n,
             self._meshes[3],
-            *hits,
-            sums,
+            *chunk.hits,
+            chunk.sums,
             np.int64(n),
             np.float64(scale),
-            np.int64(start),
-            *other_hits,
+            np.int64(chunk.start),
+            *chunk.other_hits,
             cp.asarray(table.astype(np.int32)),
             np.int32(len(kept_counts)),
             np.int32(min(groups.keep_every, _MAX_INT)),
@@ -412,6 +458,19 @@ class CudaBackend(Backend):
         if threads:
             grid = (-(-threads // _BLOCK),)
             self._module.get_function(kernel)(grid, (_BLOCK,), arguments)
+
+
+def _one_behind(items: Iterable[T]) -> Iterator[T]:
+    """Yield items, each after the next was computed.
+
+    So the device casts a chunk while the host waits for the hits of the chunk before.
+    """
+    waiting: list[T] = []
+    for item in items:
+        waiting.append(item)
+        if len(waiting) > 1:
+            yield waiting.pop(0)
+    yield from waiting
 
 
 def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:

@@ -113,6 +113,50 @@ class _Pinned:
 _pinned = _Pinned()
 
 
+def host_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
+    """Return an array (count,) in page-locked memory, to which the device can write directly.
+
+    The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
+    `PINNED_BYTES`, further arrays are in ordinary memory, to which copies take longer: memory that
+    is page-locked is lost to all other processes of the machine.
+    """
+    size = max(count * np.dtype(kind).itemsize, 1)
+    if not _pinned.take(size):
+        return np.empty(count, kind)
+    try:
+        memory = cupy.cuda.alloc_pinned_memory(size)
+    except BaseException:
+        _pinned.give_back(size)
+        raise
+    array = np.frombuffer(memory, kind, count)
+    weakref.finalize(array, _pinned.give_back, size)  # views of the array keep the array
+    return array
+
+
+class PendingCopy:
+    """A small copy to the host, in the current stream, for which the host waits later.
+
+    Parameters
+    ----------
+    cupy
+        The module.
+    array
+        CuPy array (n,), which the current stream computes.
+    """
+
+    def __init__(self, cupy: Any, array: Any) -> None:
+        stream = cupy.cuda.get_current_stream()
+        self._values = host_array(cupy, len(array), array.dtype)
+        array.get(stream=stream, out=self._values, blocking=False)
+        self._copied = stream.record()
+        self._source = array  # the device still reads the array
+
+    def values(self) -> AnyArray:
+        """Wait for the copy, and return the values (n,)."""
+        self._copied.synchronize()
+        return self._values
+
+
 class Outbox:
     """Queue of copies of arrays to the host, in a separate stream, while the device goes on.
 
@@ -128,29 +172,10 @@ class Outbox:
         # Events after copies, and arrays that the device still reads.
         self._pending: deque[tuple[Any, Sequence[Any]]] = deque()
 
-    def room(self, count: int, kind: DTypeLike) -> AnyArray:
-        """Return an array (count,) in page-locked memory, to which the device can write directly.
-
-        The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
-        `PINNED_BYTES`, further arrays are in ordinary memory, to which copies take longer: memory
-        that is page-locked is lost to all other processes of the machine.
-        """
-        size = max(count * np.dtype(kind).itemsize, 1)
-        if not _pinned.take(size):
-            return np.empty(count, kind)
-        try:
-            memory = self._cupy.cuda.alloc_pinned_memory(size)
-        except BaseException:
-            _pinned.give_back(size)
-            raise
-        array = np.frombuffer(memory, kind, count)
-        weakref.finalize(array, _pinned.give_back, size)  # views of the array keep the array
-        return array
-
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
         """Start to copy arrays that the current stream computes: pairs of source and target.
 
-        Targets are arrays from `room`.
+        Targets are arrays from `host_array`.
         """
         self._stream.wait_event(self._cupy.cuda.get_current_stream().record())
         for source, target in pairs:
@@ -167,3 +192,50 @@ class Outbox:
         while len(self._pending) > max_pending:
             copied, _ = self._pending.popleft()
             copied.synchronize()
+
+
+class HitTransfer:
+    """Sends the hits of a scan to the host, part by part, while the device casts further rays.
+
+    Parameters
+    ----------
+    cupy
+        The module.
+    max_hits
+        Number of hits for which there is room.
+    nested
+        Whether the scene has instances; without instances, all hits are on instance 0.
+    """
+
+    def __init__(self, cupy: Any, max_hits: int, *, nested: bool) -> None:
+        self._outbox = Outbox(cupy)
+        kinds = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
+        self._arrays = [host_array(cupy, max_hits, kind) for kind in kinds]
+        self._max_hits = max_hits
+        self._count = 0
+
+    def send(self, hits: DeviceHits) -> None:
+        """Start to copy the next hits, in ray order."""
+        rows = slice(self._count, self._count + len(hits))
+        columns = (hits.ray, hits.distance, hits.triangle, hits.instance)
+        pairs = zip(columns, self._arrays, strict=False)
+        self._outbox.send([(column, array[rows]) for column, array in pairs])
+        self._count += len(hits)
+
+    def finish(self) -> Part:
+        """Wait for all copies, and return the hits."""
+        self._outbox.wait()
+        ray, distance, triangle, *instances = (
+            filled(array, self._count, self._max_hits) for array in self._arrays
+        )
+        instance = instances[0] if instances else np.zeros(self._count, np.int32)
+        return ray, distance, triangle, instance
+
+
+def filled(array: AnyArray, count: int, room: int) -> AnyArray:
+    """Return the first `count` values of an array from `host_array`, which has `room` values.
+
+    If less than half of the room is in use, the values are a copy: the page-locked memory is given
+    back.
+    """
+    return array[:count].copy() if 2 * count < room else array[:count]

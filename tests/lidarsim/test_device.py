@@ -246,6 +246,22 @@ def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
         assert np.array_equal(values, clouds[1].columns[name]), name
 
 
+@pytest.mark.parametrize(
+    "actors",
+    [pytest.param((), id=""), pytest.param(ACTORS, id="actors", marks=NEEDS_NUMBA)],
+)
+def test_images_of_ranges(actors, scenes, backend):
+    scene = scenes["both"].with_actors(actors)
+    poses = np.array([[0, 0, 1], [2, -1, 1.5], [0, 0, 900]])
+    images = [
+        Scanner(scene, MADE["few columns"].sensor, backend=name).ranges(poses, start_s=0.5)
+        for name in (backend, "numpy")
+    ]
+    assert np.array_equal(*images)
+    assert np.isfinite(images[0][0]).any()
+    assert np.isinf(images[0][2]).all()
+
+
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
 def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import DeviceHits, Outbox, Pattern, check_scan
-from raybeam.device import to_device
+from raybeam import DeviceHits, OtherHits, Outbox, Pattern, Scan, check_scan
+from raybeam.device import filled, host_array, to_device
 
-from ..base.arrays import AnyArray, Floats, Indices, Ints
+from ..base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
-from ..sensor import ScanSpec, Survey
+from ..sensor import ScanSpec, Sensor, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
 from .motion import CastPoses
 from .points import BatchPoints
@@ -172,11 +172,7 @@ class DeviceColumns:
             groups=groups,
             tally=True,
         )
-        actor_hits = self._caster.on_actors(scan, poses) if poses.actor_trajectories else None
-        if actor_hits is not None:  # the last body is all actors: its triangles count from 0
-            actor_hits = replace(
-                actor_hits, triangle=actor_hits.triangle - np.int32(self.bodies[-1, 0])
-            )
+        actor_hits = self._actor_hits(scan, poses)
         transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // keep_every) + len(groups))
         try:
             hits, tally = self._caster.caster.visit(scan, transfer.make, self._counters, actor_hits)
@@ -207,6 +203,41 @@ class DeviceColumns:
             columns,
             returns if self.needs_all_hits else None,
         )
+
+    def _actor_hits(self, scan: Scan, poses: CastPoses) -> OtherHits | None:
+        """Find the hits of a scan on actors; None without actors.
+
+        All actors are the last body: its triangles count from 0.
+        """
+        if not poses.actor_trajectories:
+            return None
+        hits = self._caster.on_actors(scan, poses)
+        return replace(hits, triangle=hits.triangle - np.int32(self.bodies[-1, 0]))
+
+    def write_ranges(
+        self, sensor: Sensor, pattern: Pattern, poses: CastPoses, image: Floats32
+    ) -> None:
+        """Write the ranges of rays to `image` (n,), metres, which are inf before.
+
+        Ray i is row ``i % len(pattern)`` of the pattern, at its pose; without a return it keeps inf.
+        """
+        scan = check_scan(
+            pattern,
+            **poses.caster_arguments,
+            window=(0, len(image)),
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+        )
+        images: list[Any] = []  # on the device, as soon as there are hits
+
+        def take(hits: DeviceHits) -> None:
+            if not images:
+                images.append(hits.cupy.full(len(image), np.inf, np.float32))
+            images[0][hits.ray] = hits.distance
+
+        self._caster.caster.visit(scan, take, other_hits=self._actor_hits(scan, poses))
+        for device_image in images:
+            device_image.get(out=image)
 
     def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Return the tables of surfaces that columns.cu reads, on the caster's device."""
@@ -312,15 +343,12 @@ class _ColumnTransfer:
         if self._buffers is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
         self._buffers.outbox.wait()
-        # Page-locked memory has room for hits of all rays: after few hits, it is given back.
-        copies = 2 * self._count < self._max_points
-
-        def filled(host: AnyArray) -> AnyArray:
-            return host[: self._count].copy() if copies else host[: self._count]
-
-        columns = {column.name: filled(host) for column, host in self._buffers.columns.items()}
+        sizes = (self._count, self._max_points)
+        columns = {
+            column.name: filled(host, *sizes) for column, host in self._buffers.columns.items()
+        }
         if self._buffers.hits:
-            return columns, tuple(map(filled, self._buffers.hits))
+            return columns, tuple(filled(host, *sizes) for host in self._buffers.hits)
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
@@ -330,10 +358,13 @@ class _ColumnTransfer:
         kernel_arguments = self._kernel_arguments(cupy)
         outbox = Outbox(cupy)
         columns = {
-            column: outbox.room(self._max_points, column.dtype) for column in maker.device_columns
+            column: host_array(cupy, self._max_points, column.dtype)
+            for column in maker.device_columns
         }
         hits = (
-            [outbox.room(self._max_points, kind) for kind in _HITS] if maker.needs_all_hits else []
+            [host_array(cupy, self._max_points, kind) for kind in _HITS]
+            if maker.needs_all_hits
+            else []
         )
         kernel = _kernel(cupy, cupy.cuda.Device().id)
         return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)

@@ -339,10 +339,14 @@ class Rig:
         pose behind those of the pose before. `first_scan` is added to the number of `specs[0]`, for
         random numbers.
         """
-        sensor = self.survey.carried[specs[0].sensor].sensor
         rays = len(pattern)
         count = len(image) // rays
+        sensor = self.survey.carried[specs[0].sensor].sensor
         firings = Firings.from_scans(sensor, specs, count)
+        poses = self._with_actor_clock(poses, firings)
+        if self._device is not None:
+            self._device.write_ranges(sensor, pattern, poses, image)
+            return
         first = specs[0].firings[0]
         scan_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         returns = (
@@ -350,7 +354,7 @@ class Rig:
             .scan(
                 specs[0].scan + specs[0].ahead + first_scan,
                 pattern,
-                self._with_actor_clock(poses, firings),
+                poses,
                 (0, len(image)),
                 (rays * np.arange(count)[:, None] + scan_rays).reshape(-1),
                 firings,
