@@ -68,7 +68,8 @@ def rates(
     """Time a scan: rays, the cast alone, packing of hits, and copies of hits to the host."""
     engine: Any = caster.engine
     parts = list(scan.chunks(engine.chunk))
-    tables = [engine._make_rays(scan, start, stop) for start, stop in parts]
+    rays_of_parts = [engine._make_rays(scan, start, stop) for start, stop in parts]
+    tables = [(rays[:3], rays[3:]) for rays in rays_of_parts]
     limits = (scan.t_min, scan.t_max)
 
     def rays() -> None:

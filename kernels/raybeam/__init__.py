@@ -6,7 +6,7 @@ from .deforming import Deforming
 from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
-from .moving import Moving, hits_on
+from .moving import Moving, hits_on, listed_hits_on
 from .opacity import Opacity
 from .pattern import Pattern
 from .pattern_rays import pattern_rays
@@ -37,5 +37,6 @@ __all__ = [
     "backend_build",
     "check_scan",
     "hits_on",
+    "listed_hits_on",
     "pattern_rays",
 ]

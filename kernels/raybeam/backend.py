@@ -11,7 +11,7 @@ import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
 from .crossing import Crossing, Nearest, TimedBodies, cast_crossing
-from .device import DeviceHits, OtherHits
+from .device import DeviceHits, DeviceNearest, OtherHits
 from .hits import Counted, Hits, Part, ScanReturns, join_hits
 from .instances import Scene
 from .rays import Rays
@@ -112,7 +112,13 @@ class Backend(ABC):
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
         cast_crossing(self.nearest, crossing, nearest)
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
+    def device_nearest(
+        self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
+    ) -> DeviceNearest:
+        """Put rays `start` to `stop` of a scan on the device, as `RayCaster.device_nearest`."""
+        raise BackendUnavailable(f"Backend {self.name!r} has no device: use cast_crossing.")
+
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         raise BackendUnavailable(f"Backend {self.name!r} has no device: use cast_crossing.")
 

@@ -9,10 +9,10 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Floats, Ints
+from .arrays import Floats, Ints, Ints32
 from .backend import Backend
 from .crossing import Crossing, Nearest, TimedBodies
-from .device import DeviceHits, OtherHits
+from .device import DeviceHits, DeviceNearest, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transforms, nested_scene
 from .pattern import Pattern
@@ -159,7 +159,17 @@ class RayCaster:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
         self.engine.cast_crossing(crossing, nearest)
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
+    def device_nearest(
+        self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
+    ) -> DeviceNearest:
+        """Put rays `start` to `stop` (n) of a scan on the device, without hits on bodies.
+
+        `time_index` (n,) are the numbers of the rays' times; hits count before distance `end`,
+        metres. BackendUnavailable if this backend has no device.
+        """
+        return self.engine.device_nearest(scan, start, stop, time_index, end)
+
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`.
 
         BackendUnavailable if this backend has no device.

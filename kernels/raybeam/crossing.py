@@ -54,14 +54,10 @@ class Crossing(NamedTuple):
 
 
 class TimedBodies(NamedTuple):
-    """Rays and bodies of a common shape, with the poses of the bodies at all times of the rays.
+    """Bodies of a common shape, with their poses at consecutive times of rays.
 
     Attributes
     ----------
-    rays
-        float64 (6, n): origins, metres, and directions.
-    time_index
-        int32 (n,): number of each ray's time; a number beyond the t times meets no body.
     body
         int64 (b,): numbers of the bodies.
     poses
@@ -70,19 +66,42 @@ class TimedBodies(NamedTuple):
     boxes
         float64 (t / SPAN, b, 6): lower and upper corner of the box around a body's boxes during
         `SPAN` times, metres.
+    first_time
+        Number of the first of the t times among the times of the rays.
     limits
         Closest and farthest distance of a hit, metres.
     """
 
-    rays: Floats
-    time_index: Ints32
     body: Ints
     poses: Floats
     boxes: Floats
+    first_time: int
     limits: tuple[float, float]
 
 
 SPAN = 32  # times of a box of `TimedBodies`; as in intersect.cu
+
+
+class BodyHits(NamedTuple):
+    """Nearest hits on moving bodies, of the rays that hit a body.
+
+    Attributes
+    ----------
+    ray
+        int64 (k,): number of the ray, ascending.
+    distance
+        float64 (k,): metres.
+    body
+        int64 (k,): number of the body; of equal distances, the lowest.
+    instance, triangle
+        int32 (k,): instance and triangle of the body's shape.
+    """
+
+    ray: Ints
+    distance: Floats
+    body: Ints
+    instance: Ints32
+    triangle: Ints32
 
 
 class Nearest(NamedTuple):
@@ -114,6 +133,21 @@ class Nearest(NamedTuple):
         span = slice(start, stop)
         distance, body, instance, triangle = self
         return Nearest(distance[span], body[span], instance[span], triangle[span])
+
+    def take(self, hits: BodyHits) -> None:
+        """Write those hits on bodies that are nearer than the nearest hits so far."""
+        nearer = np.flatnonzero(hits.distance < self.distance[hits.ray])
+        ray = hits.ray[nearer]
+        self.distance[ray] = hits.distance[nearer]
+        self.body[ray] = hits.body[nearer]
+        self.instance[ray] = hits.instance[nearer]
+        self.triangle[ray] = hits.triangle[nearer]
+
+    def hits(self) -> BodyHits:
+        """Return the hits, without the rays that hit no body."""
+        ray = np.flatnonzero(self.body >= 0)
+        distance, body, instance, triangle = self
+        return BodyHits(ray, distance[ray], body[ray], instance[ray], triangle[ray])
 
 
 def cast_crossing(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:

@@ -7,15 +7,15 @@ import importlib.util
 import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, partial
-from typing import Any, ClassVar, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from .arrays import AnyArray, Ints
+from .arrays import AnyArray, Ints, Ints32
 from .backend import Backend, ClosestHits
-from .crossing import Nearest, TimedBodies
-from .device import DeviceHits, HitTransfer, OtherHits, PendingCopy, to_device
+from .crossing import TimedBodies
+from .device import DeviceHits, DeviceNearest, HitTransfer, OtherHits, PendingCopy, to_device
 from .hits import Counted, ScanReturns
 from .installation import install_command
 from .instances import Scene
@@ -24,10 +24,12 @@ from .opacity import Masks
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
-from .scan import Groups, Scan
+from .scan import Groups, Scan, host_rays
 
 T = TypeVar("T")
 
+# {pattern: {number of a device: directions on the device, and origins if the pattern has any}}
+_patterns: WeakKeyDictionary[Pattern, dict[int, tuple[Any, ...]]] = WeakKeyDictionary()
 _BLOCK = 128  # threads, as in intersect.cu
 _STACK_STEP = 32
 # Tables that are not read where all triangles are opaque.
@@ -129,8 +131,6 @@ class CudaBackend(Backend):
             no_table = to_device(cupy, np.zeros(2, np.int64))
             self._no_counters = no_table, np.int32(0), cupy.zeros(1, np.int64)
             self._no_other_hits = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
-        # {pattern: its directions on the device, and its origins if it has any}
-        self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
         self.update_scene(scene)
 
     def update_scene(self, scene: Scene) -> None:
@@ -248,33 +248,54 @@ class CudaBackend(Backend):
                 raise
             return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: Nearest) -> None:
+    def device_nearest(
+        self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
+    ) -> DeviceNearest:
+        """Put rays `start` to `stop` (n) of a scan on the device, as `RayCaster.device_nearest`."""
+        cp = self._cupy
+        n = stop - start
+        with self._device:
+            if scan.pattern.sub_rays is None:
+                rays = self._make_rays(scan, start, stop)
+            else:  # the kernel has no sub-rays
+                rays = cp.asarray(host_rays(scan, start, stop))
+            return DeviceNearest(
+                rays,
+                cp.asarray(time_index),
+                cp.full(n, end, np.float64),
+                cp.full(n, -1, np.int64),
+                cp.zeros(n, np.int32),
+                cp.zeros(n, np.int32),
+                cp,
+            )
+
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         cp = self._cupy
-        n = len(bodies.time_index)
-        columns = cast(tuple[AnyArray, ...], nearest)
+        n = len(nearest.time_index)
         limits = (np.float64(t * self._scene.frame.scale) for t in bodies.limits)
         with self._device:
-            rays, time_index, body, poses, boxes = map(cp.asarray, bodies[:5])
-            hits = [cp.asarray(column) for column in columns]
+            body, poses, boxes = map(cp.asarray, (bodies.body, bodies.poses, bodies.boxes))
             self._run(
                 "cast_bodies",
                 n,
                 *self._meshes,
                 *self._instance_tables,
-                rays,
-                time_index,
+                nearest.rays,
+                nearest.time_index,
                 np.int64(n),
                 body,
                 np.int32(len(body)),
                 poses,
                 boxes,
+                np.int32(bodies.first_time),
                 np.int32(len(poses)),
                 *limits,
-                *hits,
+                nearest.distance,
+                nearest.body,
+                nearest.instance,
+                nearest.triangle,
             )
-            for column, target in zip(hits, columns, strict=True):
-                target[:] = column.get()
 
     def _nonzero_counters(self, tally: Any) -> Counted:
         """Copy the counters that are not 0 to the host, a small part of a tally."""
@@ -295,10 +316,10 @@ class CudaBackend(Backend):
         self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *hits[:2])
         return metres, triangle, np.int32(len(self._scene.mesh))
 
-    def _make_rays(self, scan: Scan, start: int, stop: int) -> tuple[Any, Any]:
+    def _make_rays(self, scan: Scan, start: int, stop: int) -> Any:
         """Return origins, metres, and directions of rays `start` to `stop` of a scan.
 
-        Both are float64 (3, n) on the device, with the bits of `pattern_rays`. Rays that are read
+        They are float64 (6, n) on the device, with the bits of `pattern_rays`. Rays that are read
         from memory cost the cast fewer registers and operations in double than rays that are
         computed again for each triangle.
         """
@@ -306,7 +327,7 @@ class CudaBackend(Backend):
         n = stop - start
         directions, pattern_origins = self._resident(scan.pattern)
         rows = len(scan.pattern)
-        table = cp.empty((3, n)), cp.empty((3, n))
+        rays = cp.empty((6, n))
         self._run(
             "make_rays",
             n,
@@ -318,9 +339,9 @@ class CudaBackend(Backend):
             *self._pattern_flags(scan, start),
             *self._motion(scan.poses, start, stop),
             np.int64(n),
-            *table,
+            rays,
         )
-        return table
+        return rays
 
     def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
         """Return arguments of make_rays: positions and rotations of rays `start` to `stop`."""
@@ -359,12 +380,13 @@ class CudaBackend(Backend):
 
         Without origins, the directions take their place, which are not read then.
         """
-        tables = self._patterns.get(pattern)
+        copies = _patterns.setdefault(pattern, {})
+        tables = copies.get(self._device.id)
         if tables is None:
             arrays = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
-            copies = [to_device(self._cupy, array.T) for array in arrays if array is not None]
-            tables = self._patterns[pattern] = (copies[0], copies[-1])
+            columns = [to_device(self._cupy, array.T) for array in arrays if array is not None]
+            tables = copies[self._device.id] = (columns[0], columns[-1])
         return tables
 
     def _cast(
@@ -387,7 +409,7 @@ class CudaBackend(Backend):
         self, scan: Scan, start: int, stop: int, groups: Groups, other_hits: OtherHits | None
     ) -> _CastChunk:
         """Cast rays `start` to `stop` of a scan, and count the hits; nothing is waited for."""
-        rays = self._make_rays(scan, start, stop)
+        rays = _table(self._make_rays(scan, start, stop))
         hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
         replacing = self._replace(hits, start, stop - start, other_hits)
         return self._counted(start, rays, hits, groups, replacing)
@@ -471,6 +493,11 @@ def _one_behind(items: Iterable[T]) -> Iterator[T]:
         if len(waiting) > 1:
             yield waiting.pop(0)
     yield from waiting
+
+
+def _table(rays: Any) -> tuple[Any, Any]:
+    """Return origins and directions, (3, n) each, of rays (6, n)."""
+    return rays[:3], rays[3:]
 
 
 def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:

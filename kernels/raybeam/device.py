@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .arrays import AnyArray, Floats, Ints32, UInts32
+from .crossing import BodyHits
 from .hits import Part
 
 PINNED_BYTES = 1 << 30  # page-locked, of all outboxes of a process
@@ -72,6 +73,37 @@ class OtherHits:
     ray: UInts32
     distance: Floats
     triangle: Ints32
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceNearest:
+    """Rays on a CUDA device, and their nearest hits on moving bodies so far, as CuPy arrays.
+
+    Attributes
+    ----------
+    rays
+        float64 (6, n): origins, metres, and directions.
+    time_index
+        int32 (n,): number of each ray's time.
+    distance, body, instance, triangle
+        (n,): as in `Nearest`.
+    cupy
+        The module.
+    """
+
+    rays: Any
+    time_index: Any
+    distance: Any
+    body: Any
+    instance: Any
+    triangle: Any
+    cupy: Any
+
+    def hits(self) -> BodyHits:
+        """Copy the hits to the host, without the rays that hit no body."""
+        ray = self.cupy.flatnonzero(self.body >= 0)
+        columns = (self.distance, self.body, self.instance, self.triangle)
+        return BodyHits(ray.get(), *(column[ray].get() for column in columns))
 
 
 def to_device(cupy: Any, array: AnyArray) -> Any:

@@ -682,8 +682,8 @@ KERNEL cast_table(
 #define BLOCKS (NESTED ? (MASKED ? 2 : 3) : 4)
 
 // Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of crossing.py. Ray i
-// meets the bodies at time when[i], if below `times`: the pose of body k at time t, 12 doubles, is
-// at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
+// meets the bodies at time t = when[i] - first_time, if t is one of `times`: the pose of body k then, 12
+// doubles, is at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
 // during SPAN times: lower and upper corner. `nearest_...` are read and written.
 KERNEL cast_bodies(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
@@ -694,24 +694,26 @@ KERNEL cast_bodies(
     const double* __restrict__ instances,
     const double* __restrict__ rays, const int* __restrict__ when, Count count,
     const Count* __restrict__ bodies, int body_count,
-    const double* __restrict__ poses, const double* __restrict__ boxes, int times,
-    double t_min, double t_max,
+    const double* __restrict__ poses, const double* __restrict__ boxes,
+    int first_time, int times, double t_min, double t_max,
     double* __restrict__ nearest_metres, Count* __restrict__ nearest_body,
     int* __restrict__ nearest_instance, int* __restrict__ nearest_triangle)
 {
     const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
-    if (i >= count || when[i] < 0 || when[i] >= times) return;
+    if (i >= count) return;
+    const int time = when[i] - first_time;
+    if (time < 0 || time >= times) return;
     const Scene scene = {nodes, triangles, corners, faces, uvs,
                          masks, opacity,   frame,   top,   instances};
 #pragma unroll 1
     for (int k = 0; k < body_count; ++k) {
-        const double* low = boxes + 6 * ((Count)(when[i] / SPAN) * body_count + k);
+        const double* low = boxes + 6 * ((Count)(time / SPAN) * body_count + k);
         double enters = 0.0, leaves = nearest_metres[i] * (1.0 + SLACK);
         for (int axis = 0; axis < 3; ++axis) {
             const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];
             clip(low[axis], low[3 + axis], o, d, enters, leaves);
         }
-        const int row = when[i] * body_count + k;
+        const int row = time * body_count + k;  // fits: CHUNK_POSES of moving.py bounds the poses
         const double absent = poses[12 * (Count)row];
         if (!(enters <= leaves) || absent != absent) continue;
         const BodyRays own = {rays, count, poses, row};
@@ -828,14 +830,14 @@ KERNEL pack(
     which[k] = in;
 }
 
-// Rays of a pattern, from one pose after another, as a table: origins in metres and directions,
-// (3, count) each, with the bits of `pattern_rays`.
+// Rays of a pattern, from one pose after another, as a table: 6 rows of `count`, origins in metres and
+// directions, with the bits of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,
     Count rows, Count first, int left, int each, int turned, int shifted,
     const double* __restrict__ delays, const double* __restrict__ rates, int moving,
-    Count count, double* __restrict__ from, double* __restrict__ towards)
+    Count count, double* __restrict__ table)
 {
     const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
     if (i >= count) return;
@@ -845,7 +847,7 @@ KERNEL make_rays(
     double at[3], to[3];
     rays.make(i, at, to);
     for (int axis = 0; axis < 3; ++axis) {
-        from[axis * count + i] = at[axis];
-        towards[axis * count + i] = to[axis];
+        table[axis * count + i] = at[axis];
+        table[(3 + axis) * count + i] = to[axis];
     }
 }

@@ -14,26 +14,27 @@ times of the rays. A shape that deforms has frames: vertices at known times (def
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .arrays import Bools, Floats, Indices, Ints
+from .arrays import Bools, Floats, Indices, Ints, Ints32
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .crossing import SPAN, Crossing, Nearest, TimedBodies
+from .crossing import SPAN, BodyHits, Crossing, Nearest, TimedBodies
 from .deforming import Deforming
 from .installation import install_command
-from .scan import Scan
+from .scan import Scan, host_rays
 
 if TYPE_CHECKING:
     from .moving_loops import BodySamples
 
 CHUNK_RAYS = 1 << 17  # rays at a time
 CHUNK_PAIRS = 1 << 14  # pairs of cells and bodies at a time
+DEVICE_RAYS = 1 << 20  # rays on a device at a time: 80 MB
 CHUNK_POSES = 1 << 18  # poses on a device at a time: 25 MB
 _BOXES = 128  # static boxes at a time
 _CELLS_PER_SAMPLE = 256  # cells for each sample of the bodies' boxes
@@ -70,6 +71,11 @@ class Moving:
     presence: Floats
     poses: Callable[[Ints, Floats], Floats]
     frames: Callable[[Ints, Floats], Floats] | None = None
+
+    @property
+    def on_device(self) -> Bools:
+        """Mask (b,) of the bodies whose shapes are on a CUDA device."""
+        return np.array([shape.on_device for shape in self.shapes], np.bool_)[self.shape]
 
     @cached_property
     def middle(self) -> Floats:
@@ -116,21 +122,108 @@ def hits_on(
         raise BackendUnavailable(f"Bodies that move need numba: {install_command('numba')}.")
     from . import moving_loops as loops  # numba takes half a second to import
 
-    end = float(np.nextafter(scan.t_max, np.inf))  # t_max counts
+    end = _end(scan)
     nearest = Nearest.without_hits(
         np.full(len(scan), end) if limits is None else np.minimum(limits, end)
     )
-    for start, stop in scan.chunks(CHUNK_RAYS):
-        ray = np.arange(start, stop, dtype=np.int64)
-        if scan.room is None:
-            scan_rays = scan.rays(start, stop)
-            rays = np.empty((6, len(ray)))
-            rays[:3] = scan_rays.origins.T
-            rays[3:] = scan_rays.directions.T
-        else:  # the caster has written the rays
-            rays = np.ascontiguousarray(scan.room[:, start:stop])
-        _Chunk(loops, moving, scan, rays, times(ray), nearest.part(start, stop)).cast()
+    on_device = moving.on_device
+    for hits in _hits_on_device(moving, scan, times, np.flatnonzero(on_device)):
+        nearest.take(hits)
+    bodies = np.flatnonzero(~on_device)
+    if len(bodies):
+        for start, stop in scan.chunks(CHUNK_RAYS):
+            rays = host_rays(scan, start, stop)
+            ray_times = times(np.arange(start, stop, dtype=np.int64))
+            chunk = _Chunk(loops, moving, scan, rays, ray_times, nearest.part(start, stop))
+            chunk.cast(bodies)
     return nearest
+
+
+def listed_hits_on(moving: Moving, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
+    """Return the hits of `hits_on`, without the rays that hit no body; the arguments are the same.
+
+    Without host memory for each ray, if all shapes are on a device.
+    """
+    if not moving.on_device.all():
+        return hits_on(moving, scan, times).hits()
+    parts = [*_hits_on_device(moving, scan, times, np.arange(len(moving.shape)))]
+    if not parts:
+        return Nearest.without_hits(np.zeros(0)).hits()
+    return BodyHits(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _end(scan: Scan) -> float:
+    """Return the distance before which hits of a scan count, metres: its limit counts."""
+    return float(np.nextafter(scan.t_max, np.inf))
+
+
+def _hits_on_device(
+    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
+) -> Iterator[BodyHits]:
+    """Yield the nearest hits of consecutive rays of a scan on bodies (b,) on a device."""
+    if not len(bodies):
+        return
+    limits = (scan.t_min, scan.t_max)
+    step = max(1, CHUNK_POSES // (SPAN * len(bodies))) * SPAN
+    shape = moving.shape[bodies]
+    casters = {number: moving.shapes[number] for number in np.unique(shape).tolist()}
+    for start, stop in scan.chunks(DEVICE_RAYS):
+        distinct_times, time_index = _distinct(times(np.arange(start, stop, dtype=np.int64)))
+        caster = casters[int(shape[0])]
+        assert isinstance(caster, RayCaster)
+        nearest = caster.device_nearest(scan, start, stop, time_index, _end(scan))
+        for first in range(0, len(distinct_times), step):
+            poses, boxes = _poses_and_boxes(moving, bodies, distinct_times[first : first + step])
+            for number, caster in casters.items():
+                assert isinstance(caster, RayCaster)
+                column = np.flatnonzero(shape == number)
+                timed = TimedBodies(
+                    bodies[column],
+                    np.ascontiguousarray(poses[:, column]),
+                    np.ascontiguousarray(boxes[:, column]),
+                    first,
+                    limits,
+                )
+                caster.cast_bodies(timed, nearest)
+        hits = nearest.hits()
+        yield hits._replace(ray=hits.ray + start)
+
+
+def _distinct(times: Floats) -> tuple[Floats, Ints32]:
+    """Return the distinct values of times (n,), ascending, and the number of each: int32 (n,)."""
+    later = times[1:] > times[:-1]
+    if np.array_equal(later, times[1:] != times[:-1]):  # ascending: no sort is needed
+        index = np.zeros(len(times), np.int32)
+        np.cumsum(later, out=index[1:])
+        return times[np.flatnonzero(np.append(True, later))], index
+    distinct_times, inverse = np.unique(times, return_inverse=True)
+    return distinct_times, inverse.astype(np.int32)
+
+
+def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+    """Return the poses and the boxes of bodies (b,) at times (t,).
+
+    `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of bodies.
+    """
+    from .moving_loops import PADS_M
+
+    body = np.tile(bodies, len(times))
+    time = np.repeat(times, len(bodies))
+    present = moving.is_present(body, time)
+    shape = moving.shape[body[present]]
+    poses = np.full((len(body), 12), np.nan)
+    corners = np.full((2, len(body), 3), np.nan)
+    if present.any():
+        table = moving.poses(body[present], time[present])
+        poses[present] = table.T
+        rotations = _rotations(table)
+        centres = table[:3].T + _rotated(rotations, moving.middle[shape])
+        half = _rotated(np.abs(rotations), moving.half[shape]) + PADS_M
+        corners[:, present] = centres - half, centres + half
+    lower, upper = corners.reshape(2, -1, len(bodies), 3)
+    spans = np.arange(0, len(times), SPAN)
+    boxes = np.fmin.reduceat(lower, spans), np.fmax.reduceat(upper, spans)
+    return poses.reshape(-1, len(bodies), 12), np.concatenate(boxes, axis=2)
 
 
 def near_boxes(
@@ -223,17 +316,12 @@ class _Chunk:
         self._times = times
         self._nearest = nearest
 
-    def cast(self) -> None:
-        """Cast the rays on all bodies that are present; write nearer hits to the nearest hits."""
-        moving = self._moving
-        first, last = moving.presence.T
-        bodies = np.flatnonzero((first <= self._times.max()) & (last >= self._times.min()))
-        on_device = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
-        if on_device.any():
-            self._cast_on_device(bodies[on_device])
-            bodies = bodies[~on_device]
-        if len(bodies):
-            self._cast_near_cells(bodies)
+    def cast(self, bodies: Ints) -> None:
+        """Cast the rays on those of the bodies that are present; write nearer hits."""
+        first, last = self._moving.presence[bodies].T
+        present = bodies[(first <= self._times.max()) & (last >= self._times.min())]
+        if len(present):
+            self._cast_near_cells(present)
 
     def _cast_near_cells(self, bodies: Ints) -> None:
         """Cast the cells on bodies (b,) near them: first on near bodies, where rays then end."""
@@ -251,53 +339,6 @@ class _Chunk:
         for start in range(0, len(cell), CHUNK_PAIRS):
             pairs = slice(start, start + CHUNK_PAIRS)
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
-
-    def _cast_on_device(self, bodies: Ints) -> None:
-        """Cast the rays on bodies (b,) whose shapes are on a device; write nearer hits."""
-        moving = self._moving
-        limits = (self._scan.t_min, self._scan.t_max)
-        times, time_index = np.unique(self._times, return_inverse=True)
-        step = max(1, CHUNK_POSES // (SPAN * len(bodies))) * SPAN
-        for number in np.unique(moving.shape[bodies]).tolist():
-            shape = moving.shapes[number]
-            shape_bodies = bodies[moving.shape[bodies] == number]
-            assert isinstance(shape, RayCaster)
-            for start in range(0, len(times), step):
-                rows = np.flatnonzero((time_index >= start) & (time_index < start + step))
-                span = slice(int(rows[0]), int(rows[-1]) + 1)
-                poses, boxes = self._poses_and_boxes(
-                    number, shape_bodies, times[start : start + step]
-                )
-                rays = np.ascontiguousarray(self._rays[:, span])
-                row_times = (time_index[span] - start).astype(np.int32)
-                timed = TimedBodies(rays, row_times, shape_bodies, poses, boxes, limits)
-                shape.cast_bodies(timed, self._nearest.part(span.start, span.stop))
-
-    def _poses_and_boxes(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-        """Return the poses and the boxes of bodies (b,) of a shape at times (t,).
-
-        `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of
-        bodies.
-        """
-        from .moving_loops import PADS_M
-
-        moving = self._moving
-        body = np.tile(bodies, len(times))
-        time = np.repeat(times, len(bodies))
-        present = moving.is_present(body, time)
-        poses = np.full((len(body), 12), np.nan)
-        corners = np.full((2, len(body), 3), np.nan)
-        if present.any():
-            table = moving.poses(body[present], time[present])
-            poses[present] = table.T
-            rotations = _rotations(table)
-            centres = table[:3].T + _rotated(rotations, moving.middle[[shape]])
-            half = _rotated(np.abs(rotations), moving.half[[shape]]) + PADS_M
-            corners[:, present] = centres - half, centres + half
-        lower, upper = corners.reshape(2, -1, len(bodies), 3)
-        spans = np.arange(0, len(times), SPAN)
-        boxes = np.fmin.reduceat(lower, spans), np.fmax.reduceat(upper, spans)
-        return poses.reshape(-1, len(bodies), 12), np.concatenate(boxes, axis=2)
 
     def _samples(self, bodies: Ints, cells: Floats) -> BodySamples:
         """Return the boxes of bodies (b,) at equal steps of time over cells (c, 15)."""

@@ -119,6 +119,17 @@ def check_scan(
     )
 
 
+def host_rays(scan: Scan, start: int, stop: int) -> Floats:
+    """Return origins, metres, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
+    if scan.room is not None:  # the caster has written the rays
+        return np.ascontiguousarray(scan.room[:, start:stop])
+    scan_rays = scan.rays(start, stop)
+    rays = np.empty((6, stop - start))
+    rays[:3] = scan_rays.origins.T
+    rays[3:] = scan_rays.directions.T
+    return rays
+
+
 class Groups:
     """Counts of the hits in each group of rays of a scan, of which every n-th hit is kept.
 

@@ -219,7 +219,7 @@ class DeviceColumns:
     ) -> None:
         """Write the ranges of rays to `image` (n,), metres, which are inf before.
 
-        Ray i is row ``i % len(pattern)`` of the pattern, at its pose; without a return it keeps inf.
+        Ray i is row ``i % len(pattern)`` of the pattern. A ray without a return keeps inf.
         """
         scan = check_scan(
             pattern,

@@ -23,8 +23,8 @@ from raybeam import (
     available_backends,
     check_scan,
     hits_on,
+    listed_hits_on,
 )
-from raybeam.crossing import Nearest
 
 from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..base.errors import LidarError
@@ -265,7 +265,8 @@ class SceneCaster:
 
         static_distance = np.full(len(scan), np.inf)
         static_distance[static_hits.ray] = static_hits.distance
-        nearest, shapes = self._nearest(scan, poses, static_distance)
+        moving, shapes = self._moving_actors(poses)
+        nearest = hits_on(moving, scan, poses.times, static_distance)
         joined = surface_loops.JoinedHits(
             np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
         )
@@ -282,22 +283,16 @@ class SceneCaster:
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
-        hits, shapes = self._nearest(scan, poses)
-        ray = np.flatnonzero(hits.body >= 0)
-        actor = hits.body[ray]
-        triangle = hits.triangle[ray]
-        part_triangle = shapes.part_triangles[shapes.shape[actor], hits.instance[ray]]
+        moving, shapes = self._moving_actors(poses)
+        ray, distance, actor, instance, triangle = listed_hits_on(moving, scan, poses.times)
+        part_triangle = shapes.part_triangles[shapes.shape[actor], instance]
         triangle = triangle + part_triangle + self._actor_triangles[actor]
-        return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
+        return OtherHits(ray.astype(np.uint32), distance, triangle)
 
-    def _nearest(
-        self, scan: Scan, poses: CastPoses, limit: Floats | None = None
-    ) -> tuple[Nearest, _ActorShapes]:
-        """Return the nearest hits of all rays (n,) on actors, and the shapes of the actors.
-
-        Hits count before distances `limit` (n,), metres.
-        """
-        assert self._shapes is not None
+    def _moving_actors(self, poses: CastPoses) -> tuple[Moving, _ActorShapes]:
+        """Return the actors as moving bodies, and their shapes."""
+        shapes = self._shapes
+        assert shapes is not None, "without actors"
         trajectories = poses.actor_trajectories
 
         def frames(actor: Ints, times: Floats) -> Floats:
@@ -305,14 +300,14 @@ class SceneCaster:
             return trajectories.played(actor, times)[0]
 
         moving = Moving(
-            self._shapes.casters,
-            self._shapes.boxes,
-            self._shapes.shape,
+            shapes.casters,
+            shapes.boxes,
+            shapes.shape,
             trajectories.presence_ns,
             trajectories.table,
             frames,
         )
-        return hits_on(moving, scan, poses.times, limit), self._shapes
+        return moving, shapes
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
