@@ -102,7 +102,10 @@ SANITIZER = """#!/bin/sh
 echo "bits: six objects: rays 342"
 case $2 in
 memcheck) echo "========= ERROR SUMMARY: 2 errors"; exit 1;;
-racecheck) echo "========= RACECHECK SUMMARY: 0 hazards displayed (0 errors, 0 warnings)";;
+racecheck)
+    echo "========= Warning: Race reported between Read access at cupy_nonzero+0x460"
+    echo "=========     and Write access at cupy_nonzero+0x630 [256 hazards]"
+    echo "========= RACECHECK SUMMARY: 1 hazards displayed (0 errors, 1 warnings)";;
 esac
 """
 NCU = """#!/bin/sh
@@ -133,7 +136,12 @@ def test_tools_of_nvidia(played_cuda, tmp_path, capsys, monkeypatch):  # noqa: F
     code, sections = results_of(tmp_path, "--in-process", "--first-device", "--only", *names)
     assert code == 1
     assert sections["sanitizer"]["memcheck"]["errors"] == 2
-    assert sections["sanitizer"]["racecheck"] == {"scenes": 1, "exit code": 0, "errors": 0}
+    assert sections["sanitizer"]["racecheck"] == {
+        "scenes": 1,
+        "exit code": 0,
+        "errors": 0,
+        "hazards in kernels of CuPy": 1,
+    }
     assert sections["counters"] == {
         "cast_table": {
             "Registers Per Thread, register per thread": 64,
