@@ -92,7 +92,8 @@ def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) ->
 
     Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
     """
-    positions: Floats = cells * precision_m + origin
+    positions: Floats = cells * precision_m
+    positions += origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
     digits = max(0, 3 - decade(precision_m))
     return np.round(positions, digits, out=positions)
