@@ -210,20 +210,27 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
     body = np.tile(bodies, len(times))
     time = np.repeat(times, len(bodies))
     present = moving.is_present(body, time)
-    shape = moving.shape[body[present]]
-    poses = np.full((len(body), 12), np.nan)
-    corners = np.full((2, len(body), 3), np.nan)
-    if present.any():
-        table = moving.poses(body[present], time[present])
-        poses[present] = table.T
-        rotations = _rotations(table)
-        centres = table[:3].T + _rotated(rotations, moving.middle[shape])
-        half = _rotated(np.abs(rotations), moving.half[shape]) + PADS_M
-        corners[:, present] = centres - half, centres + half
-    lower, upper = corners.reshape(2, -1, len(bodies), 3)
+    if present.all():
+        table = moving.poses(body, time)
+    else:
+        rows = np.flatnonzero(present)
+        table = np.full((12, len(body)), np.nan)
+        table[:, rows] = moving.poses(body[rows], time[rows])
+    shape = moving.shape[body]
+    middle = moving.middle[shape].T
+    half = moving.half[shape].T
+    corners = np.empty((2, 3, len(body)))
+    for axis in range(3):
+        x, y, z = table[3 + 3 * axis : 6 + 3 * axis]
+        centre = table[axis] + (x * middle[0] + y * middle[1] + z * middle[2])
+        reach = np.abs(x) * half[0] + np.abs(y) * half[1] + np.abs(z) * half[2] + PADS_M
+        np.subtract(centre, reach, out=corners[0, axis])
+        np.add(centre, reach, out=corners[1, axis])
+    lower, upper = corners.reshape(2, 3, len(times), len(bodies))
     spans = np.arange(0, len(times), SPAN)
-    boxes = np.fmin.reduceat(lower, spans), np.fmax.reduceat(upper, spans)
-    return poses.reshape(-1, len(bodies), 12), np.concatenate(boxes, axis=2)
+    boxes = [np.fmin.reduceat(lower, spans, axis=1), np.fmax.reduceat(upper, spans, axis=1)]
+    poses = table.T.reshape(len(times), len(bodies), 12)
+    return poses, np.moveaxis(np.concatenate(boxes), 0, -1)
 
 
 def near_boxes(

@@ -19,6 +19,9 @@ from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
 
+_BLOCK_CELLS = 1 << 13  # cells that are turned into positions at a time
+
+
 @dataclass(frozen=True)
 class PartColumns:
     """Content of a part."""
@@ -92,8 +95,12 @@ def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) ->
 
     Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
     """
-    positions: Floats = cells * precision_m
-    positions += origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
     digits = max(0, 3 - decade(precision_m))
-    return np.round(positions, digits, out=positions)
+    positions = np.empty(cells.shape)
+    for start in range(0, len(cells), _BLOCK_CELLS):  # intermediate values stay in the cache
+        block = slice(start, start + _BLOCK_CELLS)
+        unrounded = cells[block] * precision_m
+        unrounded += origin
+        np.round(unrounded, digits, out=positions[block])
+    return positions
