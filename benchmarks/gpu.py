@@ -38,24 +38,24 @@ from .gpu_clock import QUICK, Session, Sizes, clocks
 # {section: (its module, seconds at most)}, in an order of rising risk; its function has its name.
 # A section has that long on a device with nothing compiled yet.
 SECTIONS = {
-    "device": ("gpu_clock", 15),
-    "compiling": ("gpu_first", 20),
+    "device": ("gpu_clock", 10),
+    "compiling": ("gpu_first", 15),
     "tests": ("gpu_first", 100),
-    "bits": ("gpu_bits", 40),
-    "leaks": ("gpu_bits", 15),
+    "bits": ("gpu_bits", 35),
+    "leaks": ("gpu_bits", 10),
     "sanitizer": ("gpu_first", 80),
-    "kernels": ("gpu_rays", 60),
+    "kernels": ("gpu_rays", 35),
     "scanner": ("gpu_points", 30),
-    "columns": ("gpu_points", 35),
-    "run": ("gpu_points", 35),
-    "peers": ("gpu_warp", 20),
-    "large": ("gpu_rays", 40),
+    "columns": ("gpu_points", 50),
+    "run": ("gpu_points", 45),
+    "peers": ("gpu_warp", 25),
+    "large": ("gpu_rays", 55),
     "counters": ("gpu_first", 40),
-    "moving": ("gpu_rays", 25),
-    "instances": ("gpu_rays", 30),
+    "moving": ("gpu_rays", 20),
+    "instances": ("gpu_rays", 25),
     "durable": ("gpu_points", 30),
-    "sharing": ("gpu_points", 20),
-    "mujoco": ("gpu_warp", 15),
+    "sharing": ("gpu_points", 35),
+    "mujoco": ("gpu_warp", 10),
 }
 _FIRST_ONLY = ("tests", "sanitizer", "scanner", "counters")
 MEASURED = [name for name in SECTIONS if name not in _FIRST_ONLY]  # 400 s
