@@ -81,7 +81,7 @@ ROWS = (
     ("the same, shuffled", 2, _casts("shuffled")),
     ("the same, random directions from random origins", 2, _casts("scattered")),
     ("brute force, Mray/s", 2, [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
-    ("hits to the host, 20 bytes each, Gray/s", 2,
+    ("hits to the host, 16 bytes each, Gray/s", 2,
      [f"kernels/{city}, coherent/grays_s/to_host" for city in _CITIES]),
     ("build of a caster of 10⁴, 10⁵, 10⁶, 10⁷ triangles, s", 1,
      (*(f"kernels/{city}, build/seconds" for city in _CITIES), "large/city 1e7, build/seconds")),

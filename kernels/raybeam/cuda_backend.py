@@ -64,7 +64,7 @@ class CudaBackend(Backend):
 
     name: ClassVar[str] = "cuda"
     on_device: ClassVar[bool] = True
-    # Rays: some 500 MB on the device, and 300 MB more while columns are copied. Grid, sums of
+    # Rays: two chunks take some 600 MB on the device, columns included. Grid, sums of
     # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
     # 64 bits.
     chunk: ClassVar[int] = 1 << 21

@@ -205,8 +205,6 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
 
     `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of bodies.
     """
-    from .moving_loops import PADS_M
-
     body = np.tile(bodies, len(times))
     time = np.repeat(times, len(bodies))
     present = moving.is_present(body, time)
@@ -216,21 +214,31 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
         rows = np.flatnonzero(present)
         table = np.full((12, len(body)), np.nan)
         table[:, rows] = moving.poses(body[rows], time[rows])
-    shape = moving.shape[body]
-    middle = moving.middle[shape].T
-    half = moving.half[shape].T
-    corners = np.empty((2, 3, len(body)))
-    for axis in range(3):
-        x, y, z = table[3 + 3 * axis : 6 + 3 * axis]
-        centre = table[axis] + (x * middle[0] + y * middle[1] + z * middle[2])
-        reach = np.abs(x) * half[0] + np.abs(y) * half[1] + np.abs(z) * half[2] + PADS_M
-        np.subtract(centre, reach, out=corners[0, axis])
-        np.add(centre, reach, out=corners[1, axis])
+    corners = _corners(moving, moving.shape[body], table)
     lower, upper = corners.reshape(2, 3, len(times), len(bodies))
     spans = np.arange(0, len(times), SPAN)
     boxes = [np.fmin.reduceat(lower, spans, axis=1), np.fmax.reduceat(upper, spans, axis=1)]
     poses = table.T.reshape(len(times), len(bodies), 12)
     return poses, np.moveaxis(np.concatenate(boxes), 0, -1)
+
+
+def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
+    """Return the lower and upper corners (2, 3, m) of boxes around shapes (m,) at poses (12, m).
+
+    The boxes are along the axes of the scene, metres, with a margin for rounding errors.
+    """
+    from .moving_loops import PADS_M
+
+    middle = moving.middle[shape].T
+    half = moving.half[shape].T
+    corners = np.empty((2, *middle.shape))
+    for axis in range(3):
+        x, y, z = poses[3 + 3 * axis : 6 + 3 * axis]
+        centre = poses[axis] + (x * middle[0] + y * middle[1] + z * middle[2])
+        reach = np.abs(x) * half[0] + np.abs(y) * half[1] + np.abs(z) * half[2] + PADS_M
+        np.subtract(centre, reach, out=corners[0, axis])
+        np.add(centre, reach, out=corners[1, axis])
+    return corners
 
 
 def near_boxes(

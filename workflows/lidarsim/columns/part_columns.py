@@ -18,7 +18,6 @@ from .cloud import Cloud
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
-
 _BLOCK_CELLS = 1 << 13  # cells that are turned into positions at a time
 
 
