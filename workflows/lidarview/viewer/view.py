@@ -161,12 +161,13 @@ class View:
         self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the last answer
         self.show(self.points)
 
-    def show(self, points: Points) -> None:
-        """Replace the points."""
+    def show(self, points: Points, *, keep_scales: bool = False) -> None:
+        """Replace the points; colour scales stay those of earlier points with `keep_scales`."""
         self.points = points
         self._finder = PointFinder(points, self.origin)
-        # {(column, filter, limits of the scale): colour scale}
-        self._colourings: dict[tuple[Any, ...], Colouring] = {}
+        if not keep_scales:
+            # {(column, filter, limits of the scale): colour scale}
+            self._colourings: dict[tuple[Any, ...], Colouring] = {}
         self.version += 1
 
     # -- properties of the survey ---------------------------------------------------------
