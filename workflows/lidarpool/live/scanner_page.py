@@ -45,8 +45,8 @@ from ..viewers.scanner_view import ScannerView, is_present, pose_at
 from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
-SHARE = 0.05  # of a core, for the page
-NEWS_MS = 60  # from a question of a page for news to the next
+SHARE = 0.04  # of a core, for points; sending them takes half as much again
+NEWS_MS = 60  # at least, from a question of a page for news to the next
 SCALES_S = 5.0  # for which colour scales stay, so that colours of surfaces do not flicker
 MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
 _RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
@@ -223,7 +223,7 @@ class SweepFeed:
             return self._news(), {}
         if question == "state":
             header, arrays = self.view.answer(question, arguments, abandoned)
-            return header | {"live": True, "scanner": True, "news_ms": NEWS_MS}, arrays
+            return header | {"live": True, "scanner": True}, arrays
         if question not in ("news", "points"):  # once, or when a user asks
             return self.view.answer(question, arguments, abandoned)
         with self._share.use():
@@ -272,6 +272,7 @@ class SweepFeed:
             "hits_version": None,
             "path": None,
             "ends": 0,
+            "wait_ms": max(NEWS_MS, 1e3 * self._share.wait_s),  # until newer points are due
             "points": 0 if self._view is None else len(self._view.points),
         }
 

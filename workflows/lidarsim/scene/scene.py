@@ -15,6 +15,7 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
+from ..base.signatures import shown_readably
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import plural
@@ -233,6 +234,7 @@ class Scene:
         return cls.from_objects(objects._replace(static=tuple(static)))
 
     @classmethod
+    @shown_readably
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
         """Make a scene of the objects of mesh files.
 

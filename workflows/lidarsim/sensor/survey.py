@@ -17,6 +17,7 @@ from pydantic import AwareDatetime, Field, Strict
 from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarError
+from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields, shown
 from ..columns.table import (
     COORDINATES,
@@ -104,6 +105,8 @@ class ScanSpec:
         For a scan of a frozen sensor: the first scan of the sweep that is sent again, and the first
         scan of the sweep that it replaces.
     """
+
+    __signature__ = ReadableSignature()
 
     scan: int
     station: int

@@ -1137,7 +1137,7 @@ async function begin() {
   requestAnimationFrame(frame);
   if (state.live) {
     panel.progress.after(stop);
-    follow("news", () => ({}), state.news_ms ?? NEWS_MS, news).catch((error) => {
+    follow("news", () => ({}), NEWS_MS, news).catch((error) => {
       failed(error);
       panel.progress.replaceChildren(); // it goes on no more
     });
