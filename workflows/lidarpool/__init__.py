@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import lidarview  # noqa: F401 - which draws the pictures of notebooks
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:

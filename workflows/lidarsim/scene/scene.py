@@ -15,10 +15,11 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
+from ..base.notebook import picture_of, table_of
 from ..base.signatures import shown_readably
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
-from ..base.words import plural
+from ..base.words import listed, plural
 from ..sensor import Track
 from ..sensor.materials import SurfaceKinds
 from .actors import Actor
@@ -90,6 +91,22 @@ class Scene:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
         objects = plural(len(self.all_names), "object")
         return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
+
+    def _repr_html_(self) -> str:
+        """Return the table of the main figures, and a picture if a package draws scenes."""
+        sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
+        rows = {
+            "scene": f"{plural(len(self.all_names), 'object')}: {listed(self.all_names, 8)}",
+            "triangles": f"{self.triangles:,}",
+            "extent": f"{sides} m",
+        }
+        if self.origin.any():
+            rows["origin"] = ", ".join(f"{value:,.0f}" for value in self.origin) + " m"
+        if self.actors:
+            rows["actors"] = listed([actor.name for actor in self.actors], 8)
+        if names := [name for name in self.material_names if name]:
+            rows["materials"] = listed(names, 8)
+        return table_of(rows.items()) + picture_of(self)
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
