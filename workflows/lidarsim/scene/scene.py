@@ -393,6 +393,20 @@ class Scene:
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
 
     @property
+    def face_materials(self) -> Ints32 | None:
+        """Indices of `faces` into `material_names`, (f,), -1 for none; None without any name."""
+        if self.materials is None or not self.material_names:
+            return None
+        kinds = self.surface_kinds
+        numbers = {name: number for number, name in enumerate(self.material_names)}
+        of_kind = np.array([numbers.get(name, -1) for name in kinds.material], np.int32)
+        rows = kinds.first[self.face_object]
+        if self.materials.index is not None:
+            is_mixed = np.array([len(names) > 1 for names in self.materials.names])
+            rows = rows + self.materials.index * is_mixed[self.face_object]
+        return of_kind[rows]
+
+    @property
     def masked(self) -> tuple[str, ...]:
         """Names of the objects with masks, through which light passes in part, in order."""
         owners = set()

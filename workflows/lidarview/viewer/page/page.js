@@ -294,13 +294,15 @@ function setLimits(name, limits) {
 
 const objectLimits = () => chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null;
 
-const showSceneLegend = () => panel.sceneLegend?.replaceChildren(labels(panel.sceneTold, "object"));
+// Its labels choose objects, or materials of points.
+function showSceneLegend() {
+  const column = panel.sceneTold?.column ?? "object", acts = state.columns.some(({ name }) => name === column);
+  panel.sceneLegend?.replaceChildren(acts ? labels(panel.sceneTold, column) : legend(panel.sceneTold, null, () => {}));
+}
 
 function afterFilter(name) {
-  if (name === "object") {
-    picture.showObjects(objectLimits(), hiddenOf("object"));
-    showSceneLegend();
-  }
+  if (name === "object") picture.showObjects(objectLimits(), hiddenOf("object"));
+  showSceneLegend();
   legendText = "";
   tellFilter();
   tellResults();
