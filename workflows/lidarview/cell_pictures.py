@@ -91,8 +91,7 @@ def draw_survey(survey: Survey) -> bytes:
     colours = theme.object_colours(len(sensors))
     for sensor, colour in zip(sensors, colours, strict=True):
         x, y, _ = sensor.positions.T
-        style = {"lw": 1.6, "ls": "-"} if sensor.moves else {"ls": "", "marker": "o", "ms": 4}
-        axes.plot(x, y, color=colour, **style)
+        axes.plot(x, y, "-" if sensor.moves else "o", color=colour, lw=1.6, ms=4)
         axes.plot(x[0], y[0], "o", color=colour, ms=5)
     headings = _headings(survey)
     axes.quiver(*headings.T, color=theme.MUTED, width=0.003, scale=24, zorder=3)

@@ -11,7 +11,7 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import click
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.notebook import cell_display
 from lidarsim.base.validation import checked
@@ -45,7 +45,7 @@ from ..viewers.scanner_view import ScannerView, is_present, pose_at
 from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
-SHARE = 0.04  # of a core, for points; sending them takes half as much again
+SHARE = 0.03  # of a core, for points; sending them takes as much again
 NEWS_MS = 60  # at least, from a question of a page for news to the next
 SCALES_S = 5.0  # for which colour scales stay, so that colours of surfaces do not flicker
 MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
@@ -164,7 +164,7 @@ class _Sensor:
             rows[:, 0] * 1e9, rows[:, 1:], True, mounted.name, mounted.sensor.model
         )
 
-    def points(self, columns: Sequence[str], origin: Floats) -> tuple[Floats, list[AnyArray]]:
+    def points(self, columns: Sequence[str], origin: Floats) -> tuple[AnyFloats, list[AnyArray]]:
         """Return the points of the sweep in the world, (n, 3), and some of their columns."""
         if self.cloud is None:
             kinds = {column.name: column.dtype for column in self.scanner.survey.stored_columns}
@@ -307,7 +307,7 @@ class SweepFeed:
         custom = next((s.cloud.custom_columns for s in sensors if s.cloud is not None), ())
         return Cloud(np.concatenate([positions for positions, _ in parts]), columns, custom)
 
-    def _moved(self) -> Mapping[str, AnyArray]:
+    def _moved(self) -> dict[str, AnyArray]:
         """Return where sensors and actors are, as arrays for the page; local metres, seconds."""
         with self._lock:
             scene = self._scene

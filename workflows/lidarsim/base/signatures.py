@@ -96,12 +96,15 @@ def words_of(kind: Any) -> str:
         return f"[{', '.join(map(words_of, kind))}]"
     if kind is Ellipsis:
         return "..."
-    if isinstance(kind, (ForwardRef, str)):
-        return getattr(kind, "__forward_arg__", kind)
-    if isinstance(kind, TypeVar):
-        return kind.__name__
-    name = getattr(origin or kind, "__name__", None) or str(kind).rpartition(".")[2]
+    name = _name_of(origin or kind)
     return f"{name}[{', '.join(map(words_of, args))}]" if args else name
+
+
+def _name_of(kind: Any) -> str:
+    """Return the name of a class, of a type variable or of a type that is not imported."""
+    if isinstance(kind, (ForwardRef, str)):
+        return kind if isinstance(kind, str) else kind.__forward_arg__
+    return getattr(kind, "__name__", None) or str(kind).rpartition(".")[2]
 
 
 def _choices(values: tuple[Any, ...]) -> str:
@@ -144,7 +147,7 @@ def readable(signature: inspect.Signature, names: Mapping[str, Any]) -> inspect.
 
 def shown_readably(function: F) -> F:
     """Give a function a readable signature."""
-    signature = readable(inspect.signature(function), function.__globals__)  # type: ignore[attr-defined]
+    signature = readable(inspect.signature(function), function.__globals__)
     function.__signature__ = signature  # type: ignore[attr-defined]
     return function
 
