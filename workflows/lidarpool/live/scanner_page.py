@@ -45,7 +45,7 @@ from ..viewers.scanner_view import ScannerView, is_present, pose_at
 from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
-SHARE = 0.03  # of a core, for points; sending them takes as much again
+SHARE = 0.02  # of a core, for points; sending them takes as much again
 NEWS_MS = 60  # at least, from a question of a page for news to the next
 SCALES_S = 5.0  # for which colour scales stay, so that colours of surfaces do not flicker
 MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
