@@ -195,6 +195,13 @@ counts_of_parts = st.lists(
 )
 
 
+def test_a_notebook_shows_stored_points_as_it_shows_points_in_memory(tmp_path):
+    cloud, _ = stored_cloud(Storage.at(tmp_path), [[3, 2], [40]])
+    shown = cloud._repr_html_()
+    assert "45 points" in shown and "data:image/png" in shown
+    assert shown.replace("StoredCloud", "Cloud") == cloud.load()._repr_html_()
+
+
 @settings(max_examples=40)
 @given(counts_of_parts, st.integers(1, 30))
 def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, points):
@@ -210,7 +217,7 @@ def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, poi
         assert whole[name].tolist() == values
     assert np.array_equal(whole.bounds, cloud.bounds)
     assert np.array_equal(np.asarray(cloud), np.asarray(whole))
-    assert cloud._repr_html_() == whole._repr_html_() and f"{len(whole)} points" in repr(cloud)
+    assert f"{len(whole)} points" in repr(cloud)
     chunks = list(cloud.chunks(points))
     assert all(len(chunk) == points for chunk in chunks[:-1])
     assert len(chunks) == -(-len(cloud) // points)

@@ -11,7 +11,8 @@ LOADED = f"""
 import sys
 from lidarsim import Scanner, load_sensor
 
-load_sensor("velodyne/vlp16")
+shown = load_sensor("velodyne/vlp16")._repr_html_()
+assert "Velodyne VLP-16" in shown and "<img" not in shown
 print(sorted({{name.split(".")[0] for name in sys.modules}} & set({ABSENT!r})))
 """
 
@@ -54,7 +55,7 @@ def run(code: str, *arguments: object) -> str:
     return done.stdout
 
 
-def test_importing_lidarsim_imports_neither_dask_nor_open3d():
+def test_importing_lidarsim_imports_neither_dask_nor_open3d_and_shows_tables_alone():
     assert run(LOADED) == "[]\n"
 
 

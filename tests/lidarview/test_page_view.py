@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import LidarError, Pose, Scene, Sensor, Survey, Track
+from lidarpool import LidarError, Pose, Scene, SceneInstance, SceneMesh, Sensor, Survey, Track
 from lidarpool.live.opened import open_views
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
@@ -19,6 +19,7 @@ from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import (
     PICTURE_FILE,
@@ -541,6 +542,37 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert not vivid[~there].any()
     assert "hits per square metre" in legend["title"]
     assert len(ShownSurface(scene).corners) == len(scene.faces)  # few enough
+
+
+def test_a_scene_is_coloured_by_the_materials_of_its_faces(tmp_path):
+    """Those of faces and of instances, also simplified, and read back from a result."""
+    square, faces = np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]), [[0, 1, 2], [0, 2, 3]]
+    named = FaceMaterials(("Brick", "Glass"), np.array([0, 1], np.int32))
+    wall = SceneMesh("wall", square, faces, materials=named)
+    floor = SceneMesh("floor", square - [0, 0, 1], faces)
+    pane = SceneMesh("pane", square, faces, materials=FaceMaterials(("Glass",)))
+    copy = SceneInstance(wall, Pose((9, 0, 0)), "copy")
+    scene = Scene.from_meshes([floor, wall, pane, copy])
+    survey = Survey(Sensor.grid(100, 4), [(0, 0, 1)])
+    content, _ = PictureContent.before_casting(scene, survey)
+    expected = [-1, -1, 0, 1, 1, 1, 0, 1]
+    assert content.face_materials.tolist() == expected
+    content = replace(content, hit_counts=np.zeros(content.scene.triangles, np.int64))
+    content.save(tmp_path / "pictures.npz")
+    content = PictureContent.load(tmp_path / "pictures.npz")
+    view = View(HeldPoints(Cloud(np.ones((3, 3)), {})), content)
+    header, _ = view.answer("state", {}, bool)
+    assert "material" in header["scene"]
+    header, arrays = view.answer("surface", {"colour": "material"}, bool)
+    assert [name for name, *_ in header["legend"]["labels"]] == ["no material", "Brick", "Glass"]
+    colours = {value: colour for _, colour, value in header["legend"]["labels"]}
+    shown = arrays["colours"][:, 0].tolist()
+    assert shown == [colours[material] for material in expected]
+    assert len({*map(tuple, colours.values())}) == 3
+    plain = Scene.from_meshes([floor])
+    content, _ = PictureContent.before_casting(plain, survey)
+    assert content.face_materials is None
+    assert "material" not in colours_for(plain, None, content.face_materials)
 
 
 def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():

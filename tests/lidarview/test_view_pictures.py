@@ -179,7 +179,7 @@ def test_names_from_files_are_words_and_nothing_else(name):
     scene = Scene.from_meshes([SceneMesh(name, *solid(0)), SceneMesh("plain", *solid(1))])
     page = draw_scene(take_shot(scene, [], size=SIZE, backend="numpy"), 9)
     assert html.fromstring(page.svg()).tag == "svg"
-    first, second, _ = (text.get_text() for text in page.figure.legends[0].get_texts())
+    first, second = (text.get_text() for text in page.figure.legends[0].get_texts())
     assert (len(first), second) == (len(name), "plain")
     assert first.isprintable()
 

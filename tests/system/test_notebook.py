@@ -10,6 +10,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples/drive.ipynb"
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     notebook = nbformat.read(EXAMPLE, 4)
     assert not any(cell.get("outputs") for cell in notebook.cells)  # they would grow old
@@ -26,3 +27,6 @@ def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     assert result.count("data:image/png;base64") == 2
     assert result.count("max-width:800px") == 2  # as drawn: smaller, letters could not be read
     assert "<iframe src=" in shown[-1].data["text/html"]
+    html = [output.data.get("text/html", "") for output in shown if "data" in output]
+    assert any("sweeps of Velodyne VLP-16" in text and "<iframe" in text for text in html)
+    assert any("<caption>" in text and "data:image/png" in text for text in html)  # of a cloud

@@ -91,13 +91,14 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
     assert np.abs(cloud.positions - expected).max() <= 0.006
 
 
+@pytest.mark.usefixtures("pictures")
 def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result):
     told = repr(result)
     assert told.startswith("survey: 60 scans, 28,800 rays")
     assert (
         f"cloud: {len(result.cloud):,} points: x, y, z, scan, channel, object, brightness" in told
     )
-    assert result._repr_html_().count("<tr>") == len(told.splitlines())
+    assert result._repr_html_().count("<tr>") == len(told.splitlines()) + 3
     cloud = result.cloud
     frame = cloud.to_dataframe()
     lazy = to_dask(result.points)

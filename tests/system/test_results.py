@@ -1,6 +1,7 @@
 """What a result makes of itself in Python, and that another survey's is not replaced unasked."""
 
 import json
+import re
 import urllib.request
 from dataclasses import replace
 
@@ -33,6 +34,7 @@ def another(result) -> Result:
     return replace(result, identity={**result.identity, "survey": "another"})
 
 
+@pytest.mark.usefixtures("pictures")
 def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, scene, monkeypatch):
     monkeypatch.setattr("lidarpool.api.result.PICTURE_SIZE", (480, 480))
     survey, cloud, path = repr(result).splitlines()
@@ -41,6 +43,8 @@ def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, sc
     assert path.startswith("path: ") and "no GPU" not in path
     shown = result._repr_html_()
     assert shown.startswith("<table>") and shown.count("data:image/png;base64,") == 2
+    assert all(len(data) < 80_000 for data in re.findall('base64,([^"]*)"', shown))
+    assert f">{result.backend}<" in shown and f">{result.points.storage.url}<" in shown
     assert result.objects == scene.names
 
 

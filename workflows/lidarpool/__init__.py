@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import lidarview  # noqa: F401 - which draws the pictures of notebooks
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from .export.formats import save_cloud
     from .export.open3d_cloud import to_open3d
     from .export.ply import read_cloud
+    from .live.scanner_page import show
     from .plan import Plan, Planning
     from .playback.live import play
     from .report.merging import merge
@@ -111,6 +113,7 @@ __all__ = [
     "read_cloud",
     "remove_run",
     "save_cloud",
+    "show",
     "simulate",
     "sweeps",
     "to_dask",
@@ -130,6 +133,7 @@ _MODULES = {
     ".export.open3d_cloud": ("to_open3d",),
     ".export.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),
+    ".live.scanner_page": ("show",),
     ".plan": ("Plan", "Planning"),
     ".playback.live": ("play",),
     ".report.merging": ("merge",),

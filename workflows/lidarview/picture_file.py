@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.archives import open_archive, packed
-from lidarsim.base.arrays import AnyArray, Floats, Floats32
+from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
 from lidarsim.base.words import plural
 from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
@@ -103,6 +103,7 @@ class PictureContent:
     triangles: int = 0  # of the scene, though simpler instances may be drawn
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
+    face_materials: Ints32 | None = None  # (f,): material of each static triangle, -1 for none
 
     @classmethod
     def before_casting(
@@ -135,6 +136,7 @@ class PictureContent:
             triangles=scene.triangles,
             classes=value_names(survey.classes),
             materials=scene.material_names,
+            face_materials=drawn.scene.face_materials,
         )
         return content, drawn
 
@@ -204,6 +206,8 @@ class PictureContent:
         }
         if self.reflectance is not None:
             arrays["reflectance"] = self.reflectance
+        if self.face_materials is not None:
+            arrays["face_materials"] = self.face_materials
         if self.scene.colours is not None:
             arrays["colours"] = self.scene.colours.means()
         arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
@@ -328,6 +332,7 @@ class PictureContent:
             triangles=names["triangles"],
             classes=names.get("classes"),
             materials=names.get("materials"),
+            face_materials=arrays.get("face_materials"),
         )
 
 

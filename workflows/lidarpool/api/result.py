@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import shutil
 import weakref
-from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.base.notebook import cell_display
+from lidarsim.base.notebook import PICTURE_SIZE, cell_display, image_of, table_of
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 
@@ -24,10 +22,7 @@ from ..run.run_result import RunResult
 if TYPE_CHECKING:
     from lidarview.picture_file import PictureContent
 
-# In a notebook: the pictures of a result, and their size in pixels; scaled down by much, their
-# letters could not be read.
-_SHOWN = ("hits", "cloud")
-PICTURE_SIZE = (800, 500)
+_SHOWN = ("hits", "cloud")  # pictures of a result in a notebook
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,24 +167,21 @@ class Result(RunResult):
 
     def _repr_html_(self) -> str:
         """Return the table and pictures that notebooks show."""
-        rows = (
-            f"<tr><th style='text-align:left'>{escape(name)}</th>"
-            f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in self._figures()
-        )
-        return f"<table>{''.join(rows)}</table>{self._images}"
+        further = {
+            "backend": self.backend,
+            "seconds": f"{self.seconds:.1f}",
+            "folder": self.points.storage.url,
+        }
+        return table_of([*self._figures(), *further.items()]) + self._images
 
     @cached_property
     def _images(self) -> str:
         """Pictures of the result as HTML."""
+        from lidarview.cell_pictures import small_png
+
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=PICTURE_SIZE)
-            data = [b64encode(path.read_bytes()).decode() for path in drawn]
-        style = f"display:block;width:100%;max-width:{PICTURE_SIZE[0]}px"
-        return "".join(
-            f'<img alt="{name}" src="data:image/png;base64,{image}" style="{style}">'
-            for name, image in zip(_SHOWN, data, strict=True)
-        )
+            return "".join(image_of(small_png(path.read_bytes()), path.stem) for path in drawn)
 
     def _figures(self) -> Iterator[tuple[str, str]]:
         """Yield names and values of the main figures."""

@@ -17,6 +17,7 @@ from lidarsim._version import __version__
 from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.sampling import even_indices
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
@@ -68,6 +69,8 @@ class MeasuredPoints(NamedTuple):
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Result of `compare`; printed as a table."""
+
+    __signature__ = ReadableSignature()
 
     figures: dict[str, Any]  # as in compare.json; lengths in metres, None for unknown
     images: RangeImages | None  # of the first pair of sweeps that has range images

@@ -24,6 +24,7 @@ from lidarsim.base.arrays import Bools, Floats, Floats32, Indices, Ints
 from lidarsim.base.errors import LidarError, explained, prefixed
 from lidarsim.base.extras import need
 from lidarsim.base.sampling import even_indices
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
@@ -152,6 +153,8 @@ _STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """Result of `fit`; printed as a table."""
+
+    __signature__ = ReadableSignature()
 
     figures: dict[str, Any]  # numbers and texts of the page; lengths in metres
     model: SensorModel  # the sensor with the fitted performance

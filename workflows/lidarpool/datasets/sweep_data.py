@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.sensor import Fault
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -27,6 +28,8 @@ class Sweep:
     The frame is the sensor frame at the start of the sweep: x ahead, y to the left, z up, unless
     the mount is turned. The motion during the sweep is taken out of the points.
     """
+
+    __signature__ = ReadableSignature()
 
     job: str  # name
     job_number: int

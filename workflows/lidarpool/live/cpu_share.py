@@ -17,7 +17,12 @@ class CpuShare:
     @property
     def due(self) -> bool:
         """True if the activity may run again."""
-        return time.monotonic() >= self._due_at
+        return self.wait_s <= 0
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds until the activity may run again; 0 or less if it may now."""
+        return self._due_at - time.monotonic()
 
     @contextmanager
     def use(self, pause_s: float = 0.0) -> Iterator[None]:

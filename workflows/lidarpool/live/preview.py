@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import AXES, SCAN
+from lidarsim.columns.table import AXES, SCAN, TABLE
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarview.picture_file import PictureContent
@@ -22,6 +23,7 @@ from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.scenario import Scenario
 
+MATERIAL = TABLE["material"]
 _PREVIEW = "Preview before a run, with the points of the first sweep of each sensor."
 
 
@@ -38,8 +40,14 @@ def scenario_view(path: Path) -> View:
         job = campaign.job(0)
         note = f"Job {job.name} of {campaign.count:,} of the campaign. {_PREVIEW}"
     else:
-        job = build(Scenario.load(path)).job()
+        job = build(_with_materials(Scenario.load(path))).job()
     return preview_of(job, note, f"{path.resolve().name} - lidarpool")
+
+
+def _with_materials(scenario: Scenario) -> Scenario:
+    """Return a scenario whose points, and so the faces of its scene, have their materials."""
+    columns = (*scenario.cloud.columns, MATERIAL.name)
+    return scenario.model_copy(update={"cloud": replace(scenario.cloud, columns=columns)})
 
 
 def preview_of(job: Job, note: str, title: str) -> View:
@@ -47,6 +55,9 @@ def preview_of(job: Job, note: str, title: str) -> View:
     planning = planning_picture(job.planning)
     content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
     cloud = Cloud.joined([*first_sweeps(job)])
+    if not job.scene.material_names:
+        columns = {name: values for name, values in cloud.columns.items() if name != MATERIAL.name}
+        cloud = replace(cloud, columns=columns)
     sweeps = job.sweeps
     return View(OrderedPoints(cloud), content, sweeps, note, title, preview=True)
 

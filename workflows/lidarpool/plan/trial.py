@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import one_line
 
 from .cost import PathCost
@@ -98,6 +99,8 @@ class Plan:
     trials
         Number of trials.
     """
+
+    __signature__ = ReadableSignature()
 
     path: Floats
     length: float

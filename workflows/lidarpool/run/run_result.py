@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from lidarsim.base.arrays import Floats32, Ints
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
@@ -49,6 +50,8 @@ class RunResult:
     replayed
         Batches that were offered again.
     """
+
+    __signature__ = ReadableSignature()
 
     scene: Scene
     survey: Survey
@@ -116,6 +119,8 @@ class CampaignRun:
         Remarks for the user, the sensors of the jobs that are done, {name: models and rates}, and
         names of classes, {number: name}.
     """
+
+    __signature__ = ReadableSignature()
 
     failed: tuple[JobRow, ...]
     done: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -10,6 +11,7 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import Actor
@@ -30,29 +32,28 @@ from ..export.shown_sweeps import (
 from .viewer import Viewer, open_viewer
 
 
-class ScannerView:
-    """A viewer of the sweeps of scanners; see `Foxglove` and `Rerun`."""
+class ScannerView(ABC):
+    """Shows the sweeps of scanners while a program scans; a context manager."""
 
-    def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
-        self._viewer = viewer
+    def __init__(self, scanner: Scanner) -> None:
         self._scanner = scanner
-        name = scanner.survey.carried[0].name
-        surroundings = Surroundings(
-            Surface.from_scene(scanner.scene),
-            start_ns=time.time_ns(),
-            topics=[points_topic(name, frame_names([name], [])[0])],
-            has_actors=bool(scanner.scene.actors),
-        )
-        viewer.show_surroundings(surroundings)
-        click.echo(viewer.description, err=True)
+        self._is_closed = False
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self._scanner!r}>"
 
     @property
+    @abstractmethod
     def description(self) -> str:
         """Line for users with the addresses to open."""
-        return self._viewer.description
+
+    @abstractmethod
+    def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
+        """Send a sweep that began at a time of the clock of trajectories, nanoseconds."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """Disconnect all programs."""
 
     @checked
     def show(
@@ -77,13 +78,21 @@ class ScannerView:
             Start of the sweep by the clock of trajectories, seconds.
         scanner
             The scanner of the sweep, if there are several, with names; by default the first.
+
+        Raises
+        ------
+        LidarError
+            If the view is closed.
         """
-        scanner = scanner or self._scanner
-        self._viewer.show_sweep(_shown(scanner, cloud, pose, start_s * 1e9))
+        if self._is_closed:
+            raise LidarError("This view is closed and shows no more sweeps: open another.")
+        self._send(scanner or self._scanner, cloud, pose, start_s * 1e9)
 
     def close(self) -> None:
         """Disconnect all programs."""
-        self._viewer.close()
+        if not self._is_closed:
+            self._is_closed = True
+            self._end()
 
     def __enter__(self) -> Self:
         return self
@@ -92,7 +101,35 @@ class ScannerView:
         self.close()
 
 
-class Foxglove(ScannerView):
+class _InViewer(ScannerView):
+    """Shows the sweeps of scanners in a viewer of another program."""
+
+    def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
+        super().__init__(scanner)
+        self._viewer = viewer
+        name = scanner.survey.carried[0].name
+        surroundings = Surroundings(
+            Surface.from_scene(scanner.scene),
+            start_ns=time.time_ns(),
+            topics=[points_topic(name, frame_names([name], [])[0])],
+            has_actors=bool(scanner.scene.actors),
+        )
+        viewer.show_surroundings(surroundings)
+        click.echo(viewer.description, err=True)
+
+    @property
+    def description(self) -> str:
+        """Line for users with the addresses to open."""
+        return self._viewer.description
+
+    def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
+        self._viewer.show_sweep(_shown(scanner, cloud, pose, time_ns))
+
+    def _end(self) -> None:
+        self._viewer.close()
+
+
+class Foxglove(_InViewer):
     """Shows the sweeps of a scanner in Foxglove, in real time.
 
     A context manager. It prints the link that opens Foxglove.
@@ -115,7 +152,7 @@ class Foxglove(ScannerView):
         super().__init__(open_viewer("foxglove", to), scanner)
 
 
-class Rerun(ScannerView):
+class Rerun(_InViewer):
     """Shows the sweeps of a scanner in Rerun, in real time; see `Foxglove`.
 
     It prints the link of the viewer in the browser. By default it listens on 127.0.0.1:9876, with
@@ -131,7 +168,7 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
     """Return a sweep that a scanner has scanned from a pose or along a trajectory."""
     scene = scanner.scene
     (mounted,) = scanner.survey.carried
-    carrier = _pose_at(pose, time_ns)
+    carrier = pose_at(pose, time_ns)
     sensor = carrier.compose(mounted.mount)
     positions = cloud.positions.astype(np.float64)
     if scanner.survey.coordinates == "world":
@@ -141,7 +178,7 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
         Transform(WORLD, CARRIER, *_position_and_quaternion(carrier, scene.origin)),
         Transform(CARRIER, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
     ]
-    poses = [_pose_at(actor.trajectory, time_ns) for actor in scene.actors]
+    poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     for name, actor_pose in zip(actor_frames, poses, strict=False):
         actor_in_world = _position_and_quaternion(actor_pose, scene.origin)
         transforms.append(Transform(WORLD, name, *actor_in_world))
@@ -176,7 +213,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
         quaternions=quaternions_of(rotations),
         sizes=np.ptp(bounds, axis=1),
         points=counts.tolist(),
-        present=[_is_present(actor, time_ns) for actor in actors],
+        present=[is_present(actor, time_ns) for actor in actors],
     )
 
 
@@ -186,12 +223,13 @@ def _bounds_at(actor: Actor, time_ns: float) -> Floats:
     return actor.bounds_between(times_ns, times_ns)[0]
 
 
-def _is_present(actor: Actor, time_ns: float) -> bool:
+def is_present(actor: Actor, time_ns: float) -> bool:
+    """Return True if an actor is in the scene at a time, nanoseconds."""
     appears_ns, leaves_ns = presence_ns(actor.trajectory)
     return appears_ns <= time_ns <= leaves_ns
 
 
-def _pose_at(pose: Any, time_ns: float) -> Pose:
+def pose_at(pose: Any, time_ns: float) -> Pose:
     """Return a pose unchanged, or the pose of a trajectory at a time."""
     is_trajectory = hasattr(pose, "poses")
     return pose.pose(0, time_ns) if is_trajectory else pose_of("pose", pose)

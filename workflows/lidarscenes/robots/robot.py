@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import interp, sin_cos
 from lidarsim.base.errors import LidarError, message_of
+from lidarsim.base.signatures import ReadableSignature, shown_readably
 from lidarsim.base.tables import METRES, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import as_array, checked
@@ -94,6 +95,8 @@ class Robot:
         {link: mesh in the link's frame}, of the links with a visual mesh.
     """
 
+    __signature__ = ReadableSignature()
+
     name: str
     links: tuple[str, ...]
     joints: Mapping[str, Joint]
@@ -122,6 +125,7 @@ class Robot:
         """Names of the joints that move."""
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
+    @shown_readably
     def path(
         self,
         link: str,
@@ -145,6 +149,7 @@ class Robot:
         return self._path(link, trajectory, *self._values(joints, ignore))
 
     @checked
+    @shown_readably
     def actors(
         self,
         trajectory: Trajectory = AT_ZERO,

@@ -1,17 +1,27 @@
-"""Readable signatures of functions and dataclasses whose annotations hold limits."""
+"""Readable signatures of functions and dataclasses: types without aliases, limits and quotes."""
 
 from __future__ import annotations
 
-import ast
+import builtins
 import inspect
-from collections.abc import Callable
-from typing import Any
+import sys
+from collections.abc import Callable, Mapping
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
-_ANNOTATED = "Annotated["
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_MAX_CHOICES = 60  # letters of the values of a Literal
+# Unions of a dozen types, which a union with further types would hold one by one.
+_KEPT = {"ArrayLike": ArrayLike, "DTypeLike": DTypeLike}
+_COMPUTED = "…"  # a default that is computed for each call
 
 
 class _Text(str):
-    """Text of an annotation, which `inspect` shows without quotes."""
+    """Text that `inspect` shows without quotes."""
 
     __slots__ = ()
 
@@ -19,41 +29,138 @@ class _Text(str):
         return str(self)
 
 
-class _WithoutMetadata(ast.NodeTransformer):
-    """Replaces ``Annotated[X, …]`` by ``X``."""
+class _Annotation(str):
+    """An annotation as it is written, which `inspect` shows as the types that it stands for."""
 
-    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        """Return the type of an `Annotated[…]` node, or the node itself."""
-        self.generic_visit(node)
-        annotated = isinstance(node.value, ast.Name) and node.value.id == "Annotated"
-        return node.slice.elts[0] if annotated and isinstance(node.slice, ast.Tuple) else node
+    names: Mapping[str, Any]  # of the modules of the annotation, which may still be imported
+    is_optional: bool  # whether None is the default
+
+    @classmethod
+    def of(cls, parameter: inspect.Parameter, names: Mapping[str, Any]) -> Any:
+        """Return the annotation of a parameter; annotations that are no text stay."""
+        if not isinstance(parameter.annotation, str):
+            return parameter.annotation
+        annotation = cls(parameter.annotation)
+        annotation.names = names
+        annotation.is_optional = parameter.default is None
+        return annotation
+
+    def __repr__(self) -> str:
+        try:
+            words = words_of(eval(self, {}, _Names(self.names)))  # noqa: S307 - of our own source
+        except (TypeError, AttributeError):
+            words = str(self)
+        return f"{words} | None" if self.is_optional and not _allows_none(words) else words
 
 
-def readable(signature: inspect.Signature) -> inspect.Signature:
-    """Return a signature whose annotations are types alone, without limits and descriptions.
+class _Names(dict[str, Any]):
+    """Names of modules; a name that is imported for type checkers only is an empty class."""
+
+    def __init__(self, names: Mapping[str, Any]) -> None:
+        super().__init__(names)
+        for name, kind in _KEPT.items():
+            if self.get(name) is kind:
+                del self[name]
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, None) or type(name, (), {})
+
+
+def _allows_none(words: str) -> bool:
+    return words == "Any" or "None" in words.split(" | ")
+
+
+def words_of(kind: Any) -> str:
+    """Return a type as text, without limits, descriptions and names of modules.
 
     Examples
     --------
-    >>> def scan(count: Annotated[int, Field(ge=1)], name: str | None = None): ...
-    >>> readable(inspect.signature(scan))
-    <Signature (count: int, name: str | None = None)>
+    >>> words_of(Annotated[int, "at least 1"] | None)
+    'int | None'
+    >>> words_of(Callable[[np.ndarray], tuple[str, ...]])
+    'Callable[[ndarray], tuple[str, ...]]'
+    """
+    origin = get_origin(kind)
+    args = get_args(kind)
+    if kind in (None, NoneType):
+        return "None"
+    if origin is Annotated:
+        return words_of(args[0])
+    if origin in (Union, UnionType):
+        return " | ".join(dict.fromkeys(map(words_of, args)))
+    if origin is Literal:
+        return _choices(args)
+    if origin is np.ndarray:
+        return _array(args)
+    if isinstance(kind, (list, tuple)):
+        return f"[{', '.join(map(words_of, kind))}]"
+    if kind is Ellipsis:
+        return "..."
+    name = _name_of(origin or kind)
+    return f"{name}[{', '.join(map(words_of, args))}]" if args else name
+
+
+def _name_of(kind: Any) -> str:
+    """Return the name of a class, of a type variable or of a type that is not imported."""
+    if isinstance(kind, (ForwardRef, str)):
+        return kind if isinstance(kind, str) else kind.__forward_arg__
+    return getattr(kind, "__name__", None) or str(kind).rpartition(".")[2]
+
+
+def _choices(values: tuple[Any, ...]) -> str:
+    """Return the values of a Literal, or their types if they are long."""
+    words = " | ".join(map(repr, values))
+    if len(words) <= _MAX_CHOICES:
+        return words
+    return " | ".join(dict.fromkeys(type(value).__name__ for value in values))
+
+
+def _array(args: tuple[Any, ...]) -> str:
+    """Return the type of an array with its elements, if these are of one type."""
+    (element,) = get_args(args[1]) or (Any,)
+    return "NDArray" if element is Any else f"NDArray[{(get_origin(element) or element).__name__}]"
+
+
+def readable(signature: inspect.Signature, names: Mapping[str, Any]) -> inspect.Signature:
+    """Return a signature whose annotations are types alone, and whose defaults can be read.
+
+    `names` are those of the module of the annotations.
+
+    Examples
+    --------
+    >>> Count = Annotated[int, "at least 1"]
+    >>> def scan(count: Count, name: str | None = None) -> Count: ...
+    >>> readable(inspect.signature(scan), globals() | locals())
+    <Signature (count: int, name: str | None = None) -> int>
     """
     parameters = [
-        parameter.replace(annotation=_plain(parameter.annotation))
+        parameter.replace(
+            annotation=_Annotation.of(parameter, names), default=_shown(parameter.default)
+        )
         for parameter in signature.parameters.values()
     ]
-    return signature.replace(
-        parameters=parameters, return_annotation=_plain(signature.return_annotation)
+    result = inspect.Parameter(
+        "result", inspect.Parameter.KEYWORD_ONLY, annotation=signature.return_annotation
     )
+    return signature.replace(parameters=parameters, return_annotation=_Annotation.of(result, names))
 
 
-def _plain(annotation: Any) -> Any:
-    """Return an annotation without metadata, texts without quotes."""
-    if not isinstance(annotation, str):
-        return annotation
-    if _ANNOTATED in annotation:
-        annotation = ast.unparse(_WithoutMetadata().visit(ast.parse(annotation, mode="eval")))
-    return _Text(annotation)
+def shown_readably(function: F) -> F:
+    """Give a function a readable signature."""
+    signature = readable(inspect.signature(function), function.__globals__)
+    function.__signature__ = signature  # type: ignore[attr-defined]
+    return function
+
+
+def _shown(default: Any) -> Any:
+    """Return a default, or its name if it is a function, which would be shown with its address."""
+    if inspect.isroutine(default):
+        return _Text(default.__name__)
+    if isinstance(default, MappingProxyType):
+        return dict(default)
+    if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":  # of a dataclass
+        return _Text(_COMPUTED)
+    return default
 
 
 class ReadableSignature:
@@ -64,11 +171,10 @@ class ReadableSignature:
             raise AttributeError("__signature__")
         signature = inspect.signature(owner.__init__)  # type: ignore[misc]
         _, *parameters = signature.parameters.values()
-        return readable(signature.replace(parameters=parameters)).replace(
-            return_annotation=inspect.Signature.empty
+        public = [parameter for parameter in parameters if not parameter.name.startswith("_")]
+        names: dict[str, Any] = {}
+        for base in reversed(owner.__mro__):
+            names |= vars(sys.modules[base.__module__])
+        return readable(
+            signature.replace(parameters=public, return_annotation=inspect.Signature.empty), names
         )
-
-
-def annotated(function: Callable[..., Any]) -> bool:
-    """Return True if an annotation of a function holds more than a type."""
-    return any(_ANNOTATED in str(annotation) for annotation in function.__annotations__.values())

@@ -40,7 +40,7 @@ from pydantic_core import (
 
 from .arrays import AnyArray
 from .errors import LidarError, Mistakes
-from .signatures import ReadableSignature, annotated, readable
+from .signatures import ReadableSignature, readable
 from .words import did_you_mean, plural
 
 P = ParamSpec("P")
@@ -122,8 +122,9 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         _check(function, {**dict(zip(_defaults(function), args, strict=False)), **kwargs})
         return function(*args, **kwargs)
 
-    if annotated(function):
-        checked_function.__signature__ = readable(inspect.signature(function))  # type: ignore[attr-defined]
+    checked_function.__signature__ = readable(  # type: ignore[attr-defined]
+        inspect.signature(function), function.__globals__
+    )
     return checked_function
 
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarError
 from ..base.extras import install_command
+from ..base.notebook import picture_of
 from ..base.validation import as_array, checked, checked_fields, shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
@@ -54,14 +55,16 @@ class CloudDisplay:
         return f"<{type(self).__name__} of {len(self):,} points: {shown_names}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Return an HTML table of the columns, their types, and the first points."""
+        """Return an HTML table of the columns, their types, and the first points; a picture."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
         kinds = [array.dtype for array in values.values()]
         rows = (values, kinds, *zip(*values.values(), strict=True))
         cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
         body = "".join(f"<tr>{row}</tr>" for row in cells)
-        return f"<table><caption>{len(self):,} points</caption>{body}</table>"
+        sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0).tolist())
+        caption = f"<caption>{len(self):,} points, {sides} m</caption>"
+        return f"<table>{caption}{body}</table>{picture_of(self)}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..base.arrays import Floats, Floats32, Indices
 from ..base.errors import LidarError
+from ..base.signatures import ReadableSignature
 from ..columns.cloud import Cloud
 from ..follower import Follower
 from ..sensor import Mounted, Sensor
@@ -60,6 +61,8 @@ class MujocoScanner:
     >>> scanner.sweep(data)  # doctest: +SKIP
     <Cloud of 21,316 points: x, y, z, scan, channel, object>
     """
+
+    __signature__ = ReadableSignature()
 
     def __init__(
         self,

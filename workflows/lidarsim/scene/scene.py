@@ -15,9 +15,11 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
+from ..base.notebook import picture_of, table_of
+from ..base.signatures import shown_readably
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
-from ..base.words import plural
+from ..base.words import listed, plural
 from ..sensor import Track
 from ..sensor.materials import SurfaceKinds
 from .actors import Actor
@@ -89,6 +91,22 @@ class Scene:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
         objects = plural(len(self.all_names), "object")
         return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
+
+    def _repr_html_(self) -> str:
+        """Return the table of the main figures, and a picture if a package draws scenes."""
+        sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
+        rows = {
+            "scene": f"{plural(len(self.all_names), 'object')}: {listed(self.all_names, 8)}",
+            "triangles": f"{self.triangles:,}",
+            "extent": f"{sides} m",
+        }
+        if self.origin.any():
+            rows["origin"] = ", ".join(f"{value:,.0f}" for value in self.origin) + " m"
+        if self.actors:
+            rows["actors"] = listed([actor.name for actor in self.actors], 8)
+        if names := [name for name in self.material_names if name]:
+            rows["materials"] = listed(names, 8)
+        return table_of(rows.items()) + picture_of(self)
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
@@ -233,6 +251,7 @@ class Scene:
         return cls.from_objects(objects._replace(static=tuple(static)))
 
     @classmethod
+    @shown_readably
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
         """Make a scene of the objects of mesh files.
 
@@ -372,6 +391,20 @@ class Scene:
         The column `material` holds indices into these names.
         """
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
+
+    @property
+    def face_materials(self) -> Ints32 | None:
+        """Indices of `faces` into `material_names`, (f,), -1 for none; None without any name."""
+        if self.materials is None or not self.material_names:
+            return None
+        kinds = self.surface_kinds
+        numbers = {name: number for number, name in enumerate(self.material_names)}
+        of_kind = np.array([numbers.get(name, -1) for name in kinds.material], np.int32)
+        rows = kinds.first[self.face_object]
+        if self.materials.index is not None:
+            is_mixed = np.array([len(names) > 1 for names in self.materials.names])
+            rows = rows + self.materials.index * is_mixed[self.face_object]
+        return of_kind[rows]
 
     @property
     def masked(self) -> tuple[str, ...]:

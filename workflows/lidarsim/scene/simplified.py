@@ -10,6 +10,7 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Floats, Indices, Ints, Ints32
 from .colours import Colours, join_colours
+from .face_materials import ObjectMaterials
 from .scene import Scene
 from .scene_instances import Instances, MeshPart
 from .scene_mesh import stacked, triangle_areas
@@ -76,6 +77,7 @@ class _DrawnPart(NamedTuple):
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3)
     colours: Colours | None  # a plain colour for each face
+    materials: Ints32 | None  # (f,): row of the names of the object's materials; None for the first
 
 
 class _CopiedInstances:
@@ -86,6 +88,7 @@ class _CopiedInstances:
         self._meshes = [(scene.vertices, scene.faces)]
         self._owners = [scene.face_object]
         self._colours = [scene.colours]
+        self._materials = [None if scene.materials is None else scene.materials.index]
         self.counters = [np.arange(len(scene.faces))]
         assert scene.instances is not None
         self._mirrored = np.linalg.det(scene.instances.transforms[:, :, :3]) < 0
@@ -98,6 +101,7 @@ class _CopiedInstances:
         self._meshes.append((part.vertices @ matrix[:, :3].T + matrix[:, 3], corners))
         self._owners.append(np.full(count, shared.owner[row]))
         self._colours.append(part.colours)
+        self._materials.append(part.materials)
         self.counters.append(np.full(count, len(self._scene.faces) + row))
 
     def scene(self) -> Scene:
@@ -111,7 +115,18 @@ class _CopiedInstances:
             self._scene.origin,
             self._scene.actors,
             colours=join_colours(self._colours, map(len, self._owners)),
+            materials=self._object_materials(),
         )
+
+    def _object_materials(self) -> ObjectMaterials | None:
+        """Return the materials of all triangles."""
+        if self._scene.materials is None:
+            return None
+        rows = [
+            np.zeros(len(owners), np.int32) if materials is None else materials
+            for owners, materials in zip(self._owners, self._materials, strict=True)
+        ]
+        return ObjectMaterials(self._scene.materials.names, np.concatenate(rows))
 
 
 def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
@@ -123,7 +138,8 @@ def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
     if count < len(faces):
         vertices, faces, rows = _simplified_part(part, count)
     colours = part.colours and Colours.of_faces(part.colours.take(rows).means())
-    return _DrawnPart(vertices, faces, colours)
+    materials = part.materials and part.materials.take(rows)
+    return _DrawnPart(vertices, faces, colours, None if materials is None else materials.index)
 
 
 def cut_masks(scene: Scene) -> Scene:
@@ -165,7 +181,10 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
     vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
     colours = part.colours and part.colours.divided(face, corners[piece])
     return MeshPart(
-        vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colours=colours
+        vertices,
+        np.arange(len(vertices), dtype=np.int32).reshape(-1, 3),
+        colours=colours,
+        materials=part.materials and part.materials.take(face),
     )
 
 

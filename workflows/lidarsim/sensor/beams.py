@@ -15,6 +15,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import about
 from ..base.elementary import cos, sin_cos
 from ..base.errors import LidarError
+from ..base.signatures import ReadableSignature
 from ..base.validation import as_array, checked, checked_fields
 
 MAX_CHANNELS = 65_535  # of the type of the column
@@ -43,6 +44,8 @@ class Beams:
     LidarError
         If the lengths differ, a value is not finite, or there are no beams or too many.
     """
+
+    __signature__ = ReadableSignature()
 
     elevation: Floats
     azimuth: Floats = field(default_factory=lambda: np.zeros(0))

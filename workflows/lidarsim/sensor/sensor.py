@@ -16,6 +16,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import about
 from ..base.elementary import sin_cos
 from ..base.errors import LidarError
+from ..base.notebook import picture_of, table_of
 from ..base.validation import checked, checked_fields
 from ..base.vectors import turned
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
@@ -32,6 +33,8 @@ Sector = Annotated[
     float,
     about("for a grid: degrees that a revolution sweeps, half of it left of +x", gt=0, le=360),
 ]
+SAMPLED_FIRINGS = 2000  # from which the field of view is taken
+MAX_GAP_DEG = 5.0  # between neighbouring azimuths of a sensor that looks all around
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
@@ -93,6 +96,43 @@ class Sensor:
     def __post_init__(self) -> None:
         if not self.max_range_m > self.min_range_m:
             raise LidarError(f"max_range_m is {self.max_range_m}; it must be above min_range_m.")
+
+    def _repr_html_(self) -> str:
+        """Return the table of the main figures, and a picture if a package draws sensors."""
+        rows = {
+            "sensor": self.model,
+            "channels": f"{self.channels:,}",
+            "field of view": self._field_of_view(),
+            "rate": self._rate(),
+            "range": f"from {self.min_range_m:g} m"
+            + (f" to {self.max_range_m:g} m" if self.max_range_m < float("inf") else ""),
+            "wavelength": f"{self.optics.wavelength_nm:g} nm",
+        }
+        return table_of(rows.items()) + picture_of(self)
+
+    def _revolution_firings(self) -> tuple[int, int]:
+        """Return the half-open range of the firings of the first revolution, or frame."""
+        steps = self.steps_of_revolution(0)
+        return self.firings(steps[0])[0], self.firings(steps[-1])[1]
+
+    def _field_of_view(self) -> str:
+        """Return the horizontal and vertical field of view, degrees, from a sample of rays."""
+        first, stop = self._revolution_firings()
+        firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
+        x, y, z = self.directions(firings).reshape(-1, 3).T
+        azimuths = np.sort(np.degrees(np.arctan2(y, x)))
+        # All around, less the widest gap between neighbours.
+        gaps = np.diff(azimuths, append=azimuths[0] + 360)
+        width = 360.0 if gaps.max() < MAX_GAP_DEG else 360.0 - float(gaps.max())
+        elevations = np.degrees(np.arcsin(np.clip(z, -1, 1)))
+        return f"{width:.4g}°, {elevations.min():.3g}° to {elevations.max():.3g}°"
+
+    def _rate(self) -> str:
+        """Return the revolutions, or frames, and the rays of a second."""
+        first, stop = self._revolution_firings()
+        seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
+        rays = (stop - first) * self.channels / seconds
+        return f"{1 / seconds:.4g} Hz, {rays:,.0f} rays/s"
 
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]

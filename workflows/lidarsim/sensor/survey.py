@@ -17,7 +17,10 @@ from pydantic import AwareDatetime, Field, Strict
 from ..base.arrays import Floats, Ints
 from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarError
+from ..base.notebook import picture_of, table_of
+from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields, shown
+from ..base.words import listed, plural
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -104,6 +107,8 @@ class ScanSpec:
         For a scan of a frozen sensor: the first scan of the sweep that is sent again, and the first
         scan of the sweep that it replaces.
     """
+
+    __signature__ = ReadableSignature()
 
     scan: int
     station: int
@@ -287,6 +292,25 @@ class Survey(CloudOptions, Weather):
             self._check_duration(carried.sensor, steps)
         sensors = {carried.name: carried.sensor for carried in self.carried}
         check_faults(self.faults, sensors, self.duration_ns)
+
+    def _repr_html_(self) -> str:
+        """Return the table of the main figures, and a picture if a package draws surveys."""
+        models = [
+            f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
+            for carried in self.carried
+        ]
+        poses = plural(self.path.stations, "position")
+        if self.path.moves:
+            poses = "along a trajectory"
+        rows = {
+            "survey": f"{plural(len(models), 'sensor')}: {listed(models, 8)}",
+            "poses": poses,
+            "scans": f"{self.scan_count:,}",
+            "rays": f"{self.ray_count:,}",
+            "duration": f"{self.duration_ns / 1e9:.6g} s",
+            "columns": ", ".join(column.name for column in self.stored_columns),
+        }
+        return table_of(rows.items()) + picture_of(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
         """Set the returns or the noise of all sensors, if the survey has none."""

@@ -28,13 +28,18 @@ class _BeamPlot(NamedTuple):
 
 
 def draw_beams(path: Path, sensor: Sensor) -> None:
+    """Write the picture of `beam_page`; LidarError if the file, a .png, cannot be written."""
+    beam_page(sensor).save(path)
+
+
+def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, coloured by time.
 
     The rays are those of some firings; for sensors of a single channel, those of a frame, or of two
     cycles of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over
-    time. LidarError if the file, a .png, cannot be written.
+    time.
     """
-    page = Page(SIZE)
+    page = Page(size)
     firings_per_revolution = round(getattr(sensor.head, "firings_per_turn", 1000))
     looks_down = isinstance(sensor, LineSensor)
     has_channels = sensor.channels > 1
@@ -59,11 +64,11 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
     if not (has_channels or looks_down):
         axes.set_aspect("equal")
     norm = Normalize(0, max(float(times.max()), 1e-3))
-    size = (10 if has_channels else 2) * page.unit**2
-    axes.scatter(plot.x_values, plot.y_values, s=size, c=mapped(COLOURS, norm(times)), linewidths=0)
+    area = (10 if has_channels else 2) * page.unit**2
+    axes.scatter(plot.x_values, plot.y_values, s=area, c=mapped(COLOURS, norm(times)), linewidths=0)
     page.colour_bar(mapped(COLOURS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
     page.title(sensor.name, f"{sensor.channels:,} channel{'s' * has_channels} · {words}")
-    page.save(path)
+    return page
 
 
 def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:

@@ -25,6 +25,8 @@ NORMALS = Column(
     "normals", "uint32", "", "directions of the surfaces: x red, y green, z blue, -1 dark, 1 bright"
 )
 _COMPOSED = {RGB.name: (RGB, COLOURS), NORMALS.name: (NORMALS, NORMAL)}  # {name: (column, parts)}
+MATERIAL = "material"  # name of the column
+NO_MATERIAL = "no material"
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 # The scale is logarithmic if numbers differ by the first factor and the median is this low in their
@@ -85,6 +87,8 @@ def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
     """Return the word for a label; `names` are the words for the values 0, 1, 2, …."""
     if 0 <= value < len(names) and names[value]:
         return names[value]
+    if value < 0 and column.name == MATERIAL:
+        return NO_MATERIAL
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
@@ -123,10 +127,11 @@ def _label_colouring(labels: Ints, column: Column, names: Sequence[str]) -> Colo
     colours = object_colours(min(count, MAX_COLOURS))
     grey = len(colours)
     palette = np.vstack([colours, [_GREY] * 3])
+    has_none = column.name in (OBJECT.name, MATERIAL)  # a value below 0
 
     def paint(values: AnyArray) -> Floats:
         numbers = values.astype(np.int64)
-        is_surface = (numbers >= 0) | (column.name != OBJECT.name)
+        is_surface = (numbers >= 0) | (not has_none)
         return np.asarray(palette[np.where(is_surface, numbers % grey, grey)])
 
     values = tuple(labels.tolist())

@@ -285,9 +285,13 @@ class Page:
         axes.set_title(text, loc="left", parse_math=False, **style)
 
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
-        """Draw a legend of (name, colour) in the right margin; the last line counts the rest."""
+        """Draw a legend of (name, colour) in the right margin; the last line counts the rest.
+
+        An empty name of the sensor leaves the sensor out.
+        """
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
-        rows.append(("o", sensor, theme.SENSOR))
+        if sensor:
+            rows.append(("o", sensor, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
             rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
         size = min(7.4, 175 / len(rows))

@@ -60,7 +60,8 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     order = [*range(first, len(names)), *range(first)]
     if is_visible.sum() > LEGEND_ROWS:
         order.sort(key=lambda k: k < first and counts[k] == 1)  # then copies
-    page.legend([(labels[k], colours[firsts[k]]) for k in order if is_visible[k]])
+    entries = [(labels[k], colours[firsts[k]]) for k in order if is_visible[k]]
+    page.legend(entries, "Sensor" if len(shot.sensors) or shot.paths else "")
     page.title("Scene", f"{words} · {shot.caption}", shot.models)
     return page
 

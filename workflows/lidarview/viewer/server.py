@@ -220,16 +220,23 @@ class _Question(_Guarded):
 
 @dataclass(frozen=True)
 class PageServer:
-    """A page that is served on 127.0.0.1."""
+    """A page that is served at an address of this machine."""
 
     port: int
+    host: str = HOST
     token: str = field(default_factory=secrets.token_urlsafe, repr=False)
     good_once: list[str] = field(default_factory=list, repr=False)  # tokens of single use
 
     @property
     def url(self) -> str:
         """Address of the page, which ends with "/"."""
-        return f"http://{HOST}:{self.port}/{self.token}/"
+        return f"{self._root}{self.token}/"
+
+    @property
+    def _root(self) -> str:
+        """Address of the server, which ends with "/"."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/"
 
     def once(self) -> str:
         """Return an address that leads to the page once.
@@ -237,23 +244,28 @@ class PageServer:
         Other users of the machine see the arguments that a browser is started with.
         """
         self.good_once.append(secrets.token_urlsafe())
-        return f"http://{HOST}:{self.port}/{self.good_once[-1]}/"
+        return f"{self._root}{self.good_once[-1]}/"
 
 
 @contextmanager
 def page_server(
-    source: Source, port: int = PORT, stop: Callable[[], None] | None = None, *, index: str = VIEWER
+    source: Source,
+    port: int = PORT,
+    stop: Callable[[], None] | None = None,
+    *,
+    index: str = VIEWER,
+    host: str = HOST,
 ) -> Iterator[PageServer]:
     """Serve a page while the body runs, in a separate thread, on a port or the next free port.
 
     A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
     the page's file; the viewer of a job is at ``job/NUMBER/``, with which its questions start.
     """
-    listener = _open_socket(port)
+    listener = _open_socket(host, port)
     folder = str(files(__package__) / "page")
     page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
     listener.setblocking(False)
-    served_page = PageServer(listener.getsockname()[1])
+    served_page = PageServer(listener.getsockname()[1], host)
     running: Future[asyncio.AbstractEventLoop] = Future()
     ended = asyncio.Event()
 
@@ -289,12 +301,13 @@ def page_server(
         thread.join()
 
 
-def _open_socket(port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     """Listen on a port, or the next free port; on any port for 0, or if no port is free."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     for candidate in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
         with suppress(OSError):
-            return socket.create_server((HOST, candidate), backlog=128)
-    return socket.create_server((HOST, 0), backlog=128)
+            return socket.create_server((host, candidate), family=family, backlog=128)
+    return socket.create_server((host, 0), family=family, backlog=128)
 
 
 @contextmanager
@@ -313,6 +326,15 @@ def announced(
             open_browser(page.once())
         yield
         return
+    shown = display.display(display.HTML(frame_of(page, words)), display_id=True)
+    try:
+        yield
+    finally:
+        shown.update(display.HTML(""))
+
+
+def frame_of(page: PageServer, words: str) -> str:
+    """Return HTML for the cell of a notebook: a link of some words, and the page in a frame."""
     url = page.url
     words = escape(words)
     if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
@@ -322,12 +344,7 @@ def announced(
             f"{page.port}:{HOST}:{page.port} and the machine's name, and open the address."
         )
     link = f'<a href="{url}" target="_blank">{words}</a>'
-    below = f'<iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'
-    shown = display.display(display.HTML(f"{link}<br>{below}"), display_id=True)
-    try:
-        yield
-    finally:
-        shown.update(display.HTML(""))
+    return f'{link}<br><iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'
 
 
 def open_browser(url: str) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import click
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.notebook import cell_display
 from lidarsim.base.words import plural
@@ -161,12 +161,13 @@ class View:
         self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the last answer
         self.show(self.points)
 
-    def show(self, points: Points) -> None:
-        """Replace the points."""
+    def show(self, points: Points, *, keep_scales: bool = False) -> None:
+        """Replace the points; colour scales stay those of earlier points with `keep_scales`."""
         self.points = points
         self._finder = PointFinder(points, self.origin)
-        # {(column, filter, limits of the scale): colour scale}
-        self._colourings: dict[tuple[Any, ...], Colouring] = {}
+        if not keep_scales:
+            # {(column, filter, limits of the scale): colour scale}
+            self._colourings: dict[tuple[Any, ...], Colouring] = {}
         self.version += 1
 
     # -- properties of the survey ---------------------------------------------------------
@@ -311,7 +312,8 @@ class View:
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if shown_box is None else float(shown_box[1, 2]),
-            "scene": pictured and colours_for(pictured.scene, pictured.reflectance),
+            "scene": pictured
+            and colours_for(pictured.scene, pictured.reflectance, pictured.face_materials),
             "sensors": [
                 {"name": sensor.name, "model": sensor.model, "moves": sensor.moves}
                 for sensor in self.sensors
@@ -581,7 +583,11 @@ class View:
             raise KeyError("surface")
         with self._lock:  # simplifying may take long: only the first browser's question does so
             surface = self._surface = self._surface or ShownSurface(
-                pictured.scene, pictured.reflectance, self.triangles
+                pictured.scene,
+                pictured.reflectance,
+                self.triangles,
+                pictured.face_materials,
+                pictured.materials or (),
             )
         hit_counts = pictured.hit_counts
         hit_points = np.zeros((0, 3), np.float32)
@@ -742,11 +748,17 @@ class ShownSurface:
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
     triangle that vanishes go to a neighbour. `reflectance` is the share of the light that each
-    object reflects, (objects,), if known.
+    object reflects, (objects,), if known; `face_materials` (f,) are indices into the names of
+    materials, -1 for none.
     """
 
     def __init__(
-        self, scene: Scene, reflectance: Floats | None = None, max_triangles: int = MAX_TRIANGLES
+        self,
+        scene: Scene,
+        reflectance: Floats | None = None,
+        max_triangles: int = MAX_TRIANGLES,
+        face_materials: Ints32 | None = None,
+        material_names: Sequence[str] = (),
     ) -> None:
         self.coarse = scene
         self._reflectance = reflectance
@@ -754,6 +766,12 @@ class ShownSurface:
         self._replacements = np.arange(len(scene.faces))
         if len(scene.faces) > max_triangles:
             self.coarse, self._replacements = simplified(scene, max_triangles)
+        self._material_names = material_names
+        self._materials: Ints | None = None  # (shown triangles,)
+        if face_materials is not None:
+            self._materials = np.full(len(self.coarse.faces), -1)
+            is_shown = self._replacements >= 0
+            self._materials[self._replacements[is_shown]] = face_materials[is_shown]
         self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
@@ -781,6 +799,10 @@ class ShownSurface:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
             legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "material" and self._materials is not None:
+            colouring = colours_of(self._materials, TABLE["material"], self._material_names)
+            colours = colouring.paint(self._materials)
+            legend = legend_of(colouring)
         elif by == "normals":
             a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
             normals = np.cross(b - a, c - a)
@@ -818,16 +840,20 @@ class ShownSurface:
         return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
 
 
-def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
+def colours_for(
+    scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
+) -> tuple[str, ...]:
     """Return the names by which `ShownSurface.coloured` can colour a scene.
 
-    "reflectance" needs several values (objects,), "colour" a scene with colours.
+    "reflectance" needs several values (objects,), "material" those of faces, "colour" a scene with
+    colours.
     """
     scene_colours = ("colour",) if scene.coloured else ()
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     )
-    return ("grey", "hits", "object", "normals", *reflectances, *scene_colours)
+    materials = () if face_materials is None else ("material",)
+    return ("grey", "hits", "object", "normals", *reflectances, *materials, *scene_colours)
 
 
 def legend_of(colouring: Colouring) -> Legend:

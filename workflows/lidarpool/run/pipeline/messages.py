@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from lidarsim.base.arrays import Floats32
+from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -170,6 +171,8 @@ class ScanFrame:
     samples
         float32 (m, 3): ends of a few rays, metres, local coordinates.
     """
+
+    __signature__ = ReadableSignature()
 
     scan: int
     sensor: str

@@ -294,13 +294,15 @@ function setLimits(name, limits) {
 
 const objectLimits = () => chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null;
 
-const showSceneLegend = () => panel.sceneLegend?.replaceChildren(labels(panel.sceneTold, "object"));
+// Its labels choose objects, or materials of points.
+function showSceneLegend() {
+  const column = panel.sceneTold?.column ?? "object", acts = state.columns.some(({ name }) => name === column);
+  panel.sceneLegend?.replaceChildren(acts ? labels(panel.sceneTold, column) : legend(panel.sceneTold, null, () => {}));
+}
 
 function afterFilter(name) {
-  if (name === "object") {
-    picture.showObjects(objectLimits(), hiddenOf("object"));
-    showSceneLegend();
-  }
+  if (name === "object") picture.showObjects(objectLimits(), hiddenOf("object"));
+  showSceneLegend();
   legendText = "";
   tellFilter();
   tellResults();
@@ -408,7 +410,7 @@ function buildPanel() {
         chosen.opacity = picture.opacity = value;
         picture.dirty = true;
       })),
-      tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); }),
+      ...(state.scanner ? [] : [tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); })]),
       ...(picture.actors.length ? [tick("boxes and names", chosen.boxes, (on) => { chosen.boxes = on; picture.showBoxes(on); })] : []),
     ));
   }
@@ -425,6 +427,7 @@ function buildPanel() {
   }
   const sides = [["all", "All"], ["top", "Top"], ["side", "Side"], ["front", "Front"]].map(([side, text]) => button(text, () => look(side)));
   if (picture.sensors.length) sides.push(button("Sensor", () => look("sensor")));
+  if (state.scanner) sides.push((clock.follow = button("Follow", () => setFollow(!chosen.follow))));
   panel.parallel = tick("parallel projection", false, (on) => picture.useParallel(on));
   parts.push(section("View", true, element("div", { className: "buttons" }, ...sides), panel.parallel));
   panel.point = element("div", { className: "note" });
@@ -697,7 +700,7 @@ function setFollow(on) {
 
 function showToggles() {
   for (const [control, on] of [[clock.loop, chosen.loop], [clock.follow, chosen.follow], [clock.images, chosen.images]])
-    control.setAttribute("aria-pressed", on);
+    control?.setAttribute("aria-pressed", on);
 }
 
 function drawTicks() {
@@ -951,7 +954,21 @@ function takeState(told) {
   document.title = state.title;
 }
 
-// What is new of a run.
+// Places the sensors and actors of a scanner as its last sweep has met them, at a time in seconds.
+function placeMoved(arrays, time) {
+  const times = Float64Array.of(time), part = (name, k, size) => arrays[name].subarray(size * k, size * k + size);
+  for (const [k, sensor] of picture.sensors.entries()) {
+    Object.assign(sensor, { times: arrays[`sensor${k}_times`], places: arrays[`sensor${k}_places`] });
+    picture.drawWay(sensor);
+  }
+  for (const [k, actor] of picture.actors.entries()) {
+    Object.assign(actor, { times, places: part("actor_places", k, 3), turns: part("actor_turns", k, 4), frames: part("actor_frames", k, 1) });
+    actor.there = arrays.actor_there[k] ? [-Infinity, Infinity] : [1, 0];
+  }
+  picture.setTime(time);
+}
+
+// What is new of a run, or of a scanner.
 const known = { rays: null, hits: null, ends: 0 };
 async function news(told) {
   if (told.rays_version !== known.rays) {
@@ -959,7 +976,8 @@ async function news(told) {
     picture.setRays(told.arrays.rays);
   }
   tellRun(told);
-  if (told.time !== null && !told.over) picture.setTime(told.time);
+  if (told.arrays.actor_places) placeMoved(told.arrays, told.time);
+  else if (told.time !== null && !told.over) picture.setTime(told.time);
   state.points = told.points;
   if (told.version !== state.version && told.ends === known.ends) {
     state.version = told.version;

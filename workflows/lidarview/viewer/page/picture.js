@@ -384,11 +384,8 @@ export class Picture {
       this.sensorParts.push(sensor.marker);
       const { places } = sensor, count = places.length / 3;
       sensor.way = new THREE.Group();
-      if (sensor.moves && count > 1) {
-        const lines = [];
-        for (let k = 0; k + 1 < count; k++) lines.push(...places.subarray(3 * k, 3 * k + 6));
-        sensor.way.add(this.thickLines(lines, RED, 3));
-      } else {
+      if (sensor.moves) this.drawWay(sensor);
+      else {
         for (let k = 0; k < count && k < 1000; k++) {
           const mark = new THREE.Mesh(ball, red);
           mark.position.set(...places.subarray(3 * k, 3 * k + 3));
@@ -399,6 +396,18 @@ export class Picture {
       this.sensorParts.push(sensor.way);
     }
     for (const made of this.sensorParts) this.scene.add(made);
+  }
+
+  // Draws the trajectory of a moving sensor, in place of an earlier one.
+  drawWay({ way, places }) {
+    for (const { geometry, material } of way.children) {
+      geometry.dispose();
+      material.dispose();
+    }
+    way.clear();
+    const lines = [];
+    for (let k = 0; 3 * k + 3 < places.length; k++) lines.push(...places.subarray(3 * k, 3 * k + 6));
+    if (lines.length) way.add(this.thickLines(lines, RED, 3));
   }
 
   setRays(ends) {

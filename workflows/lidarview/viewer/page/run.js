@@ -28,9 +28,11 @@ export async function follow(what, asked, ms, show) {
   try {
     for (;;) {
       const told = await ask(what, asked());
+      stop.hidden = told.stops === false; // it is no run
       stop.textContent = told.over ? "Close" : told.state === "stopping" ? "Stopping" : "Stop";
       if (await show(told)) return told;
-      await new Promise((done) => setTimeout(done, document.hidden ? 4 * ms : ms));
+      const pause = told.wait_ms ?? ms;
+      await new Promise((done) => setTimeout(done, document.hidden ? 4 * pause : pause));
     }
   } finally {
     stop.hidden = true;

@@ -1,0 +1,176 @@
+"""Small pictures of scenes, sensors, surveys and clouds, for the cells of notebooks."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from matplotlib.colors import Normalize
+from PIL import Image
+
+from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.base.notebook import PICTURE_SIZE
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import CloudLike
+from lidarsim.columns.table import Z
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
+from lidarsim.sensor import Sensor, Survey
+
+from .picture_file import SensorPositions, sensor_positions
+from .render import theme
+from .render.beam_picture import beam_page
+from .render.camera import fit_camera
+from .render.colouring import colours_of
+from .render.picture_page import Page
+from .render.pictures import draw_scene as draw_objects
+from .render.pictures import splat
+from .render.shot import take_shot
+from .render.stage import PlotBox
+
+MAX_BYTES = 60_000  # of a picture; notebooks keep all of them
+MAX_POINTS = 60_000
+MAX_TRIANGLES = 200_000
+_PALETTES = (128, 32)  # numbers of colours, until a picture is small enough
+_CHART = (0.09, 0.115, 0.72, 0.735)  # left, bottom, width, height on the page
+_BOX = (0.06, 0.2, 0.82, 0.94)  # left, top, right, bottom of the points on the page
+_SPREAD = (1, 99)  # percentiles of the positions that are in the picture
+
+
+def small_png(png: bytes) -> bytes:
+    """Return a PNG with at most `MAX_BYTES`: with fewer colours, and if need be of half the size.
+
+    A picture of noise, of which both are too large, is returned in the last form.
+    """
+    image = Image.open(io.BytesIO(png)).convert("RGB")
+    half = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
+    for candidate, colours in product((image, half), _PALETTES):
+        file = io.BytesIO()
+        candidate.quantize(colours, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
+        if file.tell() <= MAX_BYTES:
+            break
+    return file.getvalue()
+
+
+def draw_scene(scene: Scene) -> bytes:
+    """Draw a scene at time 0, each object in its colour."""
+    drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
+    if len(drawn.faces) > MAX_TRIANGLES:
+        drawn, _ = simplified(drawn, MAX_TRIANGLES)
+    sides = " × ".join(f"{side:,.1f}" for side in np.ptp(scene.bounds, axis=0))
+    shot = take_shot(
+        replace(drawn, actors=scene.actors).solid(0.0),
+        np.empty((0, 3)),
+        actors=len(scene.actors),
+        caption=f"{sides} m",
+        size=PICTURE_SIZE,
+    )
+    return small_png(draw_objects(shot, scene.triangles).png())
+
+
+def draw_sensor(sensor: Sensor) -> bytes:
+    """Draw the directions of a sensor's first rays, coloured by time."""
+    return small_png(beam_page(sensor, PICTURE_SIZE).png())
+
+
+def draw_survey(survey: Survey) -> bytes:
+    """Draw the positions of a survey's sensors from above, with the directions of their x axes."""
+    page = Page(PICTURE_SIZE)
+    sensors = sensor_positions(survey)
+    limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
+    axes = page.chart(
+        _CHART,
+        xlabel="x, metres",
+        ylabel="y, metres",
+        aspect="equal",
+        xlim=limits[:, 0],
+        ylim=limits[:, 1],
+    )
+    colours = theme.object_colours(len(sensors))
+    for sensor, colour in zip(sensors, colours, strict=True):
+        x, y, _ = sensor.positions.T
+        axes.plot(x, y, "-" if sensor.moves else "o", color=colour, lw=1.6, ms=4)
+        axes.plot(x[0], y[0], "o", color=colour, ms=5)
+    headings = _headings(survey)
+    axes.quiver(*headings.T, color=theme.MUTED, width=0.003, scale=24, zorder=3)
+    names = [sensor.name or sensor.model or "sensor" for sensor in sensors]
+    page.legend([*zip(names, colours, strict=True)], "")
+    rays = f"{plural(survey.scan_count, 'scan')} · {plural(survey.ray_count, 'ray')}"
+    page.title("Survey from above", f"{_positions_in_words(sensors)} · {rays}")
+    return small_png(page.png())
+
+
+def _headings(survey: Survey, count: int = 24) -> Floats:
+    """Return positions and directions of the x axis of the first sensor, (k, 4): x, y, dx, dy."""
+    last = survey.steps_each[0] * survey.path.stations - 1
+    scans = np.unique(np.linspace(0, last, count).astype(int)).tolist()
+    poses = [survey.pose(scan) for scan in scans]
+    return np.array([(*pose.position[:2], *pose.rotation_matrix[:2, 0]) for pose in poses])
+
+
+def _around(points: Floats) -> Floats:
+    """Return the corners (2, 2) of a box around points (n, 2), in the proportions of the chart."""
+    lower = points.min(axis=0)
+    upper = points.max(axis=0)
+    sides = np.array(_CHART[2:]) * PICTURE_SIZE
+    half = sides * (np.maximum(upper - lower, 1.0) / sides).max() * 0.6
+    middle = (lower + upper) / 2
+    return np.stack([middle - half, middle + half])
+
+
+def _positions_in_words(sensors: list[SensorPositions]) -> str:
+    """Return the number of positions, or the length of the first trajectory."""
+    if not sensors[0].moves:
+        return plural(sum(len(sensor.positions) for sensor in sensors), "position")
+    steps = np.diff(sensors[0].positions, axis=0)
+    return f"trajectory of {np.linalg.norm(steps, axis=1).sum():,.1f} m"
+
+
+def draw_cloud(cloud: CloudLike) -> bytes | None:
+    """Draw points coloured by height; of many, an even choice. None for an empty cloud."""
+    total = len(cloud)
+    positions = _sampled(cloud, -(-total // MAX_POINTS) or 1)
+    if not len(positions):
+        return None
+    box = np.percentile(positions, _SPREAD, axis=0)
+    positions = positions[((positions >= box[0]) & (positions <= box[1])).all(axis=1)]
+    page = Page(PICTURE_SIZE)
+    if len(positions):
+        colouring = colours_of(positions[:, 2], Z)
+        image = _image_of(positions, colouring.paint(positions[:, 2]), box)
+        page.figure.figimage(image, zorder=-1)
+        page.colour_bar(colouring.scale, Normalize(*colouring.limits or (0, 1)), "z (m)")
+    sides = " × ".join(f"{side:,.1f}" for side in np.ptp(cloud.bounds, axis=0))
+    page.title("Point cloud by height", f"{plural(total, 'point')} · {sides} m")
+    return small_png(page.png())
+
+
+draw_storedcloud = draw_cloud
+
+
+def _sampled(cloud: CloudLike, step: int) -> Floats:
+    """Return the position of every `step`-th point of a cloud, (n, 3)."""
+    pieces = [np.zeros((0, 3))]
+    first = 0
+    for piece in cloud.chunks():
+        pieces.append(piece.positions[-first % step :: step].astype(np.float64))
+        first += len(piece)
+    return np.concatenate(pieces)
+
+
+def _image_of(positions: Floats, colours: Floats, box: Floats) -> Floats32:
+    """Return a picture (height, width, 4) of points (n, 3) in a box (2, 3), seen from above."""
+    origin = np.round(box.mean(axis=0))
+    stage = PlotBox.from_bounds(box - origin, origin)
+    is_wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
+    camera = fit_camera(stage.corners, PICTURE_SIZE, _BOX, -62.0 if is_wide else -28.0, 40.0)
+    pixels, distance = camera.project(positions - origin)
+    order = np.argsort(-distance)
+    opaque = np.ones((len(positions), 4), np.float32)
+    opaque[:, :3] = colours
+    width, height = PICTURE_SIZE
+    radius = float(np.clip(180 / np.sqrt(len(positions)), 1.5, 5.0))
+    empty = np.zeros((height, width, 4), np.float32)
+    return splat(empty, pixels[order], opaque[order], radius)
