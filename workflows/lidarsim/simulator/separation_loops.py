@@ -94,8 +94,8 @@ class _BeamScratch(NamedTuple):
     shown: Bools  # whether the mode reports a return
 
 
-# Loops over all beams read and write by pointers: numba counts references of arrays in tuples, which
-# takes as long as the rest of the loop.
+# Loops over all beams read and write by pointers: numba counts references of arrays in tuples, and
+# that takes as long as the rest of the loop.
 @inlined
 def _pointers_to_hits(hits):
     """Return `SubrayHits` of pointers to the arrays of `SubrayHits`, which must stay alive."""
@@ -434,7 +434,7 @@ def mark_reported(ray, energy, mode, shown):
 
 
 @compiled()
-def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - a compiled loop
+def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
 
     `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
