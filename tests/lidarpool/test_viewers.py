@@ -129,7 +129,9 @@ def test_sweeps_arrive_with_all_columns_where_they_were_measured(bridge, played)
         client.settle()
         for sweep, points in scanned:
             bridge.send(sweep, points, 0)
-        client.receive(lambda client: len(client.of("/actors")) == len(scanned))
+        client.receive(
+            lambda client: len(client.of("/actors")) == len(client.times_ns) == len(scanned)
+        )
     assert client.topics == {
         "/roof/points", "/rear/points", "/tf", "/actors", "/scene", "/trajectories",
     }  # fmt: skip
