@@ -12,6 +12,7 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -73,15 +74,15 @@ def measure(
     )
     first, *others = packets.encoder.ports.values()
     ports = [port, *(port + other - first for other in others)]
-    script = Path(live_receiver.__file__)
     with subprocess.Popen(
-        [sys.executable, str(script), maker, str(rate), *map(str, ports)],
+        [sys.executable, str(live_receiver.__file__), maker, str(rate), *map(str, ports)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as receiver:
         assert receiver.stdout is not None
         receiver.stdout.readline()  # ready
         notes: list[str] = []
+        start_s = time.process_time()
         lateness = play(
             scanner,
             POSITION,
@@ -91,12 +92,15 @@ def measure(
             ready=print,
             note=notes.append,
         )
+        cpu_s = time.process_time() - start_s
         output, _ = receiver.communicate()
     received = json.loads(output)
     late_ms = np.array(received["late_ms"])
     counts = np.searchsorted(late_ms, LIMITS_MS, "right")
     return {
         "seconds": seconds,
+        # Processor time of casting and encoding, of a revolution of 0.1 s.
+        "cpu_ms_a_sweep": 1e3 * cpu_s / (seconds / 0.1),
         "sent": lateness.to_json(),
         "received": received["received"],
         "lost": lateness.sent - received["received"],
@@ -133,6 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
             f"lost; {row['later_than_5_ms']:.3%} sent and {row['arrived_later_than_5_ms']:.3%} "
             f"arrived later than 5 ms, the latest sent after {row['sent']['latest_ms']:.1f} ms"
         )
+        print(f"  {row['cpu_ms_a_sweep']:.0f} ms of processor time a sweep")
         print("  sent", row["sent"]["lateness"])
         for note in row["notes"]:
             print(f"  note: {note}")

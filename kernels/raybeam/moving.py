@@ -450,13 +450,18 @@ class _Chunk:
         if not pairs.straddles.any():
             return _RayPairs(row, body, pose, pairs.poses)
         # A body may be present at the cell's first time, and absent at the time of a ray.
-        present = np.flatnonzero(moving.is_present(body, times[row]))
-        row = row[present]
-        body = body[present]
-        pose = pose[present]
-        late = np.flatnonzero(pairs.straddles[pair[present]])
-        pose[late] = pairs.poses.shape[1] + np.arange(len(late))
-        late_poses = moving.poses(body[late], times[row[late]])
+        present = moving.is_present(body, times[row])
+        if not present.all():
+            row = row[present]
+            body = body[present]
+            pose = pose[present]
+            pair = pair[present]
+        late = pairs.straddles[pair]
+        if late.all():  # of a lidar whose lasers take turns
+            return _RayPairs(row, body, np.arange(len(row)), moving.poses(body, times[row]))
+        late_rows = np.flatnonzero(late)
+        pose[late_rows] = pairs.poses.shape[1] + np.arange(len(late_rows))
+        late_poses = moving.poses(body[late_rows], times[row[late_rows]])
         return _RayPairs(row, body, pose, np.concatenate([pairs.poses, late_poses], axis=1))
 
 

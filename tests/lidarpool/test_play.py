@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from functools import partial
+from itertools import count
 
 import numpy as np
 import pytest
@@ -107,12 +110,34 @@ def test_what_cannot_be_played_is_refused_in_a_line(tmp_path):
 
 
 def test_an_error_of_what_is_made_ahead_comes_at_its_place():
-    def items():
-        yield 1
+    def refuse():
         raise LidarError("no more")
 
-    with MadeAhead(items(), 4) as made_ahead:
+    with MadeAhead([lambda: 1, refuse, lambda: 2], 4) as made_ahead:
         ahead = iter(made_ahead)
         assert next(ahead) == 1
         with pytest.raises(LidarError, match="no more"):
             next(ahead)
+
+
+def test_what_several_threads_make_ahead_comes_in_order():
+    both_run = threading.Barrier(2)
+
+    def make(number):
+        if number < 2:
+            both_run.wait(10)  # the first two at the same time
+        time.sleep(0.02 * (number % 2 == 0))  # later tasks end earlier
+        return number
+
+    tasks = (partial(make, number) for number in range(10))
+    with MadeAhead(tasks, 4, threads=2) as made_ahead:
+        assert list(made_ahead) == list(range(10))
+
+
+def test_what_is_made_ahead_is_bounded_and_dropped_at_the_end():
+    started = []
+    with MadeAhead((partial(started.append, k) for k in count()), 3, threads=2) as made_ahead:
+        ahead = iter(made_ahead)
+        for _ in range(5):
+            next(ahead)
+    assert 5 <= len(started) <= 5 + 3

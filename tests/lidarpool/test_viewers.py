@@ -39,6 +39,7 @@ from lidarpool.export.shown_sweeps import ShownSweep, Surroundings
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarpool.playback.sources import open_source
+from lidarpool.viewers import attached_child
 from lidarpool.viewers.viewer import Address, Viewer, open_viewer
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import box
@@ -128,7 +129,9 @@ def test_sweeps_arrive_with_all_columns_where_they_were_measured(bridge, played)
         client.settle()
         for sweep, points in scanned:
             bridge.send(sweep, points, 0)
-        client.receive(lambda client: len(client.of("/actors")) == len(scanned))
+        client.receive(
+            lambda client: len(client.of("/actors")) == len(client.times_ns) == len(scanned)
+        )
     assert client.topics == {
         "/roof/points", "/rear/points", "/tf", "/actors", "/scene", "/trajectories",
     }  # fmt: skip
@@ -405,3 +408,20 @@ def test_live_may_stand_alone_before_a_scenario():
     ):
         parameters = run.make_context("run", words.copy()).params
         assert (parameters["live"], parameters["scenarios"]) == (live, ("s.yaml",)), words
+
+
+def test_a_server_ends_when_the_process_that_started_it_is_killed():
+    server = "import subprocess; subprocess.run(['sleep', '60'])"  # has a child, as Rerun's
+    command = [sys.executable, attached_child.__file__, sys.executable, "-c", server]
+    parent_code = f"""if True:
+        import subprocess, time
+        subprocess.Popen({command!r}, stdin=subprocess.PIPE, start_new_session=True)
+        print("started", flush=True)
+        time.sleep(60)
+    """
+    with subprocess.Popen([sys.executable, "-c", parent_code], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout.readline() == b"started\n"
+        time.sleep(0.5)
+        parent.kill()
+        # All of them hold the other end of this pipe.
+        assert parent.communicate(timeout=20)[0] == b""

@@ -154,6 +154,20 @@ def test_a_livox_fires_where_the_list_of_its_maker_says(name, rows):
     assert np.abs(np.transpose(found) - list(rows.values())).max() < 2e-5
 
 
+def test_directions_behind_prisms_are_kept_and_the_same():
+    sensor = load_sensor("livox/mid360")
+    first = sensor.directions(np.arange(700, 1_700))
+    assert sensor.directions(np.arange(700, 1_700)) is first
+    assert not first.flags.writeable
+    shuffled = np.random.default_rng(1).permutation(1_000)
+    assert np.array_equal(sensor.directions(700 + shuffled), first[shuffled])
+    for start in range(20):  # more sweeps than are kept
+        sensor.directions(np.arange(start, start + 1_000))
+    again = sensor.directions(np.arange(700, 1_700))
+    assert again is not first
+    assert np.array_equal(again, first)
+
+
 def test_a_prism_that_reflects_all_light_is_refused():
     with pytest.raises(LidarError, match="A prism reflects light back"):
         PrismSensor(prisms=(Prism(60, 1.9, 7),))

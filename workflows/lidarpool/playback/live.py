@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from functools import partial
 from itertools import count
 from typing import Annotated, Any
 
@@ -19,10 +19,11 @@ from lidarsim.packets.sweep_packets import Packets
 from lidarsim.sensor import Pose, Trajectory
 from lidarsim.simulator import Scanner
 
-from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
+from ..base.fork_server import keep_freed_memory
+from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 
-_AHEAD = 4  # sweeps that are cast before they are due, of a trajectory that is known
+_AHEAD = 4  # sweeps that each thread casts before they are due, of a trajectory that is known
 _START_NS = 20e6  # from the start of the schedule to the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
 Rate = Annotated[float, Field(ge=0.001, le=1000)]
@@ -85,6 +86,7 @@ def play(
     >>> lateness.sent
     242
     """
+    keep_freed_memory()
     packets = Packets.of_scanner(scanner, start)
     names = {column.name for column in scanner.survey.stored_columns}
     if missing := [name for name in packets.columns if name not in names]:
@@ -94,25 +96,34 @@ def play(
         )
     streams = sensor_streams([packets.encoder], [to], [api] if api else [])
     sweeps = _sweeps(scanner, trajectory, duration_s)
-    made_ahead = nullcontext(sweeps) if callable(trajectory) else MadeAhead(sweeps, _AHEAD)
     with Transmitter(streams, note or (lambda words: None)) as transmitter:
-        with made_ahead as clouds:
-            _send_all(packets, iter(clouds), Schedule(rate), transmitter, ready, note)
+        if callable(trajectory):  # which says the next pose only when that sweep is due
+            clouds = (task() for task in sweeps)
+            _send_all(packets, clouds, Schedule(rate), transmitter, ready, note)
+        else:
+            threads = casting_threads()
+            with MadeAhead(sweeps, _AHEAD * threads, threads) as made_ahead:
+                _send_all(packets, iter(made_ahead), Schedule(rate), transmitter, ready, note)
         transmitter.sender.finish()
     return transmitter.sender.lateness
 
 
 def _sweeps(
     scanner: Scanner, trajectory: Any, duration_s: float | None
-) -> Iterator[_NumberedSweep]:
-    """Cast sweep after sweep until the end of the trajectory, or of the duration."""
+) -> Iterator[Callable[[], _NumberedSweep]]:
+    """Yield functions that cast sweep after sweep, to the end of the trajectory or duration."""
     end_s = getattr(trajectory, "duration_ns", float("inf")) / 1e9
     for number in count():
         first_s, last_s = scanner.span_s(number)
         if last_s > end_s or first_s >= (duration_s or float("inf")):
             return
         pose = trajectory(first_s) if callable(trajectory) else trajectory
-        yield number, first_s, scanner.sweep(pose, number=number)
+        yield partial(_cast, scanner, pose, number, first_s)
+
+
+def _cast(scanner: Scanner, pose: Any, number: int, start_s: float) -> _NumberedSweep:
+    """Cast a sweep that starts at a time, seconds."""
+    return number, start_s, scanner.sweep(pose, number=number)
 
 
 def _send_all(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import chain, count, islice
 
 from lidarsim.base.words import plural
@@ -13,10 +14,11 @@ from .bridge import Bridge
 from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
 from .sources import Played
 
-# Sweeps that are cast before they are due, for each sensor.
+# Sweeps that are cast before they are due, for each sensor and thread.
 AHEAD = 4
 # From the start of the schedule to the first sweep, for what the bridge does before.
 _START_NS = 100e6
+_ShiftedSweep = tuple[int, Cloud, int]  # number, points, shift of times in nanoseconds
 
 
 def play_sweeps(
@@ -36,7 +38,8 @@ def play_sweeps(
     """
     late_sweeps = 0
     sensors = len(played.sweeps.sensors)
-    with MadeAhead(_laps(played, loop=loop), AHEAD * sensors) as made_ahead:
+    ahead = AHEAD * sensors * played.threads
+    with MadeAhead(_laps(played, loop=loop), ahead, played.threads) as made_ahead:
         sweeps = iter(made_ahead)
         first = list(islice(sweeps, sensors))
         for sweep, points, _ in first:
@@ -56,9 +59,14 @@ def play_sweeps(
         note(f"{plural(late_sweeps, 'sweep')} left late.")
 
 
-def _laps(played: Played, *, loop: bool) -> Iterator[tuple[int, Cloud, int]]:
-    """Yield number and points of each sweep, and the shift of its times, nanoseconds."""
+def _laps(played: Played, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:
+    """Yield functions that cast or read the sweeps, lap after lap."""
     period_ns = played.period_ns
     for lap in count() if loop else range(1):
-        for sweep, points in played:
-            yield sweep, points, lap * period_ns
+        for sweep in played.order:
+            yield partial(_shifted, played, sweep, lap * period_ns)
+
+
+def _shifted(played: Played, sweep: int, shift_ns: int) -> _ShiftedSweep:
+    """Return number and points of a sweep, and the shift of its times, nanoseconds."""
+    return sweep, played.points(sweep), shift_ns

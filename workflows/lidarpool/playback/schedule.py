@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import threading
+import os
 import time
-from collections.abc import Iterable, Iterator
-from queue import Empty, Full, Queue
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import islice
 from typing import Generic, Self, TypeVar
 
 from lidarsim.base.arrays import Ints
@@ -18,6 +20,17 @@ BEHIND = (
     "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
     "(--rate)."
 )
+
+
+def casting_threads() -> int:
+    """Return how many sweeps are cast at the same time: as many as this process may use cores.
+
+    The threads of a single cast share only its rays; steps on their hits, a half of the time, would
+    use one core.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class Schedule:
@@ -58,54 +71,49 @@ class Schedule:
 
 
 class MadeAhead(Generic[Item]):
-    """Iterates over items that a thread takes from `items`, up to `count` ahead: a context manager.
+    """Iterates over the results of tasks that threads run, up to `count` ahead: a context manager.
 
-    An error of `items` is raised in the place of the item. The thread ends with the context.
+    An error of a task is raised in the place of its result. Leaving the context waits for the tasks
+    under way, and drops the others.
+
+    Parameters
+    ----------
+    tasks
+        Functions without arguments; `threads` of them run at the same time.
+    count
+        Largest number of tasks that are ahead of the results taken, at least `threads`.
+    threads
+        Number of threads.
+
+    Examples
+    --------
+    >>> with MadeAhead((str, int), count=2) as results:
+    ...     list(results)
+    ['', 0]
     """
 
-    def __init__(self, items: Iterable[Item], count: int) -> None:
-        self._items = items
-        # An item, an error in the place of an item, or None after the last item.
-        self._queue: Queue[tuple[Item] | BaseException | None] = Queue(count)
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._make, name="made ahead", daemon=True)
+    def __init__(self, tasks: Iterable[Callable[[], Item]], count: int, threads: int = 1) -> None:
+        self._tasks = iter(tasks)
+        self._count = max(count, threads)
+        self._futures: deque[Future[Item]] = deque()
+        self._pool = ThreadPoolExecutor(threads, "made ahead")
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self._start_tasks()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stopped.set()
-        self._thread.join()
+        self._pool.shutdown(cancel_futures=True)
 
     def __iter__(self) -> Iterator[Item]:
-        while True:
-            try:
-                entry = self._queue.get(timeout=_CHECK_S)  # Ctrl-C may not end an unlimited wait
-            except Empty:
-                continue
-            if entry is None:
-                return
-            if isinstance(entry, BaseException):
-                raise entry
-            yield entry[0]
+        while self._futures:
+            first = self._futures.popleft()
+            while not first.done():  # Ctrl-C may not end an unlimited wait
+                wait([first], _CHECK_S)
+            self._start_tasks()
+            yield first.result()
 
-    def _make(self) -> None:
-        """Put all items into the queue, until the context ends."""
-        try:
-            for item in self._items:
-                self._put((item,))
-                if self._stopped.is_set():
-                    return
-            self._put(None)
-        except BaseException as error:
-            self._put(error)
-
-    def _put(self, entry: tuple[Item] | BaseException | None) -> None:
-        """Put an entry into the queue when the queue has room, unless the context has ended."""
-        while not self._stopped.is_set():
-            try:
-                self._queue.put(entry, timeout=_CHECK_S)
-            except Full:
-                continue
-            return
+    def _start_tasks(self) -> None:
+        """Start tasks until `count` are ahead, or none is left."""
+        for task in islice(self._tasks, self._count - len(self._futures)):
+            self._futures.append(self._pool.submit(task))

@@ -29,6 +29,7 @@ from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.scenario import Scenario
 from ..scenario.sections import OutputSection
+from .schedule import casting_threads
 
 CLOUD = "cloud.ply"
 RECORDING = ".pcap"
@@ -45,14 +46,21 @@ class Played:
     points: Callable[[int], Cloud]  # of the sweep of a number; casts the sweep of a scenario
     # Returns scene and planned path; None for a result without them.
     content: Callable[[], PictureContent | None] = lambda: None
+    threads: int = 1  # that may ask for points at the same time
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
             raise LidarError("There are no sweeps to play: give poses, or a longer trajectory.")
 
     def __iter__(self) -> Iterator[tuple[int, Cloud]]:
-        for sweep in np.argsort(self.sweeps.begins_ns, kind="stable").tolist():
+        for sweep in self.order:
             yield sweep, self.points(sweep)
+
+    @property
+    def order(self) -> list[int]:
+        """Numbers of the sweeps in the order of their starts."""
+        order: list[int] = np.argsort(self.sweeps.begins_ns, kind="stable").tolist()
+        return order
 
     @property
     def period_ns(self) -> int:
@@ -151,4 +159,8 @@ def _cast(job: Job, stack: ExitStack) -> Played:
         part = columns_of([*rig.cast(start, stop)])
         return part.cloud(table, survey.precision_m, origin)
 
-    return Played(sweeps, cast, lambda: PictureContent.before_casting(job.scene, survey)[0])
+    def content() -> PictureContent | None:
+        """Return scene and planned path."""
+        return PictureContent.before_casting(job.scene, survey)[0]
+
+    return Played(sweeps, cast, content, casting_threads())

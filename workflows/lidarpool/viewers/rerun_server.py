@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
-from contextlib import suppress
 
 import rerun as rr
 
@@ -15,6 +12,7 @@ from lidarsim.base.errors import LidarError
 
 from ..export.rrd import APPLICATION, RerunLog
 from ..export.shown_sweeps import ShownSweep, Surroundings
+from . import attached_child
 from .viewer import Address, Viewer
 
 PORT = 9876  # Rerun's own default
@@ -45,7 +43,8 @@ class RerunServer(Viewer):
         command = ["--serve-web", "--bind", address.host, "--port", f"{address.port}"]
         command += ["--web-viewer-port", f"{page.port}", "--hide-welcome-screen"]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rerun", *command],
+            [sys.executable, attached_child.__file__, sys.executable, "-m", "rerun", *command],
+            stdin=subprocess.PIPE,  # whose end tells the server that this process is gone
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for this process, which ends the server
@@ -77,6 +76,6 @@ class RerunServer(Viewer):
     def close(self) -> None:
         """Send waiting messages, and end the server."""
         self._recording.disconnect()
-        with suppress(ProcessLookupError):  # it has ended by itself
-            os.killpg(self._process.pid, signal.SIGTERM)  # the program is a child of the module
+        assert self._process.stdin is not None
+        self._process.stdin.close()
         self._process.wait()

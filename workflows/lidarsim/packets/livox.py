@@ -8,7 +8,7 @@ pub_handler.cpp. All numbers are little-endian.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
@@ -53,6 +53,7 @@ PORTS = {
 # which returns nearer than 1.5 m are merged. Other tags, of noise, are 0: high confidence.
 _HAP_FIRST_RETURN = 0x10
 _HAP_MERGED_M = 1.5
+_POSITION = "position_m"  # name of positions among the columns of shots
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,9 @@ class LivoxEncoder(PacketEncoder):
         if not len(shots):
             return []
         imu = self._imu(self._samples.during(shots))
+        # By sweeps, whose directions the sensor has kept since they were cast.
+        positions = {_POSITION: self._positions_m(shots)[None]}
+        shots = replace(shots, columns={**shots.columns, **positions})
         filling = self._carry.whole_packets(shots)
         if not len(filling):
             return imu
@@ -200,18 +204,21 @@ class LivoxEncoder(PacketEncoder):
         source_port = PORTS[self.device_type].points
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
-    def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
-        """Write positions and reflectivities of shots to `points` (n, 96)."""
+    def _positions_m(self, shots: Shots) -> Floats:
+        """Return positions in the sensor frame, metres: (n, c, 3); NaN without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
-        range_m = shots.range_m[0]
-        vectors = sensor.directions(shots.firings)[:, channels]
-        vectors *= range_m[:, :, None]
+        positions = sensor.directions(shots.firings)[:, channels]
+        positions *= shots.range_m[0][:, :, None]
         origins = sensor.origins(shots.firings)
         if origins is not None:
-            vectors += origins[:, channels]
-        vectors /= kind.unit_m
-        units = np.rint(vectors, out=vectors)
+            positions += origins[:, channels]
+        return positions
+
+    def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
+        """Write positions and reflectivities of shots to `points` (n, 96)."""
+        units = shots.columns[_POSITION][0] / kind.unit_m
+        np.rint(units, out=units)
         limit = np.iinfo(np.dtype(kind.number)).max
         fits = (np.abs(units) <= limit).all(axis=2)  # not NaN, without a return
         units[~fits] = 0
@@ -219,7 +226,7 @@ class LivoxEncoder(PacketEncoder):
         reflectivities = shots.columns["reflectivity"][0] * fits
         points["reflectivity"] = reflectivities.reshape(points.shape)
         if self.device_type == _HAP:
-            is_first = fits & (range_m > _HAP_MERGED_M)
+            is_first = fits & (shots.range_m[0] > _HAP_MERGED_M)
             points["tag"] = _HAP_FIRST_RETURN * is_first.reshape(points.shape)
 
     def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:

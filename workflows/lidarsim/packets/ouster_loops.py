@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from raybeam.compiled import compiled
@@ -63,6 +65,7 @@ def write_pixels(returns, valid, layout, units, pixels):
                 written = written + 1
 
 
+@cache
 def remainders() -> UInts64:
     """Return the remainders of a byte that 0 to 7 bytes of zeros follow: (8, 256)."""
     tables = np.zeros((8, 256), np.uint64)

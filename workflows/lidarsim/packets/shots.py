@@ -96,11 +96,13 @@ class Shots:
         names = tuple(columns)
         check_columns(points.columns, names)
 
+        shape = (image.planes, len(image.firings), len(lasers))
+        shot = (image.plane * shape[1] + image.column) * shape[2] + lasers[image.row]
+
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
             """Return values (n,) of points as an array (r, n, c)."""
-            shape = (image.planes, len(image.firings), len(lasers))
             filled = np.full(shape, missing, values.dtype)
-            filled[image.plane, image.column, lasers[image.row]] = values
+            filled.reshape(-1)[shot] = values
             return filled
 
         starts = image.begin_ns + sensor.begins_ns(image.firings)

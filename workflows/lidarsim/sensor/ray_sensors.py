@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from pydantic import Field
@@ -66,7 +67,27 @@ class PrismSensor(Sensor):
         return None
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the unit directions of firings (k,), in the sensor frame: (k, channels, 3)."""
+        """Return the unit directions of firings (k,), in the sensor frame: (k, channels, 3).
+
+        Directions of consecutive firings are read-only. Those of the latest sweeps are kept, as
+        packets of a sweep need them again after it was cast.
+        """
+        count = len(firings)
+        key = (int(firings[0]), count) if count else (0, 0)
+        if not count or count * self.channels > _MAX_KEPT_RAYS or (np.diff(firings) != 1).any():
+            return self._computed_directions(firings)
+        kept = _KEPT_DIRECTIONS.setdefault(self, {})
+        directions = kept.get(key)
+        if directions is None:
+            directions = self._computed_directions(firings)
+            directions.flags.writeable = False
+            for oldest in [*kept][: max(0, len(kept) + 1 - _KEPT_SWEEPS)]:
+                kept.pop(oldest, None)  # another thread may have dropped the sweep
+            kept[key] = directions
+        return directions
+
+    def _computed_directions(self, firings: Ints) -> Floats:
+        """Return the directions of `directions`, by Snell's law."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
         ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
@@ -97,6 +118,14 @@ class PrismSensor(Sensor):
         normal[1:, :, 0] = sine * np.stack(sin_cos(angle)[::-1])
         reflected = rays - 2 * (rays * normal).sum(axis=0) * normal
         return reflected[[1, 2, 0]]
+
+
+# {sensor: {(first firing, number of firings): directions}}; not in the sensors, which are pickled.
+_KEPT_DIRECTIONS: WeakKeyDictionary[PrismSensor, dict[tuple[int, int], Floats]] = (
+    WeakKeyDictionary()
+)
+_KEPT_SWEEPS = 16
+_MAX_KEPT_RAYS = 1 << 16  # of a sweep that is kept: 1.5 MB
 
 
 def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
+from raybeam.embree_memory import float64s, int64s, uint8s
 
 from ..base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
@@ -39,6 +40,19 @@ class Receiver(NamedTuple):
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # the threshold in standard deviations of the noise
     quantiles: Floats  # of the normal distribution; empty without detection
+
+
+class _Detection(NamedTuple):
+    """Detection by a `Receiver`, and the starts of its random numbers."""
+
+    dropout: float  # share of returns that are lost
+    threshold: float  # energy at which half of the returns are detected; 0 without detection
+    threshold_sigmas: float  # the threshold in standard deviations of the noise
+    quantiles: Floats  # pointer to those of the normal distribution
+    lowest: float  # first and last of the quantiles
+    highest: float
+    loss_start: np.uint64  # starts of hashes, see `random_numbers.starts`
+    detection_start: np.uint64
 
 
 class ReturnArrays(NamedTuple):
@@ -80,6 +94,32 @@ class _BeamScratch(NamedTuple):
     shown: Bools  # whether the mode reports a return
 
 
+# Loops over all beams read and write by pointers: numba counts references of arrays in tuples, and
+# that takes as long as the rest of the loop.
+@inlined
+def _pointers_to_hits(hits):
+    """Return `SubrayHits` of pointers to the arrays of `SubrayHits`, which must stay alive."""
+    return SubrayHits(
+        int64s(hits.ray.ctypes.data),
+        float64s(hits.distance.ctypes.data),
+        float64s(hits.energy.ctypes.data),
+        float64s(hits.velocity.ctypes.data),
+        uint8s(hits.solid.ctypes.data),
+    )
+
+
+@inlined
+def _pointers_to_returns(output):
+    """Return `ReturnArrays` of pointers to `ReturnArrays`, which must stay alive."""
+    return ReturnArrays(
+        int64s(output.beam.ctypes.data),
+        int64s(output.row.ctypes.data),
+        float64s(output.distance.ctypes.data),
+        float64s(output.energy.ctypes.data),
+        float64s(output.velocity.ctypes.data),
+    )
+
+
 @stage
 def _max_hits(ray, subrays):
     """Return the largest number of hits of a beam."""
@@ -115,9 +155,9 @@ def _room_for_hits(size, subrays):
 
 
 @inlined
-def _end_of_beam(ray, row, end_ray):
-    """Return the first row from `row` on whose sub-ray is not below `end_ray`."""
-    while row < len(ray) and ray[row] < end_ray:
+def _end_of_beam(ray, size, row, end_ray):
+    """Return the first row from `row` on, of `size`, whose sub-ray is not below `end_ray`."""
+    while row < size and ray[row] < end_ray:
         row += 1
     return row
 
@@ -226,7 +266,7 @@ def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
     number = 0
     for k in range(count):
         row_k = row[k, 0]
-        solid[k] = row_k >= 0 and hits.solid[row_k]
+        solid[k] = row_k >= 0 and hits.solid[row_k] != 0
         scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
         scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
         if receiver.with_velocity:
@@ -287,37 +327,54 @@ def _keep(output, k, count):
 
 
 @inlined
-def _detected(energy, scan, number_in_scan, return_index, receiver, hash_starts):
+def _detection_of(receiver, starts):
+    """Return the `_Detection` of a receiver; `starts` are of `RandomKeys`, empty without losses."""
+    loses = len(starts) > 0
+    count = len(receiver.quantiles)
+    return _Detection(
+        receiver.dropout,
+        receiver.threshold,
+        receiver.threshold_sigmas,
+        float64s(receiver.quantiles.ctypes.data),
+        receiver.quantiles[0] if count else 0.0,
+        receiver.quantiles[count - 1] if count else 0.0,
+        starts[0] if loses else np.uint64(0),
+        starts[1] if loses else np.uint64(0),
+    )
+
+
+@inlined
+def _detected(energy, scan, number_in_scan, return_index, detection):
     """Return whether a return is detected, as `detection.detected` does.
 
     `scan`, the beam's `number_in_scan` and the `return_index` within the beam, from 0, are the key
-    of the random numbers; `hash_starts` are the starts of the hashes for loss and for detection.
+    of the random numbers.
     """
-    quantiles = receiver.quantiles
     detected = (
-        receiver.dropout == 0
-        or uniform(hash_starts[0], scan, number_in_scan, return_index) >= receiver.dropout
+        detection.dropout == 0
+        or uniform(detection.loss_start, scan, number_in_scan, return_index) >= detection.dropout
     )
-    if detected and receiver.threshold > 0:
-        signal = receiver.threshold_sigmas * (energy / receiver.threshold - 1)
-        detected = signal + quantiles[0] > 0  # whatever is drawn
-        if not detected and signal + quantiles[-1] > 0:
+    if detected and detection.threshold > 0:
+        signal = detection.threshold_sigmas * (energy / detection.threshold - 1)
+        detected = signal + detection.lowest > 0  # whatever is drawn
+        if not detected and signal + detection.highest > 0:
             index = np.int64(
-                bits(hash_starts[1], scan, number_in_scan, return_index) >> SHIFT_TO_INDEX
+                bits(detection.detection_start, scan, number_in_scan, return_index)
+                >> SHIFT_TO_INDEX
             )
-            detected = signal + quantiles[index] > 0
+            detected = signal + detection.quantiles[index] > 0
     return detected
 
 
 @inlined
-def _keep_detected(begin, stop, scan, number_in_scan, receiver, hash_starts, output):
+def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
     """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row.
 
     `scan` and the beam's `number_in_scan` are keys of random numbers, see `_detected`.
     """
     count = begin
     for k in range(begin, stop):
-        if _detected(output.energy[k], scan, number_in_scan, k - begin, receiver, hash_starts):
+        if _detected(output.energy[k], scan, number_in_scan, k - begin, detection):
             count = _keep(output, k, count)
     return count
 
@@ -346,6 +403,12 @@ def _mark(energy, begin, stop, mode, shown):
 
 
 @inlined
+def _start_of_scan(scan_starts, row):
+    """Return the first beam of a scan by its row; a greater number after the last scan."""
+    return scan_starts[row] if row < len(scan_starts) else np.iinfo(np.int64).max
+
+
+@inlined
 def _keep_reported(begin, stop, mode, scratch, output):
     """Keep the returns of a beam that a mode reports; return the next free row."""
     for k in range(begin, stop):
@@ -371,7 +434,7 @@ def mark_reported(ray, energy, mode, shown):
 
 
 @compiled()
-def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - a compiled loop
+def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
 
     `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
@@ -382,17 +445,26 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - 
     subrays = receiver.subrays
     size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
     scratch = _room_for_hits(size, subrays)
+    hit_count = len(hits.ray)
+    air_count = len(air.ray)
+    hits = _pointers_to_hits(hits)
+    air = _pointers_to_hits(air)
+    output = _pointers_to_returns(output)
+    loses = len(keys.starts) > 0
+    detection = _detection_of(receiver, keys.starts)
     row = 0
     air_row = 0
     count = 0
     scan_index = 0
-    while row < len(hits.ray) or air_row < len(air.ray):
-        beam = beam_of(hits.ray[row] if row < len(hits.ray) else air.ray[air_row], subrays)
-        if air_row < len(air.ray):
+    scan_stop = -1  # first beam of the next scan
+    scan_start = 0
+    while row < hit_count or air_row < air_count:
+        beam = beam_of(hits.ray[row] if row < hit_count else air.ray[air_row], subrays)
+        if air_row < air_count:
             beam = min(beam, beam_of(air.ray[air_row], subrays))
         end_ray = (beam + 1) * subrays
-        stop = _end_of_beam(hits.ray, row, end_ray)
-        air_stop = _end_of_beam(air.ray, air_row, end_ray)
+        stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
+        air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
         rows = _BeamRows(row, stop, air_row, air_stop)
         row = stop
         air_row = air_stop
@@ -401,18 +473,20 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914 - 
         if rows.air_start == rows.air_stop:  # mostly, there is one surface, and no hit in the air
             single, count = _single_return(hits, rows, beam, receiver, count, output)
         if not single:
-            hit_count, extent_m = _collect_hits(hits, air, rows, scratch)
+            collected, extent_m = _collect_hits(hits, air, rows, scratch)
             apart = extent_m > receiver.gap_m
             if apart:  # few beams hit an edge or graze a surface
-                _sort_by_distance(scratch.hits, hit_count)
-            _mark_returns(hits, air, hit_count, apart, receiver, neighbours, scratch)
-            count = _write_returns(hit_count, beam, receiver, scratch, count, output)
-        if len(keys.starts) and count > begin:
-            scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
-            number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
-            scan = keys.scan + scan_index
+                _sort_by_distance(scratch.hits, collected)
+            _mark_returns(hits, air, collected, apart, receiver, neighbours, scratch)
+            count = _write_returns(collected, beam, receiver, scratch, count, output)
+        if loses and count > begin:
+            number = keys.first + beam
+            if number >= scan_stop:
+                scan_index = scan_row(keys.scan_starts, number, scan_index)
+                scan_start = keys.scan_starts[scan_index]
+                scan_stop = _start_of_scan(keys.scan_starts, scan_index + 1)
             count = _keep_detected(
-                begin, count, scan, number_in_scan, receiver, keys.starts, output
+                begin, count, keys.scan + scan_index, number - scan_start, detection, output
             )
         if receiver.mode != ALL and count - begin > 1:
             count = _keep_reported(begin, count, receiver.mode, scratch, output)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Ints, Ints32
+from ..base.arrays import AnyArray, Ints, Ints32, owned
 from ..base.errors import LidarError
 from ..columns.cloud import Cloud
 from ..sensor import Sensor
@@ -58,17 +58,23 @@ class Image:
         `first_scan` is the scan of the first step, `begin_ns` the start of the station, and a pulse
         has up to `returns`. LidarError if the points are not in order, or of other steps.
         """
+        from . import image_loops  # not before: numba takes half a second to import
+
         bounds = np.array([sensor.firings(step) for step in steps])
         firings = np.arange(bounds[0, 0], bounds[-1, 1])
-        step = points["scan"] - first_scan
-        if len(step) and not 0 <= step.min() <= step.max() < len(steps):
+        plane, row, column = np.empty((3, len(points)), np.int64)
+        max_returns = image_loops.find_pixels(
+            owned(points["ray"], np.int64),
+            owned(points["scan"] - first_scan, np.int64),
+            (bounds[:, 0] - firings[0]) * sensor.channels,
+            len(firings) * sensor.channels,
+            sensor.channels,
+            plane,
+            row,
+            column,
+        )
+        if max_returns < 0:
             raise LidarError(MIXED_UP)
-        ray = points["ray"].astype(np.int64)
-        ray += (bounds[step, 0] - firings[0]) * sensor.channels
-        if (np.diff(ray) < 0).any() or (len(ray) and ray[-1] >= len(firings) * sensor.channels):
-            raise LidarError(MIXED_UP)
-        column, row = np.divmod(ray, sensor.channels)
-        plane = _return_indices(ray)
         scans = np.arange(first_scan, first_scan + len(steps), dtype=np.int32)
         return cls(
             sensor,
@@ -78,7 +84,7 @@ class Image:
             plane,
             row,
             column,
-            planes=max(returns, int(plane.max(initial=0)) + 1),
+            planes=max(returns, max_returns),
         )
 
     def filled(self, values: AnyArray) -> AnyArray:
@@ -106,13 +112,6 @@ class Image:
             "elevation": np.degrees(np.arcsin(np.clip(z, -1, 1))).astype(np.float32),
             "scan": self.scan,
         }
-
-
-def _return_indices(ray: Ints) -> Ints:
-    """Return the index of each point among the points of its ray, from 0; `ray` (n,) ascends."""
-    first_points = np.flatnonzero(np.diff(ray, prepend=-1))
-    counts = np.diff(first_points, append=len(ray))
-    return np.asarray(np.arange(len(ray)) - np.repeat(first_points, counts))
 
 
 def fired_of(sweeps: Sweeps) -> FiredRays:
