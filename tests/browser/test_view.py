@@ -6,15 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.spirals import COUNT, WET, spiral, spiral_view
 
-from lidarpool import Column, Scene, Sensor, Survey, Track
+from lidarpool import Scene, Sensor, Survey, Track
 from lidarpool.live.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.ply_format import header, row_type
-from lidarsim.columns.table import OBJECT, SCAN, TABLE
+from lidarsim.columns.ply_format import header
+from lidarsim.columns.table import OBJECT, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
-from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import page_of
@@ -22,23 +22,7 @@ from lidarview.viewer.view import View, open_results
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-COUNT = 30_000
-SCANS = 360
 PICTURE = "lidarpool.picture"
-WET = Column("wetness", "float32", "%", "how wet it is", source="wetness")
-
-
-def spiral(path, column):
-    """Write a file with a spiral of 30,000 points in 360 scans, and a column from 0 to 100."""
-    turn = np.linspace(0, 20 * np.pi, COUNT)
-    rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, column)))
-    rows[column.name] = np.linspace(0, 100, COUNT)
-    rows["x"] = 9 * np.cos(turn)
-    rows["y"] = 9 * np.sin(turn)
-    rows["z"] = turn / 8
-    rows["scan"] = np.arange(COUNT) * SCANS // COUNT
-    path.write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
-    return path
 
 
 @pytest.fixture
@@ -48,20 +32,7 @@ def cloud(tmp_path):
 
 @pytest.fixture
 def view(cloud):
-    """Return the view of a spiral that a sensor scans in ten turns, while a box drives along x."""
-    track = Track([0, 1], [[-9, 0, 8], [9, 0, 8]])
-    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
-    scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
-    poses = Track([0, 2], [[0, -9, 4], [0, 9, 4.0]])
-    survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
-    hits = np.zeros(scene.triangles, np.int64)
-    rays = np.zeros((0, 2, 3), np.float32)
-    pictured = PictureContent(
-        scene, sensor_positions(survey), hits, rays, duration_ns=survey.duration_ns
-    )
-    sweeps = Sweeps.from_survey(survey, scene)
-    assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
-    return View(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
+    return spiral_view(cloud)
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 // The page: what is asked of the server, the controls, and the time that is played.
 import { ask } from "./ask.js";
-import { button, dual, element, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
+import { button, dual, element, explain, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
 import { count, follow, replace, slots, stop } from "./run.js";
 
@@ -663,14 +663,14 @@ function buildTime() {
   if (!timed) return;
   clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
   clock.show = menu("", SHOWS.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
-  clock.show.title = "Points that are shown";
+  explain(clock.show, "Points that are shown");
   clock.slider = element("input", { type: "range", min: 0, max: duration(), step: "any", value: chosen.time, title: "Time" });
   clock.slider.setAttribute("aria-label", "time, seconds");
   clock.slider.oninput = () => { leaveAll(); setTime(+clock.slider.value); };
   clock.ticks = element("canvas");
   clock.now = element("span", { className: "now" });
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
-  clock.speed.title = "Speed; 1× is as fast as the survey";
+  explain(clock.speed, "Speed; 1× is as fast as the survey");
   clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
   clock.follow = button("Follow", () => setFollow(!chosen.follow));
   clock.follow.title = "Move the camera with the carrier";
