@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,33 +42,49 @@ class Pieces:
     positions: list[Floats] = field(default_factory=list)
     columns: list[Mapping[str, AnyArray]] = field(default_factory=list)
     count: int = 0
+    _used: set[str] = field(default_factory=set)  # columns with other values than zeros
 
     def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
         """Add points at finite positions (n, 3); columns are those of a number for each point."""
+        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        arrays = {
+            name: values
+            for name, values in arrays.items()
+            if values.shape == (len(positions),) and values.dtype.kind in "biuf"
+        }
         valid = np.asarray(np.isfinite(positions).all(axis=1))
-        self.positions.append(positions[valid])
-        self.columns.append(
-            {
-                name: np.asarray(values)[valid]
-                for name, values in columns.items()
-                if np.shape(values) == (len(valid),) and np.asarray(values).dtype.kind in "biuf"
-            }
-        )
-        self.count += int(valid.sum())
+        if not valid.all():
+            positions = positions[valid]
+            arrays = {name: values[valid] for name, values in arrays.items()}
+        self.positions.append(positions)
+        self.columns.append(arrays)
+        self.count += len(positions)
+        self._used |= {
+            name for name in arrays.keys() - self._used if arrays[name].any()
+        }  # zeros take long to be looked at, and are not joined
 
     def cloud(self, **columns: AnyArray) -> Cloud:
         """Join the points with the columns that all pieces have, and further columns."""
         if not self.positions:
             return Cloud(np.zeros((0, 3)), columns)
-        shared = [name for name in self.columns[0] if all(name in piece for piece in self.columns)]
-        joined = {name: np.concatenate([piece[name] for piece in self.columns]) for name in shared}
-        joined = _with_known_names(joined) | columns
+        shared = set.intersection(*({*piece} for piece in self.columns))
+        joined = {
+            name: np.concatenate([piece[name] for piece in self.columns])
+            for name in self.columns[0]
+            if name in shared & self._used
+        }
+        joined = _with_known_names(joined, shared) | columns
         custom = tuple(_described(name, array) for name, array in joined.items())
         return Cloud(np.concatenate(self.positions), joined, custom)
 
 
-def _with_known_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return columns by the names of lidarpool, without coordinates and columns of zeros."""
+def _with_known_names(
+    columns: Mapping[str, AnyArray], all_names: Collection[str]
+) -> dict[str, AnyArray]:
+    """Return columns by the names of lidarpool, without coordinates.
+
+    `all_names` are the names in the recording, also of columns that are left out.
+    """
     named: dict[str, AnyArray] = {}
     for name, values in columns.items():
         if name == "rgb":  # of PCL: bytes in the bits of a float
@@ -79,8 +95,8 @@ def _with_known_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
         known_name = "channel" if name in _RINGS else _NAMES.get(name, name)
         known_name = re.sub(r"\W", "_", known_name)
         known_name = known_name if known_name.isidentifier() else f"_{known_name}"
-        is_new = known_name not in columns or known_name == name
-        if known_name.lower() not in "xyz" and is_new and values.any():
+        is_new = known_name not in all_names or known_name == name
+        if known_name.lower() not in "xyz" and is_new:
             # Bytes in the order of this machine; True and False as numbers.
             kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
             named[known_name] = values.astype(kind.newbyteorder("="))
@@ -128,8 +144,11 @@ def _cloud_of(recording: Recording) -> Cloud:
     for number in range(recording.count):
         with reading(recording.name):
             positions, columns, _ = recording.read(number)
-            thinned = {name: np.asarray(values)[::step] for name, values in columns.items()}
-            pieces.add(np.asarray(positions, np.float64)[::step] * recording.metres, thinned)
+            positions = np.asarray(positions, np.float64)[::step]
+            if recording.metres != (1.0, 1.0, 1.0):
+                positions = positions * recording.metres
+            columns = {name: np.asarray(values)[::step] for name, values in columns.items()}
+            pieces.add(positions, columns)
     return pieces.cloud()
 
 
