@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
@@ -58,11 +59,14 @@ def open_view(path: Path) -> View:
         return _preview(path)
     if suffix == ".ply" and not _has_faces(path):
         try:
-            return open_result(path, downloads())
+            view = open_result(path, downloads())
         except LidarError:  # text, or of another program
             return _recorded(path, title)
+        if not len(view.points):
+            raise LidarError(f"{path} has no points.")
+        return view
     mesh_format = format_of(path)
-    if mesh_format is not None and not mesh_format.advice:
+    if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice):
         return _preview(path)
     return _recorded(path, title)
 
@@ -73,10 +77,16 @@ def open_view(path: Path) -> View:
 
 def _recorded(path: Path, title: str) -> View:
     """Return the view of a recording."""
-    from ..recordings.recordings import open_sensors
+    from ..recordings.recordings import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
-    return recorded_view(open_sensors(path), title, downloads())
+    try:
+        return recorded_view(open_sensors(path), title, downloads())
+    except UnknownFormatError as error:
+        raise LidarError(
+            f"{path} is not read: {error.advice}give a result, data set, cloud, recording, "
+            "scenario or mesh of a format that lidarpool view --help names."
+        ) from error
 
 
 def _preview(path: Path) -> View:

@@ -185,9 +185,14 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     recordings = [*sensors.values()]
     ordered, is_timed = _order(recordings)
     pieces = Pieces()
+    frame_poses = [_frame_poses(recording) for recording in recordings]
+    if any(sensor_poses is None for sensor_poses in frame_poses):
+        frame_poses = [None] * len(recordings)  # sensors without a pose fit no others
     poses: list[Floats | None] = []
     for sweep in ordered:
-        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number))
+        sensor_poses = frame_poses[sweep.sensor]
+        pose = None if sensor_poses is None else sensor_poses[sweep.number]
+        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number, pose))
         if pieces.count > MAX_POINTS:
             break
     notes = []
@@ -200,10 +205,24 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     return cloud, recorded_sweeps(ordered[: len(poses)], poses, [*sensors]), notes
 
 
-def _add_sweep(pieces: Pieces, recording: Recording, number: int) -> Floats | None:
-    """Read a sweep into the world frame, if its pose is known; return the pose."""
+def _frame_poses(recording: Recording) -> Floats | None:
+    """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
+    if recording.frame_poses is None:
+        return None
+    with reading(recording.name):
+        return recording.frame_poses()
+
+
+def _add_sweep(
+    pieces: Pieces, recording: Recording, number: int, frame_pose: Floats | None
+) -> Floats | None:
+    """Read a sweep into the world frame, if its pose is known; return the pose.
+
+    `frame_pose` is the pose of a sweep that has none of its own.
+    """
     with reading(recording.name):
         positions, columns, pose = recording.read(number)
+        pose = frame_pose if pose is None else pose
         local = np.asarray(positions, np.float64) * recording.metres
     is_return = local.any(axis=1)  # drivers write zeros for pulses without a return
     local = local[is_return]

@@ -39,6 +39,7 @@ from ..base.fingerprint import fingerprint
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
+from .bag_poses import sweep_poses
 from .sweep_files import (
     Columns,
     Read,
@@ -71,12 +72,24 @@ _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
+    ".rrd": "it is a recording of Rerun, open it with the command rerun",
+    ".osi": "it is a trace of OSI, name it as the traffic of a scenario",
+    ".tum": "it is a trajectory, name it as the trajectory of a scenario",
+    **dict.fromkeys((".csv", ".txt"), "name a trajectory in a scenario, as trajectory: FILE"),
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
 }
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
 
 Metres = tuple[float, float, float]  # of the units of x, y and z
 _METRES: Metres = (1.0, 1.0, 1.0)
+
+
+class UnknownFormatError(LidarError):
+    """The format of a file or folder is not read; `advice` is a clause, or empty."""
+
+    def __init__(self, name: str, advice: str) -> None:
+        super().__init__(f"{name} is not read: {advice}give {KINDS}.")
+        self.advice = advice
 
 
 class SeveralSensorsError(LidarError):
@@ -138,6 +151,9 @@ class Recording:
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
+    # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
+    # None if they are unknown; None if the recording has no frames.
+    frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
 
     def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
@@ -251,7 +267,7 @@ def _open_path(
         return recording
     suffix = path.suffix.lower()
     advice = f"{_CONVERSIONS[suffix]}, or " if suffix in _CONVERSIONS else ""
-    raise LidarError(f"{name} is not read: {advice}give {KINDS}.")
+    raise UnknownFormatError(name, advice)
 
 
 def _open_folder(
@@ -522,7 +538,18 @@ def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -
     def times() -> Iterator[float]:
         return (time for _, time, _ in messages())
 
-    return _open_stream(name, messages, points, intensity, connection.msgcount, times=times)
+    def frame_poses() -> Floats | None:
+        return sweep_poses(path, (data for _, _, data in messages()))
+
+    return _open_stream(
+        name,
+        messages,
+        points,
+        intensity,
+        connection.msgcount,
+        times=times,
+        frame_poses=frame_poses,
+    )
 
 
 def _open_ouster(path: Path, name: str, sensor: str | None, intensity: str | None) -> Recording:
