@@ -74,6 +74,8 @@ def share(
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
+        if file and not file.parent.is_dir():  # films take seconds to draw
+            raise LidarError(f"{file} cannot be written: there is no folder {file.parent}.")
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
         raise LidarError("There are no points to show: rays hit nothing.")
     if view.note:
