@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from tests.shapes import room
 
 from lidarpool import Mounted, Pose, Survey, Track, load_sensor
 from lidarpool.export.formats import Format
+from lidarpool.live import opened, recorded
 from lidarpool.live.job_list import JobList
-from lidarpool.live.opened import is_data_set, open_view
+from lidarpool.live.opened import growing_view, is_data_set, open_view
 from lidarsim.base.errors import LidarError
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.picture_file import PICTURE_FILE, PictureContent
@@ -111,7 +113,26 @@ def test_each_kind_of_file_is_opened(kinds, new_tab):
                 tab.wait_for(lambda text: "5 of 6" in text and "Points of job 00" in text)
             else:
                 check_view(tab, view, name)
+            tab.open("about:blank")  # asks nothing of a server that ends
     assert tab.errors == []
+
+
+def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new_tab, monkeypatch):
+    if not (kinds / "las").exists():
+        pytest.skip("needs laspy")
+    monkeypatch.setattr(recorded, "LARGE_POINTS", 1000)
+    is_drawn = threading.Event()
+    monkeypatch.setattr(opened, "open_view", lambda path: is_drawn.wait(120) and open_view(path))
+    view = growing_view(place_of(kinds, "las"))
+    with page_server(view.answer, port=0) as page:
+        tab = new_tab(page.url)
+        tab.wait_for(lambda text: drawn(tab) > 0 and "points are read meanwhile" in text)
+        tab.choose("colour", "intensity")
+        is_drawn.set()
+        total = f"{view.total:,} points"
+        tab.wait_for(lambda text: text.count(total) == 1 and drawn(tab) == view.total)
+        assert "meanwhile" not in tab.text and "intensity" in tab.text
+        assert tab.value("lidarpool.chosen.colour") == "intensity" and tab.errors == []
 
 
 def test_jobs_of_a_data_set_are_listed_and_each_is_opened(kinds, new_tab):

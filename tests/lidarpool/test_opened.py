@@ -1,6 +1,7 @@
 """The viewer opens whatever lidarpool reads or writes: exports, recordings, meshes, scenarios."""
 
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from lidarpool.cli.result_commands import view as view_command
 from lidarpool.export.formats import Format
 from lidarpool.live import recorded
 from lidarpool.live.job_list import JobList
-from lidarpool.live.opened import is_data_set, open_view, open_views
+from lidarpool.live.opened import growing_view, is_data_set, open_view, open_views
 from lidarpool.recordings import bag_poses
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
@@ -128,6 +129,43 @@ def test_a_sweep_alone_and_what_is_too_much_for_memory(exported, monkeypatch):
     assert len(open_view(folder / "cloud.las").points) == pytest.approx(len(cloud) / 3, abs=2)
     note = state_of(open_view(folder / "pcd"))["note"]
     assert "of 6 sweeps are shown" in note
+
+
+def growth_of(view):
+    """Wait until all points of a growing view are read; return its last answer."""
+    deadline = time.monotonic() + 60
+    while True:
+        growth, _ = view.answer("growth", {}, bool)
+        if growth["complete"] or growth["error"]:
+            return growth
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz"])
+def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypatch, name, tmp_path):
+    folder, cloud, _ = exported
+    assert growing_view(folder / name) is None, "it is small"
+    assert growing_view(folder / "cloud.e57") is None
+    monkeypatch.setattr(recorded, "LARGE_POINTS", 1000)
+    monkeypatch.setattr(recorded, "_SAMPLE_POINTS", 4000)
+    view = growing_view(folder / name)
+    state = state_of(view)
+    assert state["growing"] and state["points"] == len(cloud) and not state["exports"]
+    assert f"all {len(cloud):,} points are read meanwhile" in state["note"]
+    asked = {"colour": "z", "most": "100000"}
+    assert view.answer("points", asked, bool)[0]["count"] == 4000
+    assert growth_of(view) == {"complete": True, "error": ""}
+    grown = state_of(view)
+    assert "growing" not in grown and grown["version"] > state["version"]
+    assert grown["exports"] and not grown["note"]
+    assert view.answer("points", asked, bool)[0]["count"] == len(cloud)
+    content = (folder / name).read_bytes()
+    (tmp_path / name).write_bytes(content)
+    view = growing_view(tmp_path / name)
+    (tmp_path / name).write_bytes(content[: len(content) // 2])
+    view.answer("points", asked, bool)
+    assert "is broken or cut short" in growth_of(view)["error"]
 
 
 def test_files_of_other_programs(tmp_path):

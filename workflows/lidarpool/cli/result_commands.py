@@ -246,7 +246,7 @@ def view(
     from lidarview.viewer.view import CLOUD, show_view
 
     from ..export.folder import local_result
-    from ..live.opened import is_data_set, open_views
+    from ..live.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
         raise LidarError("--film and --export take one result: give them one after the other.")
@@ -263,7 +263,8 @@ def view(
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
-        shown = open_views(folders)
+        growing = growing_view(folders[0]) if len(folders) == 1 and not (film or export) else None
+        shown = growing or open_views(folders)
         if film or export:
             from lidarview.viewer.sharing import share
 

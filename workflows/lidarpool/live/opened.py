@@ -14,7 +14,7 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
-from lidarview.viewer.view import CLOUD, View, join_views, open_result
+from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_result
 
 from ..datasets.dataset import INDEX_FILE
 from .downloads import downloads
@@ -87,6 +87,23 @@ def _recorded(path: Path, title: str) -> View:
             f"{path} is not read: {error.advice}give a result, data set, cloud, recording, "
             "scenario or mesh of a format that lidarpool view --help names."
         ) from error
+
+
+def growing_view(path: Path) -> GrowingView | None:
+    """Return the view of a sample of a large .las or .laz, until all its points are read.
+
+    None for other files and folders. LidarError if the file cannot be read.
+    """
+    if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
+        return None
+    from ..recordings.recordings import open_recording
+    from .recorded import LARGE_POINTS, sampled_view
+
+    recording = open_recording(path)
+    if recording.sample is None or (recording.point_count or 0) < LARGE_POINTS:
+        return None
+    sampled = sampled_view(recording, f"{path.resolve().name} - lidarpool")
+    return GrowingView(sampled, recording.point_count or 0, lambda: open_view(path))
 
 
 def _preview(path: Path) -> View:

@@ -22,6 +22,8 @@ from lidarview.viewer.view import Downloads, View
 from ..recordings.recordings import Recording
 
 MAX_POINTS = 20_000_000  # of a recording, in memory
+LARGE_POINTS = 2_000_000  # of a cloud, of which a sample is shown while it is read
+_SAMPLE_POINTS = 200_000
 _SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
 _RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
 _NAMES = {"classification": "class", "label": "class", "NormalX": "normal_x", "NormalY": "normal_y"}
@@ -133,6 +135,19 @@ def recorded_view(
     names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
     return View(
         OrderedPoints(cloud), None, sweeps, " ".join(notes), title, downloads=downloads, names=names
+    )
+
+
+def sampled_view(recording: Recording, title: str) -> View:
+    """Return the view of an even sample of a cloud that has `Recording.sample`, within a second."""
+    pieces = Pieces()
+    assert recording.sample is not None
+    with reading(recording.name):
+        positions, columns, _ = recording.sample(_SAMPLE_POINTS)
+        pieces.add(positions * recording.metres, columns)
+    names = {"class": ASPRS_CLASSES}
+    return View(
+        OrderedPoints(pieces.cloud()), note=" ".join(recording.notes), title=title, names=names
     )
 
 

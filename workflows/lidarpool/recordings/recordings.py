@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,6 +54,9 @@ from .sweep_files import (
     open_webdataset,
 )
 
+if TYPE_CHECKING:
+    from laspy import LasReader
+
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .bin of KITTI, "
     ".pcap of Velodyne or Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, "
@@ -79,6 +82,11 @@ _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
 }
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
+
+# A sample of a .las consists of this many runs of points, which begin where chunks of a .laz begin:
+# 50,000 points each, unless a program chooses otherwise.
+_SAMPLE_RUNS = 40
+_LAZ_CHUNK = 50_000
 
 Metres = tuple[float, float, float]  # of the units of x, y and z
 _METRES: Metres = (1.0, 1.0, 1.0)
@@ -151,6 +159,7 @@ class Recording:
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
+    sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
     # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
     # None if they are unknown; None if the recording has no frames.
     frame_poses: Callable[[], Floats | None] | None = None
@@ -495,19 +504,40 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
             metres = units.factors
             notes = [f"{name} {note}" for note in [units.note()] if note]
 
-    def read(number: int) -> Read:
-        chunk_points = min(CHUNK_POINTS, count - number * CHUNK_POINTS)
-        with open_las(path) as reader:
-            reader.seek(number * CHUNK_POINTS)
-            points = reader.read_points(chunk_points)
-        if len(points) != chunk_points:
+    def read_run(reader: LasReader, start: int, length: int) -> Read:
+        reader.seek(start)
+        points = reader.read_points(length)
+        if len(points) != length:
             raise ValueError(f"{count:,} points announced, and there are fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
         return np.stack([points.x, points.y, points.z], axis=1), columns, None
 
+    def read(number: int) -> Read:
+        start = number * CHUNK_POINTS
+        with open_las(path) as reader:
+            return read_run(reader, start, min(CHUNK_POINTS, count - start))
+
+    def sample(max_points: int) -> Read:
+        length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
+        starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
+        with open_las(path) as reader:
+            runs = [read_run(reader, int(start), length) for start in starts]
+        columns = {name: np.concatenate([run[1][name] for run in runs]) for name in runs[0][1]}
+        return np.concatenate([run[0] for run in runs]), columns, None
+
     parts = -(-count // CHUNK_POINTS)
     metres = metres or _METRES
-    return Recording(name, parts, read, intensity, True, count, notes=tuple(notes), metres=metres)
+    return Recording(
+        name,
+        parts,
+        read,
+        intensity,
+        True,
+        count,
+        notes=tuple(notes),
+        metres=metres,
+        sample=sample,
+    )
 
 
 def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -> Recording:

@@ -283,7 +283,7 @@ function tellFacts() {
   if (count < state.points) parts.push(`of ${n(state.points)}`);
   if (drawn < count && chosen.colour !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
   panel.facts.innerHTML = parts.join(" ");
-  if (requests.detail || requests.base || (underWay.size && !playing)) panel.facts.append(" …");
+  if (requests.detail || requests.base || state.growing || (underWay.size && !playing)) panel.facts.append(" …");
 }
 
 function setLimits(name, limits) {
@@ -986,6 +986,17 @@ async function news(told) {
   }
 }
 
+// Of a large file, a sample is shown first: waits for all points, and takes them.
+async function grow() {
+  const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error }) => all || error);
+  if (told.error) return say(told.error, true);
+  takeState(await ask("state"));
+  buildPanel();
+  legendText = "";
+  shownKey = null;
+  refresh();
+}
+
 function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
   const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
@@ -1127,6 +1138,7 @@ async function begin() {
     });
   }
   refresh();
+  if (state.growing) grow().catch(failed);
   showImages();
   await loadSurface();
 }
