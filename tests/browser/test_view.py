@@ -1,7 +1,9 @@
 """A finished result, looked at, played and measured in a browser."""
 
 import re
+import threading
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import SimpleNamespace
 
 import numpy as np
@@ -582,12 +584,38 @@ def colourful(picture):
     return int((part.max(axis=2) - part.min(axis=2) > 60).sum())
 
 
-def test_no_page_of_another_server_frames_it(served, view, new_tab):
-    with page_server(view.answer, port=0) as other:
-        tab = opened(new_tab, other)
-        frame = "Object.assign(document.createElement('iframe'), {src: '" + served.url + "'})"
-        tab.value(f"document.body.append({frame})")
-        tab.wait_for(lambda _: any("frame-ancestors" in error for error in tab.errors))
+class Foreign(BaseHTTPRequestHandler):
+    """Serve an empty page without a content policy."""
+
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<!doctype html><body>")
+
+    def log_message(self, *_):
+        """Log nothing."""
+
+
+@pytest.fixture
+def foreign_page():
+    """Serve a page of another server; return its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+
+
+def test_no_page_of_another_server_frames_it_and_it_frames_no_other(served, foreign_page, new_tab):
+    frame = "document.body.append(Object.assign(document.createElement('iframe'), {src: '%s'}))"
+    for outer, inner, directive in (
+        (foreign_page, served.url, "frame-ancestors"),
+        (served.url, foreign_page, "frame-src"),
+    ):
+        tab = new_tab(outer)
+        tab.wait_for(lambda _, tab=tab: tab.value("document.readyState") == "complete")
+        tab.value(frame % inner)
+        tab.wait_for(lambda _, tab=tab, name=directive: any(name in text for text in tab.errors))
 
 
 def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_path):
