@@ -61,7 +61,6 @@ def test_a_page_is_opened_played_measured_and_exported(own_pages, new_tab, tmp_p
     assert "play or pause" in tab.text
     tab.key("?")
     tab.open(own_pages[page] + "#measure=distance;0,0,0;3,4,0")
-    tab.call("Page.reload")
     tab.wait_for(lambda text: re.search(r"distance\s5.000 m", text))
     check(tab)
 

@@ -263,16 +263,15 @@ def view(
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
-        growing = growing_view(folders[0]) if len(folders) == 1 and not (film or export) else None
-        shown = growing or open_views(folders)
         if film or export:
             from lidarview.viewer.sharing import share
 
             from .terminal import Terminal
 
-            share(shown, film, export, Terminal().writing)
+            share(open_views(folders), film, export, Terminal().writing)
         else:
-            show_view(shown, port=port, browser=not no_browser)
+            growing = growing_view(folders[0]) if len(folders) == 1 else None
+            show_view(growing or open_views(folders), port=port, browser=not no_browser)
 
 
 @click.command()

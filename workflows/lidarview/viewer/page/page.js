@@ -856,8 +856,15 @@ function linkText() {
   return new URLSearchParams(words).toString();
 }
 
+let written = location.hash; // what this page has read or written last
+
+function writeLink(words) {
+  history.replaceState(null, "", `#${words}`);
+  written = location.hash;
+}
+
 async function copyLink() {
-  history.replaceState(null, "", `#${linkText()}`);
+  writeLink(linkText());
   try {
     await navigator.clipboard.writeText(location.href);
     sayBriefly("The link to this view was copied.");
@@ -870,8 +877,9 @@ async function copyLink() {
 let linked = "";
 function keepLink() {
   if (playing || lost || state.live || document.documentElement.classList.contains("plain")) return;
+  if (location.hash !== written) return; // another link was entered, with which the page loads again
   const words = linkText();
-  if (words !== linked && linked) history.replaceState(null, "", `#${words}`);
+  if (words !== linked && linked) writeLink(words);
   linked = words;
 }
 
