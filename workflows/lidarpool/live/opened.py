@@ -19,6 +19,7 @@ from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_res
 from ..datasets.dataset import INDEX_FILE
 from .downloads import downloads
 
+_TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
 _HEADER_BYTES = 1 << 16  # of a .ply, in which its elements are named
 
 
@@ -83,8 +84,10 @@ def _recorded(path: Path, title: str) -> View:
     try:
         return recorded_view(open_sensors(path), title, downloads())
     except UnknownFormatError as error:
+        trajectory = "name a trajectory in a scenario, as trajectory: FILE, or "
+        advice = trajectory if path.suffix.lower() in _TRAJECTORIES else error.advice
         raise LidarError(
-            f"{path} is not read: {error.advice}give a result, data set, cloud, recording, "
+            f"{path} is not read: {advice}give a result, data set, cloud, recording, "
             "scenario or mesh of a format that lidarpool view --help names."
         ) from error
 

@@ -77,8 +77,6 @@ _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
     ".rrd": "it is a recording of Rerun, open it with the command rerun",
     ".osi": "it is a trace of OSI, name it as the traffic of a scenario",
-    ".tum": "it is a trajectory, name it as the trajectory of a scenario",
-    **dict.fromkeys((".csv", ".txt"), "name a trajectory in a scenario, as trajectory: FILE"),
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
 }
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
