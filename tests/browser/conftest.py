@@ -9,14 +9,24 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from tests.drives import the_scene, the_sweeps, write_set
+from tests.spirals import WET, spiral, spiral_view
 from websockets.sync.client import connect
+
+from lidarpool.datasets.job_table import JobRow
+from lidarpool.live.downloads import downloads
+from lidarpool.live.job_list import JobList
+from lidarpool.live.live_page import LivePage, live_page
+from lidarpool.run.progress import Progress
+from lidarview.viewer.server import page_server
+from lidarview.viewer.sharing import page_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Pictures are drawn by the processor, and nothing is asked of the network on its own account.
@@ -85,9 +95,29 @@ class Tab:
         self.call("Page.navigate", url=url)
 
     def value(self, script: str):
-        """Value of an expression of JavaScript."""
-        told = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        """Value of an expression of JavaScript, or of its promise."""
+        told = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         return told["result"].get("value")
+
+    def resize(self, width: int, height: int = 720, *, mobile: bool = False) -> None:
+        """Set the size of the window, pixels."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+
+    def prefer(self, scheme: str) -> None:
+        """Prefer light or dark pages."""
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.call("Emulation.setEmulatedMedia", features=[feature])
+
+    def watch_policy(self) -> None:
+        """Note what the content policies of the pages opened from now on refuse."""
+        listener = (
+            "window.refused = []; addEventListener('securitypolicyviolation', (event) =>"
+            " refused.push(`${event.effectiveDirective} ${event.blockedURI} ${event.sourceFile}`));"
+        )
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=listener)
 
     @property
     def text(self) -> str:
@@ -205,3 +235,60 @@ def new_tab(chromium):
     for tab, name in tabs:
         tab.close()
         urllib.request.urlopen(f"http://{chromium.host}/json/close/{name}", timeout=120).close()
+
+
+@pytest.fixture(scope="session")
+def own_pages(tmp_path_factory):
+    """Serve one page of each kind, {name: address}: of a result, of jobs, live, and exported."""
+    folder = tmp_path_factory.mktemp("pages")
+    view = replace(spiral_view(spiral(folder / "cloud.ply", WET)), note="A note of its own.")
+    (folder / "page.html").write_bytes(page_of(view))
+    scene = the_scene()
+    write_set(folder / "set", "kitti", scene, the_sweeps(scene))
+    view.downloads = downloads()
+    with ExitStack() as stack:
+        jobs = JobList(folder / "set")
+        pages = {
+            "result": stack.enter_context(page_server(view.answer, 0)),
+            "jobs": stack.enter_context(page_server(jobs.answer, 0, index="jobs.html")),
+            "live": stack.enter_context(page_server(survey_under_way(view), 0)),
+            "campaign": stack.enter_context(campaign_under_way()),
+        }
+        urls = {name: page.url for name, page in pages.items()}
+        frame = {"job in a frame": f"{urls['jobs']}job/1/?plain"}
+        yield urls | frame | {"exported": (folder / "page.html").as_uri()}
+
+
+def survey_under_way(view):
+    """Return what a view answers while its survey goes on."""
+    live = LivePage(1, (), "a survey")
+    live.on_progress(Progress(12.0, 360, 300, 200, 150, 100, 20_000), lambda: [])
+
+    def answer(question, arguments, abandoned):
+        if question == "news":
+            versions = {"rays_version": 1, "hits_version": 1, "version": 0, "ends": 0, "path": None}
+            return live.answer("jobs", {}, abandoned)[0] | versions | {"time": 0.5}, {
+                "rays": view.rays
+            }
+        header, arrays = view.answer(question, arguments, abandoned)
+        return (
+            header | {"live": True, "sampled": False} if question == "state" else header
+        ), arrays
+
+    return answer
+
+
+@contextmanager
+def campaign_under_way():
+    """Serve the live page of a campaign with jobs that are done, failed and under way."""
+    with live_page(9, ("height_m", "rain_mm_h"), "Heights", port=0, browser=False) as live:
+        for number in range(5):
+            values = {"height_m": 1.5 + number, "rain_mm_h": number}
+            error = "The mesh wall.obj has no faces: give another." if number == 3 else ""
+            live.ended(JobRow(number, f"{number:02}", "", values, error, 36, 1, 900, 800, 700, 1.5))
+        under_way = [
+            {"name": "05", "writing": False, "stored": 9, "scans": 36, "points": 90, "number": 5,
+             "seconds": 1.0, "values": {"height_m": 6.5, "rain_mm_h": 5}, "opens": False}
+        ]  # fmt: skip
+        live.on_progress(Progress(seconds=20.0, jobs=9, jobs_done=5), lambda: under_way)
+        yield live.page

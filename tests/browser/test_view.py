@@ -1,20 +1,22 @@
 """A finished result, looked at, played and measured in a browser."""
 
 import re
+import threading
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.spirals import COUNT, WET, spiral, spiral_view
 
-from lidarpool import Column, Scene, Sensor, Survey, Track
+from lidarpool import Scene, Sensor, Survey, Track
 from lidarpool.live.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.ply_format import header, row_type
-from lidarsim.columns.table import OBJECT, SCAN, TABLE
+from lidarsim.columns.ply_format import header
+from lidarsim.columns.table import OBJECT, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
-from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import page_of
@@ -22,23 +24,7 @@ from lidarview.viewer.view import View, open_results
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-COUNT = 30_000
-SCANS = 360
 PICTURE = "lidarpool.picture"
-WET = Column("wetness", "float32", "%", "how wet it is", source="wetness")
-
-
-def spiral(path, column):
-    """Write a file with a spiral of 30,000 points in 360 scans, and a column from 0 to 100."""
-    turn = np.linspace(0, 20 * np.pi, COUNT)
-    rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, column)))
-    rows[column.name] = np.linspace(0, 100, COUNT)
-    rows["x"] = 9 * np.cos(turn)
-    rows["y"] = 9 * np.sin(turn)
-    rows["z"] = turn / 8
-    rows["scan"] = np.arange(COUNT) * SCANS // COUNT
-    path.write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
-    return path
 
 
 @pytest.fixture
@@ -48,20 +34,7 @@ def cloud(tmp_path):
 
 @pytest.fixture
 def view(cloud):
-    """Return the view of a spiral that a sensor scans in ten turns, while a box drives along x."""
-    track = Track([0, 1], [[-9, 0, 8], [9, 0, 8]])
-    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
-    scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
-    poses = Track([0, 2], [[0, -9, 4], [0, 9, 4.0]])
-    survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
-    hits = np.zeros(scene.triangles, np.int64)
-    rays = np.zeros((0, 2, 3), np.float32)
-    pictured = PictureContent(
-        scene, sensor_positions(survey), hits, rays, duration_ns=survey.duration_ns
-    )
-    sweeps = Sweeps.from_survey(survey, scene)
-    assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
-    return View(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
+    return spiral_view(cloud)
 
 
 @pytest.fixture
@@ -611,12 +584,38 @@ def colourful(picture):
     return int((part.max(axis=2) - part.min(axis=2) > 60).sum())
 
 
-def test_no_page_of_another_server_frames_it(served, view, new_tab):
-    with page_server(view.answer, port=0) as other:
-        tab = opened(new_tab, other)
-        frame = "Object.assign(document.createElement('iframe'), {src: '" + served.url + "'})"
-        tab.value(f"document.body.append({frame})")
-        tab.wait_for(lambda _: any("frame-ancestors" in error for error in tab.errors))
+class Foreign(BaseHTTPRequestHandler):
+    """Serve an empty page without a content policy."""
+
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<!doctype html><body>")
+
+    def log_message(self, *_):
+        """Log nothing."""
+
+
+@pytest.fixture
+def foreign_page():
+    """Serve a page of another server; return its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+
+
+def test_no_page_of_another_server_frames_it_and_it_frames_no_other(served, foreign_page, new_tab):
+    frame = "document.body.append(Object.assign(document.createElement('iframe'), {src: '%s'}))"
+    for outer, inner, directive in (
+        (foreign_page, served.url, "frame-ancestors"),
+        (served.url, foreign_page, "frame-src"),
+    ):
+        tab = new_tab(outer)
+        tab.wait_for(lambda _, tab=tab: tab.value("document.readyState") == "complete")
+        tab.value(frame % inner)
+        tab.wait_for(lambda _, tab=tab, name=directive: any(name in text for text in tab.errors))
 
 
 def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_path):

@@ -1,6 +1,7 @@
 """The viewer opens whatever lidarpool reads or writes: exports, recordings, meshes, scenarios."""
 
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,9 @@ from lidarpool.cli.result_commands import view as view_command
 from lidarpool.export.formats import Format
 from lidarpool.live import recorded
 from lidarpool.live.job_list import JobList
-from lidarpool.live.opened import is_data_set, open_view, open_views
+from lidarpool.live.opened import growing_view, is_data_set, open_view, open_views
+from lidarpool.recordings import bag_poses
+from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box
 from lidarsim.simulator.batch import columns_of
@@ -36,7 +39,8 @@ FORMATS = (
     "las", "laz", "parquet", "pcd", "images", "e57", "kitti", "nuscenes", "webdataset", "mcap",
     "rosbag2",
 )  # fmt: skip
-IN_AXES = ("mcap", "rosbag2")  # whose points are in the axes of their sensor
+BAGS = ("mcap", "rosbag2")
+UNCOMPENSATED = ("pcd", *BAGS)  # points are where the sensor was at the start of the sweep
 CLOUDS = ("las", "laz", "parquet")  # without sweeps
 COLUMNS = ["ray", "range", "intensity", "reflectivity", "class", "time", "normal_x", "normal_y"]
 
@@ -85,19 +89,16 @@ def test_each_format_is_opened_at_its_place_with_its_sweeps(exported, name):
         assert "first of 2 sequences" in state["note"]
     else:
         assert len(view.points) == len(cloud)
-    assert name in ("kitti", "nuscenes", "e57", *IN_AXES) or {"intensity", "normal_z"} <= names
+    assert name in ("kitti", "nuscenes", "e57", *BAGS) or {"intensity", "normal_z"} <= names
     if name in CLOUDS:
         assert view.sweeps is None and not state["note"]
     else:
         assert len(view.sweeps) == 3 * sensors and len(sweeps) == 6
-    if name in IN_AXES:
-        assert state["by_sweep"] and IN_SENSOR_AXES in state["note"]
-        return
     if name == "kitti":  # whose poses start at the first of each sequence
         return
     found = np.stack([view.points.values(axis, slice(None)) for axis in "xyz"], axis=1)
     expected = np.asarray(cloud)
-    tolerance_m = 2 if name == "pcd" else 2e-3  # the motion during a sweep is not compensated
+    tolerance_m = 2 if name in UNCOMPENSATED else 2e-3
     for axis in range(3):  # the order of sweeps of one time differs
         a, b = np.sort(found[:, axis]), np.sort(expected[:, axis])
         np.testing.assert_allclose(a, b, atol=tolerance_m)
@@ -128,6 +129,43 @@ def test_a_sweep_alone_and_what_is_too_much_for_memory(exported, monkeypatch):
     assert len(open_view(folder / "cloud.las").points) == pytest.approx(len(cloud) / 3, abs=2)
     note = state_of(open_view(folder / "pcd"))["note"]
     assert "of 6 sweeps are shown" in note
+
+
+def growth_of(view):
+    """Wait until all points of a growing view are read; return its last answer."""
+    deadline = time.monotonic() + 60
+    while True:
+        growth, _ = view.answer("growth", {}, bool)
+        if growth["complete"] or growth["error"]:
+            return growth
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz"])
+def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypatch, name, tmp_path):
+    folder, cloud, _ = exported
+    assert growing_view(folder / name) is None, "it is small"
+    assert growing_view(folder / "cloud.e57") is None
+    monkeypatch.setattr(recorded, "LARGE_POINTS", 1000)
+    monkeypatch.setattr(recorded, "_SAMPLE_POINTS", 4000)
+    view = growing_view(folder / name)
+    state = state_of(view)
+    assert state["growing"] and state["points"] == len(cloud) and not state["exports"]
+    assert f"all {len(cloud):,} points are read meanwhile" in state["note"]
+    asked = {"colour": "z", "most": "100000"}
+    assert view.answer("points", asked, bool)[0]["count"] == 4000
+    assert growth_of(view) == {"complete": True, "error": ""}
+    grown = state_of(view)
+    assert "growing" not in grown and grown["version"] > state["version"]
+    assert grown["exports"] and not grown["note"]
+    assert view.answer("points", asked, bool)[0]["count"] == len(cloud)
+    content = (folder / name).read_bytes()
+    (tmp_path / name).write_bytes(content)
+    view = growing_view(tmp_path / name)
+    (tmp_path / name).write_bytes(content[: len(content) // 2])
+    view.answer("points", asked, bool)
+    assert "is broken or cut short" in growth_of(view)["error"]
 
 
 def test_files_of_other_programs(tmp_path):
@@ -185,22 +223,47 @@ keep: kitti
 
 
 def test_a_mesh_in_a_ply_is_no_cloud(tmp_path, exported):
-    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
+    text = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
         f"property float {axis}\n" for axis in "xyz"
     )
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (tmp_path / "mesh.ply").write_text(header + faces + "0 0 0\n4 0 0\n0 4 0\n3 0 1 2\n")
+    (tmp_path / "mesh.ply").write_text(text + faces + "0 0 0\n4 0 0\n0 4 0\n3 0 1 2\n")
     assert open_view(tmp_path / "mesh.ply").preview
     save_cloud(exported[1], tmp_path / "cloud.ply")
     assert not open_view(tmp_path / "cloud.ply").preview
 
 
-def test_several_files_of_different_formats_are_one_view(exported):
+@pytest.mark.parametrize("name", BAGS)
+def test_sweeps_of_a_bag_are_where_its_frames_say(exported, name, monkeypatch):
+    folder, _, sweeps = exported
+    view = open_view(folder / Format(name).row.file)
+    assert not state_of(view)["by_sweep"] and not state_of(view)["note"]
+    for number, sensor in enumerate(("roof", "nose")):
+        assert view.sweeps.sensors[number] == f"/{sensor}/points"
+        of_sensor = view.sweeps.sensor == number
+        expected = sweeps.pose.positions[sweeps.sensor == sweeps.sensors.index(sensor)]
+        np.testing.assert_allclose(view.sweeps.pose.positions[of_sensor], expected, atol=1e-4)
+    monkeypatch.setattr(bag_poses, "_MAX_DISTANCE_NS", -1)  # no pose is near enough
+    state = state_of(open_view(folder / Format(name).row.file))
+    assert state["by_sweep"] and IN_SENSOR_AXES in state["note"]
+
+
+def test_several_files_of_different_formats_are_one_view(exported, monkeypatch):
     folder, cloud, _ = exported
     view = open_views([folder / "cloud.las", folder / "nuscenes"])
     assert len(view.points) == 2 * len(cloud) and view.results == ["cloud.las", "nuscenes"]
+    monkeypatch.setattr(bag_poses, "_MAX_DISTANCE_NS", -1)
     with pytest.raises(LidarError, match=r"cloud.mcap has points in the axes of its sensors"):
         open_views([folder / "cloud.las", folder / "cloud.mcap"])
+
+
+def test_a_robot_is_previewed_as_it_is_scanned(tmp_path):
+    (tmp_path / "arm.urdf").write_text(
+        """<robot name="arm"><link name="base"><visual><geometry><box size="1 1 1"/></geometry>
+        </visual></link></robot>"""
+    )
+    view = open_view(tmp_path / "arm.urdf")
+    assert view.preview and view.pictured.scene.names == ("arm/base",) and len(view.points) > 100
 
 
 def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
@@ -213,14 +276,29 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     (tmp_path / "cut.e57").write_bytes(b"123")
     (tmp_path / "notes.txt").write_text("none")
     (tmp_path / "empty").mkdir()
+    for name in ("run.rrd", "gt.osi"):
+        (tmp_path / name).write_bytes(b"RRF2")
+    mcap = (folder / "cloud.mcap").read_bytes()
+    (tmp_path / "osi.mcap").write_bytes(mcap.replace(b"ros2", b"osi2", 1))
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    (tmp_path / "none.ply").write_bytes(header(np.dtype(kinds), 0))
+    (tmp_path / "robot.xacro").write_text("<robot/>")
+    shutil.copytree(folder / "nuscenes", tmp_path / "lost")
+    next((tmp_path / "lost" / "samples").rglob("*.bin")).unlink()
     for name, words in (
         ("cut", "poses.txt has 1 rows for 3 files"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),
         ("cut.e57", "cut.e57"),
-        ("notes.txt", "is not read: give the folder of a result"),
-        ("empty", "is not read: give the folder of a result"),
+        ("notes.txt", "is not read: name a trajectory in a scenario, as trajectory: FILE, or give"),
+        ("empty", "is not read: give a result, data set, cloud, recording, scenario or mesh"),
+        ("run.rrd", "is not read: it is a recording of Rerun, open it with the command rerun, or"),
+        ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
+        ("osi.mcap", "osi.mcap: it has no messages of ROS 2: record PointCloud2, or, if it is a "),
+        ("none.ply", "none.ply has no points"),
+        ("robot.xacro", "expand it first"),
+        ("lost", r"lost cannot be read: No such file or directory, .*lost/samples/.*bin"),
         ("none.las", "does not exist"),
     ):
         with pytest.raises(LidarError, match=words) as raised:

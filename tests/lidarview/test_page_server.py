@@ -140,7 +140,10 @@ def test_other_pages_frame_it_in_notebooks_only_and_learn_no_address(monkeypatch
             with urllib.request.urlopen(page.url + what, timeout=120) as answer:
                 allowed = answer.headers["Content-Security-Policy"]
                 assert answer.headers["Referrer-Policy"] == "no-referrer"
-            assert allowed == (None if in_notebook else "frame-ancestors 'self'")
+                assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            assert allowed.startswith("default-src 'none'; script-src 'self'; style-src 'self'; ")
+            assert "unsafe" not in allowed
+            assert ("frame-ancestors 'self'" in allowed) != in_notebook
 
 
 def test_an_answer_that_nobody_waits_for_is_given_up(served):

@@ -243,13 +243,10 @@ def view(
     """  # noqa: D301 - click wants the character, not its name
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
     from lidarview.picture_file import PICTURE_FILE
-    from lidarview.viewer.sharing import share
     from lidarview.viewer.view import CLOUD, show_view
 
     from ..export.folder import local_result
-    from ..live.job_list import JobList, show_jobs
-    from ..live.opened import is_data_set, open_views
-    from .terminal import Terminal
+    from ..live.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
         raise LidarError("--film and --export take one result: give them one after the other.")
@@ -259,16 +256,22 @@ def view(
                 f"{data_sets[0]} is a data set of many jobs: view it alone, without --film and "
                 "--export."
             )
+        from ..live.job_list import JobList, show_jobs
+
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
-        shown = open_views(folders)
         if film or export:
-            share(shown, film, export, Terminal().writing)
+            from lidarview.viewer.sharing import share
+
+            from .terminal import Terminal
+
+            share(open_views(folders), film, export, Terminal().writing)
         else:
-            show_view(shown, port=port, browser=not no_browser)
+            growing = growing_view(folders[0]) if len(folders) == 1 else None
+            show_view(growing or open_views(folders), port=port, browser=not no_browser)
 
 
 @click.command()

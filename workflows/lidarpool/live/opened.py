@@ -9,20 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
-from lidarview.viewer.view import CLOUD, View, join_views, open_result
+from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_result
 
 from ..datasets.dataset import INDEX_FILE
-from ..recordings.recordings import open_sensors
-from ..run.store.database import FILE
-from ..run.store.run_store import RUN_FOLDER
 from .downloads import downloads
-from .preview import scenario_view
-from .recorded import recorded_view
 
+_TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
 _HEADER_BYTES = 1 << 16  # of a .ply, in which its elements are named
 
 
@@ -54,22 +51,69 @@ def open_view(path: Path) -> View:
         raise LidarError(f"{path} does not exist: give a result, a cloud, a mesh or a scenario.")
     title = f"{path.resolve().name} - lidarpool"
     if path.is_dir():
-        refuse_unfinished(path)
         if (path / CLOUD).exists():
             return open_result(path, downloads())
-        return recorded_view(open_sensors(path), title, downloads())
+        refuse_unfinished(path)
+        return _recorded(path, title)
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml"):
-        return scenario_view(path)
+        return _preview(path)
     if suffix == ".ply" and not _has_faces(path):
         try:
-            return open_result(path, downloads())
+            view = open_result(path, downloads())
         except LidarError:  # text, or of another program
-            return recorded_view(open_sensors(path), title, downloads())
+            return _recorded(path, title)
+        if not len(view.points):
+            raise LidarError(f"{path} has no points.")
+        return view
     mesh_format = format_of(path)
-    if mesh_format is not None and not mesh_format.advice:
-        return scenario_view(path)
-    return recorded_view(open_sensors(path), title, downloads())
+    if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice):
+        return _preview(path)
+    return _recorded(path, title)
+
+
+# Modules of recordings, scenarios and runs are imported only when they are needed: the first points
+# of a result are shown two seconds earlier.
+
+
+def _recorded(path: Path, title: str) -> View:
+    """Return the view of a recording."""
+    from ..recordings.recordings import UnknownFormatError, open_sensors
+    from .recorded import recorded_view
+
+    try:
+        return recorded_view(open_sensors(path), title, downloads())
+    except UnknownFormatError as error:
+        trajectory = "name a trajectory in a scenario, as trajectory: FILE, or "
+        advice = trajectory if path.suffix.lower() in _TRAJECTORIES else error.advice
+        raise LidarError(
+            f"{path} is not read: {advice}give a result, data set, cloud, recording, "
+            "scenario or mesh of a format that lidarpool view --help names."
+        ) from error
+
+
+def growing_view(path: Path) -> GrowingView | None:
+    """Return the view of a sample of a large .las or .laz, until all its points are read.
+
+    None for other files and folders. LidarError if the file cannot be read.
+    """
+    if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
+        return None
+    from ..recordings.recordings import open_recording
+    from .recorded import LARGE_POINTS, sampled_view
+
+    recording = open_recording(path)
+    if recording.sample is None or (recording.point_count or 0) < LARGE_POINTS:
+        return None
+    sampled = sampled_view(recording, f"{path.resolve().name} - lidarpool")
+    return GrowingView(sampled, recording.point_count or 0, lambda: open_view(path))
+
+
+def _preview(path: Path) -> View:
+    """Return the view of a scenario or mesh before its run."""
+    from .preview import scenario_view
+
+    return scenario_view(path)
 
 
 def _has_faces(path: Path) -> bool:
@@ -82,6 +126,9 @@ def _has_faces(path: Path) -> bool:
 
 def refuse_unfinished(path: Path) -> None:
     """Raise a LidarError if a folder holds an unfinished run and no cloud."""
+    from ..run.store.database import FILE
+    from ..run.store.run_store import RUN_FOLDER
+
     if not (path / CLOUD).exists() and (path / RUN_FOLDER / FILE).exists():
         raise LidarError(
             f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "

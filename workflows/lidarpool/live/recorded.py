@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +22,8 @@ from lidarview.viewer.view import Downloads, View
 from ..recordings.recordings import Recording
 
 MAX_POINTS = 20_000_000  # of a recording, in memory
+LARGE_POINTS = 2_000_000  # of a cloud, of which a sample is shown while it is read
+_SAMPLE_POINTS = 200_000
 _SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
 _RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
 _NAMES = {"classification": "class", "label": "class", "NormalX": "normal_x", "NormalY": "normal_y"}
@@ -42,33 +44,49 @@ class Pieces:
     positions: list[Floats] = field(default_factory=list)
     columns: list[Mapping[str, AnyArray]] = field(default_factory=list)
     count: int = 0
+    _used: set[str] = field(default_factory=set)  # columns with other values than zeros
 
     def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
         """Add points at finite positions (n, 3); columns are those of a number for each point."""
+        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        arrays = {
+            name: values
+            for name, values in arrays.items()
+            if values.shape == (len(positions),) and values.dtype.kind in "biuf"
+        }
         valid = np.asarray(np.isfinite(positions).all(axis=1))
-        self.positions.append(positions[valid])
-        self.columns.append(
-            {
-                name: np.asarray(values)[valid]
-                for name, values in columns.items()
-                if np.shape(values) == (len(valid),) and np.asarray(values).dtype.kind in "biuf"
-            }
-        )
-        self.count += int(valid.sum())
+        if not valid.all():
+            positions = positions[valid]
+            arrays = {name: values[valid] for name, values in arrays.items()}
+        self.positions.append(positions)
+        self.columns.append(arrays)
+        self.count += len(positions)
+        self._used |= {
+            name for name in arrays.keys() - self._used if arrays[name].any()
+        }  # zeros take long to be looked at, and are not joined
 
     def cloud(self, **columns: AnyArray) -> Cloud:
         """Join the points with the columns that all pieces have, and further columns."""
         if not self.positions:
             return Cloud(np.zeros((0, 3)), columns)
-        shared = [name for name in self.columns[0] if all(name in piece for piece in self.columns)]
-        joined = {name: np.concatenate([piece[name] for piece in self.columns]) for name in shared}
-        joined = _with_known_names(joined) | columns
+        shared = set.intersection(*({*piece} for piece in self.columns))
+        joined = {
+            name: np.concatenate([piece[name] for piece in self.columns])
+            for name in self.columns[0]
+            if name in shared & self._used
+        }
+        joined = _with_known_names(joined, shared) | columns
         custom = tuple(_described(name, array) for name, array in joined.items())
         return Cloud(np.concatenate(self.positions), joined, custom)
 
 
-def _with_known_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return columns by the names of lidarpool, without coordinates and columns of zeros."""
+def _with_known_names(
+    columns: Mapping[str, AnyArray], all_names: Collection[str]
+) -> dict[str, AnyArray]:
+    """Return columns by the names of lidarpool, without coordinates.
+
+    `all_names` are the names in the recording, also of columns that are left out.
+    """
     named: dict[str, AnyArray] = {}
     for name, values in columns.items():
         if name == "rgb":  # of PCL: bytes in the bits of a float
@@ -79,8 +97,8 @@ def _with_known_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
         known_name = "channel" if name in _RINGS else _NAMES.get(name, name)
         known_name = re.sub(r"\W", "_", known_name)
         known_name = known_name if known_name.isidentifier() else f"_{known_name}"
-        is_new = known_name not in columns or known_name == name
-        if known_name.lower() not in "xyz" and is_new and values.any():
+        is_new = known_name not in all_names or known_name == name
+        if known_name.lower() not in "xyz" and is_new:
             # Bytes in the order of this machine; True and False as numbers.
             kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
             named[known_name] = values.astype(kind.newbyteorder("="))
@@ -120,6 +138,19 @@ def recorded_view(
     )
 
 
+def sampled_view(recording: Recording, title: str) -> View:
+    """Return the view of an even sample of a cloud that has `Recording.sample`, within a second."""
+    pieces = Pieces()
+    assert recording.sample is not None
+    with reading(recording.name):
+        positions, columns, _ = recording.sample(_SAMPLE_POINTS)
+        pieces.add(positions * recording.metres, columns)
+    names = {"class": ASPRS_CLASSES}
+    return View(
+        OrderedPoints(pieces.cloud()), note=" ".join(recording.notes), title=title, names=names
+    )
+
+
 def _cloud_of(recording: Recording) -> Cloud:
     """Read a cloud, of which one point in a few is taken if it is large."""
     total = recording.point_count or 0
@@ -128,8 +159,11 @@ def _cloud_of(recording: Recording) -> Cloud:
     for number in range(recording.count):
         with reading(recording.name):
             positions, columns, _ = recording.read(number)
-            thinned = {name: np.asarray(values)[::step] for name, values in columns.items()}
-            pieces.add(np.asarray(positions, np.float64)[::step] * recording.metres, thinned)
+            positions = np.asarray(positions, np.float64)[::step]
+            if recording.metres != (1.0, 1.0, 1.0):
+                positions = positions * recording.metres
+            columns = {name: np.asarray(values)[::step] for name, values in columns.items()}
+            pieces.add(positions, columns)
     return pieces.cloud()
 
 
@@ -166,9 +200,14 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     recordings = [*sensors.values()]
     ordered, is_timed = _order(recordings)
     pieces = Pieces()
+    frame_poses = [_frame_poses(recording) for recording in recordings]
+    if any(sensor_poses is None for sensor_poses in frame_poses):
+        frame_poses = [None] * len(recordings)  # sensors without a pose fit no others
     poses: list[Floats | None] = []
     for sweep in ordered:
-        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number))
+        sensor_poses = frame_poses[sweep.sensor]
+        pose = None if sensor_poses is None else sensor_poses[sweep.number]
+        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number, pose))
         if pieces.count > MAX_POINTS:
             break
     notes = []
@@ -181,10 +220,24 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     return cloud, recorded_sweeps(ordered[: len(poses)], poses, [*sensors]), notes
 
 
-def _add_sweep(pieces: Pieces, recording: Recording, number: int) -> Floats | None:
-    """Read a sweep into the world frame, if its pose is known; return the pose."""
+def _frame_poses(recording: Recording) -> Floats | None:
+    """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
+    if recording.frame_poses is None:
+        return None
+    with reading(recording.name):
+        return recording.frame_poses()
+
+
+def _add_sweep(
+    pieces: Pieces, recording: Recording, number: int, frame_pose: Floats | None
+) -> Floats | None:
+    """Read a sweep into the world frame, if its pose is known; return the pose.
+
+    `frame_pose` is the pose of a sweep that has none of its own.
+    """
     with reading(recording.name):
         positions, columns, pose = recording.read(number)
+        pose = frame_pose if pose is None else pose
         local = np.asarray(positions, np.float64) * recording.metres
     is_return = local.any(axis=1)  # drivers write zeros for pulses without a return
     local = local[is_return]

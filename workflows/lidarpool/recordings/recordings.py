@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from ..base.fingerprint import fingerprint
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
+from .bag_poses import sweep_poses
 from .sweep_files import (
     Columns,
     Read,
@@ -52,6 +53,9 @@ from .sweep_files import (
     open_parquet,
     open_webdataset,
 )
+
+if TYPE_CHECKING:
+    from laspy import LasReader
 
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .bin of KITTI, "
@@ -71,12 +75,27 @@ _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
+    ".rrd": "it is a recording of Rerun, open it with the command rerun",
+    ".osi": "it is a trace of OSI, name it as the traffic of a scenario",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
 }
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
 
+# A sample of a .las consists of this many runs of points, which begin where chunks of a .laz begin:
+# 50,000 points each, unless a program chooses otherwise.
+_SAMPLE_RUNS = 40
+_LAZ_CHUNK = 50_000
+
 Metres = tuple[float, float, float]  # of the units of x, y and z
 _METRES: Metres = (1.0, 1.0, 1.0)
+
+
+class UnknownFormatError(LidarError):
+    """The format of a file or folder is not read; `advice` is a clause, or empty."""
+
+    def __init__(self, name: str, advice: str) -> None:
+        super().__init__(f"{name} is not read: {advice}give {KINDS}.")
+        self.advice = advice
 
 
 class SeveralSensorsError(LidarError):
@@ -138,6 +157,10 @@ class Recording:
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
+    sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
+    # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
+    # None if they are unknown; None if the recording has no frames.
+    frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
 
     def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
@@ -251,7 +274,7 @@ def _open_path(
         return recording
     suffix = path.suffix.lower()
     advice = f"{_CONVERSIONS[suffix]}, or " if suffix in _CONVERSIONS else ""
-    raise LidarError(f"{name} is not read: {advice}give {KINDS}.")
+    raise UnknownFormatError(name, advice)
 
 
 def _open_folder(
@@ -479,19 +502,40 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
             metres = units.factors
             notes = [f"{name} {note}" for note in [units.note()] if note]
 
-    def read(number: int) -> Read:
-        chunk_points = min(CHUNK_POINTS, count - number * CHUNK_POINTS)
-        with open_las(path) as reader:
-            reader.seek(number * CHUNK_POINTS)
-            points = reader.read_points(chunk_points)
-        if len(points) != chunk_points:
+    def read_run(reader: LasReader, start: int, length: int) -> Read:
+        reader.seek(start)
+        points = reader.read_points(length)
+        if len(points) != length:
             raise ValueError(f"{count:,} points announced, and there are fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
         return np.stack([points.x, points.y, points.z], axis=1), columns, None
 
+    def read(number: int) -> Read:
+        start = number * CHUNK_POINTS
+        with open_las(path) as reader:
+            return read_run(reader, start, min(CHUNK_POINTS, count - start))
+
+    def sample(max_points: int) -> Read:
+        length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
+        starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
+        with open_las(path) as reader:
+            runs = [read_run(reader, int(start), length) for start in starts]
+        columns = {name: np.concatenate([run[1][name] for run in runs]) for name in runs[0][1]}
+        return np.concatenate([run[0] for run in runs]), columns, None
+
     parts = -(-count // CHUNK_POINTS)
     metres = metres or _METRES
-    return Recording(name, parts, read, intensity, True, count, notes=tuple(notes), metres=metres)
+    return Recording(
+        name,
+        parts,
+        read,
+        intensity,
+        True,
+        count,
+        notes=tuple(notes),
+        metres=metres,
+        sample=sample,
+    )
 
 
 def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -> Recording:
@@ -522,7 +566,18 @@ def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -
     def times() -> Iterator[float]:
         return (time for _, time, _ in messages())
 
-    return _open_stream(name, messages, points, intensity, connection.msgcount, times=times)
+    def frame_poses() -> Floats | None:
+        return sweep_poses(path, (data for _, _, data in messages()))
+
+    return _open_stream(
+        name,
+        messages,
+        points,
+        intensity,
+        connection.msgcount,
+        times=times,
+        frame_poses=frame_poses,
+    )
 
 
 def _open_ouster(path: Path, name: str, sensor: str | None, intensity: str | None) -> Recording:

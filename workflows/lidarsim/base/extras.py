@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from .errors import LidarError, explained, prefixed
+from .errors import LidarError, prefixed
 from .words import printable
 
 
@@ -30,10 +30,13 @@ def need(package: str, extra: str, purpose: str) -> None:
 def reading(name: str) -> Iterator[None]:
     """Turn the errors of a library that reads a file into a LidarError of a line."""
     try:
-        with explained(f"{name} cannot be read"), prefixed(name):
+        with prefixed(name):
             yield
     except LidarError:
         raise
+    except OSError as error:
+        file = "" if error.filename in (None, name) else f", {error.filename}"
+        raise LidarError(f"{name} cannot be read: {error.strerror or error}{file}.") from error
     except Exception as error:  # libraries raise errors of any class
         reason = printable(str(error).partition("\n")[0]) or type(error).__name__
         raise LidarError(f"{name} is broken or cut short ({reason}).") from error

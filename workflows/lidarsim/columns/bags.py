@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ..base.arrays import AnyArray
+from ..base.errors import LidarError
 from ..base.extras import need, reading
 from ..base.input_files import input_size
 
@@ -56,14 +57,22 @@ def is_bag(path: Path) -> bool:
 def open_bag(path: Path, name: str) -> Reader:
     """Open a bag; LidarError, which begins with `name`, if that is impossible."""
     need("rosbags", "ros", f"{name} is read")
-    from rosbags.rosbag2 import Reader
+    from rosbags.rosbag2 import Reader, ReaderError
 
     with reading(name):
         for file in path.iterdir() if path.is_dir() else [path]:
             if not file.is_dir():
                 input_size(file)
-        bag = Reader(path)
-        bag.open()
+        try:
+            bag = Reader(path)
+            bag.open()
+        except ReaderError as error:
+            if "Profile is not ros2" not in str(error):
+                raise
+            raise LidarError(
+                "it has no messages of ROS 2: record PointCloud2, or, if it is a trace of OSI, "
+                "name it as the traffic of a scenario."
+            ) from error
     return bag
 
 

@@ -52,6 +52,15 @@ STALL_S = 20.0  # without a byte that the browser reads; then its connection is 
 _ALIGNED = 8  # bytes, that arrays begin at multiples of
 _PIECE = 1 << 20  # bytes that are written at a time
 
+# What a page may load: files and answers of this server, and pictures and downloads that the page
+# itself makes. No inline script, style or handler of events is allowed. A list of jobs frames the
+# viewers of its jobs.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'"
+)
+_FRAMES = "; frame-ancestors 'self'"  # pages that may frame a page
+
 _LOGGER = logging.getLogger(__name__)
 
 Arguments = Mapping[str, str]
@@ -134,10 +143,10 @@ class _Guarded(RequestHandler):
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
         self.set_header("Referrer-Policy", "no-referrer")  # the address holds the token
-        # The page of a campaign frames the pages of its jobs. The cell of a notebook, whose address
-        # is unknown here, frames any page.
-        if not self.settings["in_notebook"]:
-            self.set_header("Content-Security-Policy", "frame-ancestors 'self'")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        # The cell of a notebook, whose address is unknown here, may frame any page.
+        policy = POLICY if self.settings["in_notebook"] else POLICY + _FRAMES
+        self.set_header("Content-Security-Policy", policy)
 
     def prepare(self) -> None:
         """Answer 404 without the token, and redirect an address of single use to the page."""

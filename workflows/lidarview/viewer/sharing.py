@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
-import json
+import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from itertools import pairwise, repeat
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,11 @@ _PAGE_TRIANGLES = 60_000
 _SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
 _CELLS = 300  # along the diagonal of the points, in which their density is counted
 
+# Statements of modules. `_IMPORT` has the names and the file, `_EXPORT` the name.
+_IMPORT = re.compile(r'^import (\{[^}]*\}|\* as \w+) from "\./([\w.]+)";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?:async function|function|const|class) (\w+)", re.MULTILINE)
+_EXPORT_LIST = re.compile(r"\bexport\{([^}]*)\};?\s*$")
+
 
 def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
     """Show no progress."""
@@ -67,6 +74,8 @@ def share(
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
+        if file and not file.parent.is_dir():  # films take seconds to draw
+            raise LidarError(f"{file} cannot be written: there is no folder {file.parent}.")
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
         raise LidarError("There are no points to show: rays hit nothing.")
     if view.note:
@@ -224,20 +233,63 @@ def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
 
 
 def _page_with_modules() -> str:
-    """Return the viewer's page with its styles and modules inside."""
+    """Return the viewer's page with its styles and modules inside, and a policy that allows these.
+
+    Scripts and styles are allowed by their hashes; whatever else a page might load is refused.
+    """
     folder = files(__package__) / "page"
-    modules: dict[str, str] = {}
     page = (folder / VIEWER).read_text("utf-8")
-    for file in folder.iterdir():
-        text = file.read_text("utf-8")
-        link = f'<link rel="stylesheet" href="{file.name}">'
-        page = page.replace(link, f"<style>\n{text}</style>")
-        if file.name.endswith(".js"):  # modules in data: cannot name others by their paths
-            code = base64.b64encode(text.replace('from "./', 'from "').encode()).decode()
-            modules[file.name] = f"data:text/javascript;base64,{code}"
-    inside = f'<script type="importmap">{json.dumps({"imports": modules}, sort_keys=True)}</script>'
-    inside += '\n<script type="module">import "page.js";</script>'
-    return page.replace('<script type="module" src="page.js"></script>', inside)
+    styles: list[str] = []
+    for name in re.findall(r'<link rel="stylesheet" href="([\w.]+)">', page):
+        styles.append(f"\n{(folder / name).read_text('utf-8')}")
+        page = page.replace(
+            f'<link rel="stylesheet" href="{name}">', f"<style>{styles[-1]}</style>"
+        )
+    script = f"\n{joined_modules(folder, 'page.js')}"
+    page = page.replace(
+        '<script type="module" src="page.js"></script>', f'<script type="module">{script}</script>'
+    )
+    policy = (
+        f"default-src 'none'; script-src {_hash_source(script)}; "
+        f"style-src {' '.join(map(_hash_source, styles))}; img-src data: blob:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    charset = '<meta charset="utf-8">\n'
+    meta = f'{charset}<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+    return page.replace(charset, meta)
+
+
+def _hash_source(text: str) -> str:
+    """Return the source of a content policy that allows an inline script or style."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
+def joined_modules(folder: Traversable, name: str) -> str:
+    """Join a module of JavaScript and the modules that it imports into a single script.
+
+    Each module becomes a function that returns its exports. A page in one file cannot import: a
+    content policy allows inline scripts by hash, but modules in addresses only as a whole.
+    """
+    modules: dict[str, str] = {}  # {file: script}, imported modules first
+
+    def add(name: str) -> None:
+        text = (folder / name).read_text("utf-8")
+        for _, imported in _IMPORT.findall(text):
+            if imported not in modules:
+                add(imported)
+        exports = _EXPORT.findall(text)
+        for names in _EXPORT_LIST.findall(text):  # of a minified module, "a as Name"
+            pairs = (entry.strip().partition(" as ") for entry in names.split(","))
+            exports += [f"{exported or local}: {local}" for local, _, exported in pairs]
+        text = _IMPORT.sub(r'const \1 = modules["\2"];', text).replace("const * as ", "const ")
+        text = _EXPORT_LIST.sub("", _EXPORT.sub(lambda match: match[0][len("export ") :], text))
+        modules[name] = (
+            f'modules["{name}"] = (() => {{\n{text}\nreturn {{ {", ".join(exports)} }};\n}})();\n'
+        )
+
+    add(name)
+    return "const modules = {};\n" + "".join(modules.values())
 
 
 def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:

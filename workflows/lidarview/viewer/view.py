@@ -889,10 +889,62 @@ def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
 
 
+class GrowingView:
+    """A view of a sample of points, which a view of all points replaces once these are read.
+
+    `read` returns the view of all points; a thread calls it after the first points of the sample
+    are answered. `total` is the number of all points.
+    """
+
+    def __init__(self, sample: View, total: int, read: Callable[[], View]) -> None:
+        self.total = total
+        self.note = sample.note
+        self._view = sample
+        self._read = read
+        self._complete = False
+        self._error = ""
+        self._reading: threading.Thread | None = None
+        self._lock = threading.Lock()
+
+    def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Answer a question of the page, see `View.answer`; "growth" is whether all are read."""
+        if question == "growth":
+            return {"complete": self._complete, "error": self._error}, {}
+        is_sample = not self._complete
+        header, arrays = self._view.answer(question, arguments, abandoned)
+        if question == "state" and is_sample:
+            note = f"{self.note} A sample; all {self.total:,} points are read meanwhile.".strip()
+            header |= {"growing": True, "points": self.total, "note": note, "exports": []}
+        if question == "points":
+            self._start()
+        return header, arrays
+
+    def _start(self) -> None:
+        """Start to read all points, once."""
+        with self._lock:
+            if self._reading is None:
+                self._reading = threading.Thread(target=self._grow, name="reading", daemon=True)
+                self._reading.start()
+
+    def _grow(self) -> None:
+        """Read all points, and replace the sample."""
+        try:
+            view = self._read()
+        except LidarError as error:
+            self._error = str(error)
+            return
+        view.version += self._view.version
+        self._view = view
+        self._complete = True
+
+
 @contextmanager
-def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
+def result_page(
+    view: View | GrowingView, *, port: int = PORT, browser: bool = True
+) -> Iterator[PageServer]:
     """Serve the page of a result while the body runs, and announce its address."""
-    shows = f"shows {plural(len(view.points), 'point')}"
+    count = view.total if isinstance(view, GrowingView) else len(view.points)
+    shows = f"shows {plural(count, 'point')}"
     shows += "" if cell_display() else "; Ctrl-C ends it"
     with (
         page_server(view.answer, port) as page,
@@ -909,7 +961,7 @@ def wait_for_interrupt(stopped: Event | None = None) -> None:
             pass
 
 
-def show_view(view: View, *, port: int, browser: bool = True) -> None:
+def show_view(view: View | GrowingView, *, port: int, browser: bool = True) -> None:
     """Show a view in the browser until Ctrl-C."""
     if view.note:
         click.echo(f"note: {view.note}", err=True)

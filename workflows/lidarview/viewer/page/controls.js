@@ -34,9 +34,15 @@ const ICONS = {
   theme: '<circle cx="8" cy="8" r="5.5"/><path class="full" d="M8 2.5a5.5 5.5 0 0 1 0 11z"/>',
 };
 
+// Names a control that has no text, for the mouse and for screen readers.
+export function explain(control, title) {
+  control.title = title;
+  control.setAttribute("aria-label", title);
+}
+
 export function iconButton(icon, title, act) {
-  const made = element("button", { type: "button", className: "icon", title, onclick: act });
-  made.setAttribute("aria-label", title);
+  const made = element("button", { type: "button", className: "icon", onclick: act });
+  explain(made, title);
   setIcon(made, icon);
   return made;
 }

@@ -116,6 +116,15 @@ function showCloud(newest) {
 
 // -- news --------------------------------------------------------------------------------
 
+// The page's content policy refuses styles in text, but not those that a script sets.
+function showCharts(svg) {
+  $("charts").innerHTML = svg.replaceAll(' style="', ' data-style="');
+  for (const styled of $("charts").querySelectorAll("[data-style]")) {
+    styled.style.cssText = styled.dataset.style;
+    delete styled.dataset.style;
+  }
+}
+
 let charts = 0;
 async function show(told) {
   isStill = Boolean(told.still);
@@ -124,7 +133,7 @@ async function show(told) {
   showCloud(told.newest);
   if (told.charts !== charts) {
     charts = told.charts;
-    $("charts").innerHTML = (await ask("charts")).svg;
+    showCharts((await ask("charts")).svg);
   }
 }
 

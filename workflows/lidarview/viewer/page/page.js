@@ -1,6 +1,6 @@
 // The page: what is asked of the server, the controls, and the time that is played.
 import { ask } from "./ask.js";
-import { button, dual, element, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
+import { button, dual, element, explain, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
 import { count, follow, replace, slots, stop } from "./run.js";
 
@@ -283,7 +283,7 @@ function tellFacts() {
   if (count < state.points) parts.push(`of ${n(state.points)}`);
   if (drawn < count && chosen.colour !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
   panel.facts.innerHTML = parts.join(" ");
-  if (requests.detail || requests.base || (underWay.size && !playing)) panel.facts.append(" …");
+  if (requests.detail || requests.base || state.growing || (underWay.size && !playing)) panel.facts.append(" …");
 }
 
 function setLimits(name, limits) {
@@ -666,14 +666,14 @@ function buildTime() {
   if (!timed) return;
   clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
   clock.show = menu("", SHOWS.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
-  clock.show.title = "Points that are shown";
+  explain(clock.show, "Points that are shown");
   clock.slider = element("input", { type: "range", min: 0, max: duration(), step: "any", value: chosen.time, title: "Time" });
   clock.slider.setAttribute("aria-label", "time, seconds");
   clock.slider.oninput = () => { leaveAll(); setTime(+clock.slider.value); };
   clock.ticks = element("canvas");
   clock.now = element("span", { className: "now" });
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
-  clock.speed.title = "Speed; 1× is as fast as the survey";
+  explain(clock.speed, "Speed; 1× is as fast as the survey");
   clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
   clock.follow = button("Follow", () => setFollow(!chosen.follow));
   clock.follow.title = "Move the camera with the carrier";
@@ -859,8 +859,15 @@ function linkText() {
   return new URLSearchParams(words).toString();
 }
 
+let written = location.hash; // what this page has read or written last
+
+function writeLink(words) {
+  history.replaceState(null, "", `#${words}`);
+  written = location.hash;
+}
+
 async function copyLink() {
-  history.replaceState(null, "", `#${linkText()}`);
+  writeLink(linkText());
   try {
     await navigator.clipboard.writeText(location.href);
     sayBriefly("The link to this view was copied.");
@@ -873,8 +880,9 @@ async function copyLink() {
 let linked = "";
 function keepLink() {
   if (playing || lost || state.live || document.documentElement.classList.contains("plain")) return;
+  if (location.hash !== written) return; // another link was entered, with which the page loads again
   const words = linkText();
-  if (words !== linked && linked) history.replaceState(null, "", `#${words}`);
+  if (words !== linked && linked) writeLink(words);
   linked = words;
 }
 
@@ -1002,6 +1010,17 @@ async function news(told) {
     refresh();
     await loadSurface();
   }
+}
+
+// Of a large file, a sample is shown first: waits for all points, and takes them.
+async function grow() {
+  const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error }) => all || error);
+  if (told.error) return say(told.error, true);
+  takeState(await ask("state"));
+  buildPanel();
+  legendText = "";
+  shownKey = null;
+  refresh();
 }
 
 function tellRun(told) {
@@ -1145,6 +1164,7 @@ async function begin() {
     });
   }
   refresh();
+  if (state.growing) grow().catch(failed);
   showImages();
   await loadSurface();
 }
