@@ -18,6 +18,10 @@ import pytest
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# A test that hangs fails after this many seconds, and the others are run. As an option of
+# pyproject.toml the limit would stop `--strict-config` where pytest-timeout is not installed.
+os.environ.setdefault("PYTEST_TIMEOUT", "900")
+
 # What tests start imports what they do.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
 
