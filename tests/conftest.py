@@ -25,6 +25,10 @@ os.environ.setdefault("PYTEST_TIMEOUT", "900")
 # What tests start imports what they do.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
 
+# Threads of OpenBLAS wait for the next product of matrices by turning in a loop, which takes ten
+# times the product from the other processes of `make test`. Read when NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Tests keep dozens of Dask processes, most of them idle; each watches itself for 4 % of a core.
 # And a worker that is forked costs a tenth of one that imports Dask anew. Set before Dask is
 # imported, here and in every process that is started from here.

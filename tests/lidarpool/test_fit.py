@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
+from tests.rows import quick
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.fit import Estimate, _with_performance
@@ -33,6 +34,7 @@ def fitted(recording):
     return fit(recording)
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_was_put_in():
     """Ten trials in a street; figures that are not determined are rare."""
     held = []
@@ -354,7 +356,7 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("where", quick(("street", "forest"), PLACES))
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
     """Two recordings of a place each; fidelity.md has 40."""
     for number in (PLACES.index(where), PLACES.index(where) + 4):

@@ -150,7 +150,6 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_the_program_of_the_overview_runs_as_a_script(tmp_path):
     """It starts processes, each of which imports it."""
     script = tmp_path / "example.py"
