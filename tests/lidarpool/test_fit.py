@@ -82,13 +82,13 @@ def test_noise_by_energy_is_in_the_file(tmp_path):
         assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
 
 
-def test_a_model_keeps_what_the_recording_does_not_tell():
-    flat = fit(recorded(NOISE), model="ouster/os1-64")
+def test_a_model_keeps_what_the_recording_does_not_tell(recording):
+    flat = fit(recording, model="ouster/os1-64")
     stated = flat.model.performance
     assert stated.detection.range_m == 90 and stated.precision is None
     assert flat.model.firings_per_turn == 1024
     assert "note: the recorded rings are not those of Livox Mid-40: check --model" in repr(
-        fit(recorded(NOISE), model="mid40")
+        fit(recording, model="mid40")
     )
 
 
