@@ -246,6 +246,7 @@ def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
         assert np.array_equal(values, clouds[1].columns[name]), name
 
 
+@pytest.mark.every_nth(3)
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
 def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):
