@@ -1,5 +1,6 @@
 """What all tests start from."""
 
+import gc
 import logging
 import os
 import signal
@@ -12,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+# With Python's threshold, collections of garbage take a tenth of the time of all imports.
+gc.set_threshold(50_000)
 
 # A shell starts jobs in the background with interrupts ignored, and whatever they start inherits
 # that: programs that tests interrupt would not notice.
@@ -91,6 +95,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if counts[test] % mark.args[0]:
                 item.add_marker(pytest.mark.slow)
             counts[test] += 1
+
+
+def pytest_collection_finish() -> None:
+    """Exclude modules and tests, which last as long as the process, from collections of garbage."""
+    gc.freeze()
 
 
 _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
