@@ -1,5 +1,6 @@
 """What all tests start from."""
 
+import gc
 import logging
 import os
 import signal
@@ -13,13 +14,24 @@ from typing import Any
 
 import pytest
 
+# With Python's threshold, collections of garbage take a tenth of the time of all imports.
+gc.set_threshold(50_000)
+
 # A shell starts jobs in the background with interrupts ignored, and whatever they start inherits
 # that: programs that tests interrupt would not notice.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# A test that hangs fails after this many seconds, and the others are run. As an option of
+# pyproject.toml the limit would stop `--strict-config` where pytest-timeout is not installed.
+os.environ.setdefault("PYTEST_TIMEOUT", "900")
+
 # What tests start imports what they do.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+
+# Threads of OpenBLAS wait for the next product of matrices by turning in a loop, which takes ten
+# times the product from the other processes of `make test`. Read when NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Tests keep dozens of Dask processes, most of them idle; each watches itself for 4 % of a core.
 # And a worker that is forked costs a tenth of one that imports Dask anew. Set before Dask is
@@ -83,6 +95,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if counts[test] % mark.args[0]:
                 item.add_marker(pytest.mark.slow)
             counts[test] += 1
+
+
+def pytest_collection_finish() -> None:
+    """Exclude modules and tests, which last as long as the process, from collections of garbage."""
+    gc.freeze()
 
 
 _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

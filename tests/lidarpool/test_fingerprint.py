@@ -191,7 +191,7 @@ print(fingerprint(survey.sensor, survey.path, survey.columns, GAIN, NAMES))
 
 def test_another_process_finds_the_same():
     found = set()
-    for seed in ("1", "2", "3"):
+    for seed in ("1", "2"):
         environment = os.environ | {"PYTHONHASHSEED": seed}
         command = [sys.executable, "-c", SCRIPT]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

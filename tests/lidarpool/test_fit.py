@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
+from tests.rows import quick
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.fit import Estimate, _with_performance
@@ -33,6 +34,7 @@ def fitted(recording):
     return fit(recording)
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_was_put_in():
     """Ten trials in a street; figures that are not determined are rare."""
     held = []
@@ -80,13 +82,13 @@ def test_noise_by_energy_is_in_the_file(tmp_path):
         assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
 
 
-def test_a_model_keeps_what_the_recording_does_not_tell():
-    flat = fit(recorded(NOISE), model="ouster/os1-64")
+def test_a_model_keeps_what_the_recording_does_not_tell(recording):
+    flat = fit(recording, model="ouster/os1-64")
     stated = flat.model.performance
     assert stated.detection.range_m == 90 and stated.precision is None
     assert flat.model.firings_per_turn == 1024
     assert "note: the recorded rings are not those of Livox Mid-40: check --model" in repr(
-        fit(recorded(NOISE), model="mid40")
+        fit(recording, model="mid40")
     )
 
 
@@ -354,7 +356,7 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("where", quick(("street", "forest"), PLACES))
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
     """Two recordings of a place each; fidelity.md has 40."""
     for number in (PLACES.index(where), PLACES.index(where) + 4):

@@ -519,6 +519,12 @@ def flown(head, carried=None, **options):
     return survey, cloud_of(survey, GROUND)
 
 
+@cache
+def flown_alone(head):
+    """Return a survey of two flight lines by one scanner, and its points."""
+    return flown(head)
+
+
 def read_las(cloud, path):
     save_cloud(cloud, path)
     return laspy.read(path)
@@ -539,7 +545,7 @@ def across_deg(survey, positions, time_ns):
 @pytest.mark.parametrize("head", AIRBORNE)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, coordinates):
-    survey, cloud = flown(head)
+    survey, cloud = flown_alone(head)
     exact = read_las(cloud, tmp_path / "a.laz")
     time = np.asarray(exact["time"])
     angles = across_deg(survey, np.asarray(exact.xyz), time)
@@ -557,7 +563,7 @@ def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, 
 @pytest.mark.parametrize("chunk", [700, 1_000_000])
 @pytest.mark.parametrize(("head", "lines_s"), [("sine", 80), ("polygon", 50)])
 def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, lines_s, chunk):
-    _, cloud = flown(head)
+    _, cloud = flown_alone(head)
     chunks = type(cloud).chunks
     monkeypatch.setattr(type(cloud), "chunks", lambda self, *_: chunks(self, chunk))
     las = read_las(cloud, tmp_path / "a.laz")
@@ -577,7 +583,7 @@ def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, 
 
 
 def test_flight_lines_and_sensors_are_sources(tmp_path):
-    _, cloud = flown("sine")
+    _, cloud = flown_alone("sine")
     las = read_las(cloud, tmp_path / "a.laz")
     time = np.asarray(las["time"])
     assert set(las.point_source_id) == {1, 2}

@@ -97,7 +97,7 @@ LONG.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0
     [
         (creation.torus(1, 0.3), 100_000, 300_000),
         (creation.box((2, 1.2, 0.005)), 100_000, 300_000),
-        (LONG, 40_000, 5_000_000),
+        pytest.param(LONG, 40_000, 5_000_000, marks=pytest.mark.slow),
     ],
     ids=["torus", "plate", "rod"],
 )

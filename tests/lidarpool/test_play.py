@@ -83,12 +83,11 @@ def test_a_loop_goes_on_in_time_until_ctrl_c(kept, tmp_path):
     assert shifts_ns[3:] == pytest.approx([150e6, 150e6], rel=1e-3)
 
 
-def test_a_result_gives_the_points_of_its_scenario(tmp_path):
+def test_a_result_gives_the_points_of_its_scenario(cluster, tmp_path):
     scenario = tmp_path / "s.yaml"
     scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
-    outcome = CliRunner().invoke(
-        cli, ["run", str(scenario), "--out", str(tmp_path / "out"), "--no-plan", "--only", "cloud"]
-    )
+    options = ["--out", str(tmp_path / "out"), "--no-plan", "--only", "cloud"]
+    outcome = CliRunner().invoke(cli, ["run", str(scenario), *options, "--scheduler", cluster])
     assert outcome.exit_code == 0, outcome.output
     with open_source(tmp_path / "out") as recorded, open_source(scenario, Kept.format) as cast:
         for (sweep, points), (same_sweep, same_points) in zip(recorded, cast, strict=True):

@@ -225,6 +225,7 @@ def test_slow_and_malformed_clients_do_not_matter(bridge, played, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 @needs_foxglove
 def test_ctrl_c_ends_a_loop_with_its_server(tmp_path):
     write_scenario(tmp_path)

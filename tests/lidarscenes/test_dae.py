@@ -126,7 +126,8 @@ def test_polygons_with_holes_and_not_convex(tmp_path):
     assert area([corner]) == pytest.approx(6)
 
 
-def test_nodes_of_a_library_stand_where_they_are_named(tmp_path):
+def test_nodes_of_a_library_stand_where_they_are_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarsim.scene.files.scene_graph.MAX_NODES", 2_000)
     here = '<instance_node url="#k{}"/>'
     nodes = "".join(f'<node id="k{i + 1}">{here.format(i) * 2}</node>' for i in range(3))
     nodes += f'<node id="k0">{HERE}</node>'

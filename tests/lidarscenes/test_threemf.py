@@ -166,6 +166,7 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
     ],
     ids=str,
 )
-def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
+def test_what_cannot_be_read_says_what_it_is(tmp_path, monkeypatch, parts, message):
+    monkeypatch.setattr("lidarsim.scene.files.scene_graph.MAX_NODES", 2_000)
     with pytest.raises(LidarError, match=message):
         load(tmp_path, **parts)

@@ -237,7 +237,7 @@ def sprayed(actor, meshes=(NOTHING,), backend="numpy", sensor=None, **options):
 
 def test_numbers_of_returns_from_spray():
     """Two boxes of a tenth of a second behind the car, 2 m wide, are crossed in one of them."""
-    count = 50_000
+    count = 25_000
     found = sprayed(car(), sensor=beams(count))
     assert (found["cause"] == SPRAY).all() and (found["object"] == -1).all()
     kind = spray(200.0)

@@ -134,7 +134,7 @@ def test_dirt_shortens_the_range_of_detection():
 def test_dirt_is_before_all_light(waveform):
     """With sub-rays, rain and echoes: returns of the air are weaker, too."""
     survey = replace(
-        STANDING, returns=Returns("all", 7, 3, waveform=waveform), rain_mm_h=30, steps=10,
+        STANDING, returns=Returns("all", 7, 3, waveform=waveform), rain_mm_h=30, steps=3,
         noise=Noise(detection_range_m=90), columns=(*COLUMNS, "cause"),
     )  # fmt: skip
     clear = cast(survey)

@@ -64,7 +64,8 @@ def test_a_node_with_several_parents_stands_in_each_also_below_a_camera(tmp_path
     assert [mesh.vertices[:, 0].min() for mesh in meshes] == [0, 2, 4, 6]
 
 
-def test_nodes_that_contain_each_other_end(tmp_path):
+def test_nodes_that_contain_each_other_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarsim.scene.files.scene_graph.MAX_NODES", 2_000)
     header = triangle()
     header["nodes"] = [{"mesh": 0, "children": [1]}, {"children": [0]}]
     with pytest.raises(LidarError, match="contain each other"):

@@ -104,15 +104,9 @@ def same(one: Cloud, other: Cloud):
     return True
 
 
-@pytest.mark.parametrize(
-    ("moves", "physics"),
-    [
-        (False, {}),
-        (True, {}),
-        (True, PHYSICS),
-        pytest.param(False, PHYSICS, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.every_nth(3)
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["", "physics"])
+@pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_sweep_has_the_bytes_of_a_survey(scene, name, moves, physics):
     given = SENSORS[name]

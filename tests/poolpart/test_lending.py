@@ -493,12 +493,12 @@ def grow_tree(channel, name, level):
     return len(futures)
 
 
-LEVELS = 7
+LEVELS = 6
 
 
 @pytest.fixture(params=[Queue, Pipe])
 def tree(request):
-    """Grow a tree of 255 tasks in a partition, whose messages go through queues or pipes."""
+    """Grow a tree of 127 tasks in a partition, whose messages go through queues or pipes."""
 
     def grow(client):
         channel = request.param

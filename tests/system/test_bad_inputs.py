@@ -306,17 +306,24 @@ ANOTHER_PYTHON = "import platform; platform.python_version = lambda: '3.99.1'"
 OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345678'"
 
 
-def test_workers_whose_lidarpool_is_not_ours(outside, place, refused):
-    cluster = outside()
-    for preload, says in (
-        (WITHOUT_LIDARPOOL, "does not have lidarpool: install lidarpool"),
+@pytest.mark.parametrize(
+    ("preload", "message"),
+    [
+        pytest.param(
+            WITHOUT_LIDARPOOL,
+            "does not have lidarpool: install lidarpool",
+            marks=pytest.mark.slow,
+        ),
         (OTHER_SOURCES, "(sources 12345678), here it is"),
-        (ANOTHER_PYTHON, "has Python 3.99.1, here it is"),
-    ):
-        worker = cluster.add(("GPU", 1), preload=preload)
-        cluster.wait()
-        refused(["run", "good.yaml", "--scheduler", cluster.address], says)
-        cluster.kill(worker)
+        pytest.param(ANOTHER_PYTHON, "has Python 3.99.1, here it is", marks=pytest.mark.slow),
+    ],
+    ids=["none", "other sources", "another Python"],
+)
+def test_workers_whose_lidarpool_is_not_ours(outside, place, refused, preload, message):
+    cluster = outside()
+    cluster.add(("GPU", 1), preload=preload)
+    cluster.wait()
+    refused(["run", "good.yaml", "--scheduler", cluster.address], message)
 
 
 def test_a_run_without_open3d_ends_before_it_starts(place, refused, monkeypatch):

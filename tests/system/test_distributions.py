@@ -243,7 +243,7 @@ class Environment:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.sample if name == "lidarsim" else ())
+        pytest.param(name, marks=pytest.mark.sample if name == "poolpart" else ())
         for name in DISTRIBUTIONS
     ],
 )

@@ -138,7 +138,7 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
     columns = {"scan": one, "channel": one, "object": one}
     save_cloud(Cloud(np.ones((1, 3), np.float32), columns), folder / "cloud.ply")
     script = tmp_path / "example.py"
-    fewer = block.code.replace("trials=100", "trials=4")  # all are in `make sample`
+    fewer = block.code.replace("trials=100", "trials=4")  # all are in `make slow`
     script.write_text(fewer, encoding="utf-8")
     runpy.run_path(str(script), run_name="__main__")
     printed = capsys.readouterr().out.splitlines()
@@ -150,7 +150,6 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_the_program_of_the_overview_runs_as_a_script(tmp_path):
     """It starts processes, each of which imports it."""
     script = tmp_path / "example.py"

@@ -566,16 +566,16 @@ def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
 
 
-def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path):
+@pytest.mark.parametrize("moment", quick(("finish",), ("write_table", "finish")))
+def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path, moment):
     out = tmp_path / "ds"
     merge(parts[:2], out, partial=True)
     table = Storage.at(out)
     seconds = {row.number: row.seconds for row in read_table(table)}
-    for moment in ("write_table", "finish"):
-        killed(out, parts[2:], (moment, 1))
-        merge(parts[2:], out)
-        assert json.loads((out / "report.json").read_text())["notes"] == []
-        assert seconds == {r.number: r.seconds for r in read_table(table) if r.number in seconds}
+    killed(out, parts[2:], (moment, 1))
+    merge(parts[2:], out)
+    assert json.loads((out / "report.json").read_text())["notes"] == []
+    assert seconds == {r.number: r.seconds for r in read_table(table) if r.number in seconds}
 
 
 # -- surveys --------------------------------------------------------------------------------------

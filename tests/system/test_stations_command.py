@@ -38,7 +38,7 @@ def hall(tmp_path):
 
 def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     arguments = ("stations", "hall.yaml", "--sensor", "vlp16", "--coverage", "90%")
-    arguments += ("--slant", "85", "--spacing", "1")
+    arguments += ("--slant", "85", "--spacing", "1.5")
     outcome = lidarpool(*arguments)
     assert outcome.code == 0, outcome.err
     assert outcome.out.endswith(

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 SCENARIO = "poses: [[0, 0, 1]]\nplanning: {enabled: false}\ncloud: {keep_every: 5}\n"
 EVERYTHING_ELSE = """
 import sys
@@ -36,6 +38,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_what_writes_no_ply_does_without_it(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text(SCENARIO)
     made = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster)
