@@ -289,7 +289,10 @@ def test_a_port_of_the_interface_that_is_in_use_is_refused(tmp_path):
     assert f"cannot listen at {address} (Address already in use)" in str(outcome.exception)
 
 
-def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(receiver, tmp_path):
+def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(
+    receiver, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("lidarpool.playback.sources.casting_threads", lambda: 1)
     (tmp_path / "s.yaml").write_text(VLP16)
     to = f"127.0.0.1:{port_of(receiver)}"
     outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--to", to, "--rate", "1000")

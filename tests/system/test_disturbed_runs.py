@@ -60,7 +60,7 @@ def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     )  # or all would be under way
 
     def on_frame(frame: ScanFrame) -> None:
-        if frame.scan == 60:
+        if frame.scan == 10:
             gpu = [a for a, w in worker_identities(client).items() if "GPU" in w["resources"]]
             client.retire_workers(gpu, close_workers=True, remove=True)
 

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import about
-from ..base.elementary import sin_cos
+from ..base.elementary import arcsin, arctan2, sin_cos
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.validation import checked, checked_fields
@@ -120,11 +120,11 @@ class Sensor:
         first, stop = self._revolution_firings()
         firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
         x, y, z = self.directions(firings).reshape(-1, 3).T
-        azimuths = np.sort(np.degrees(np.arctan2(y, x)))
+        azimuths = np.sort(np.degrees(arctan2(y, x)))
         # All around, less the widest gap between neighbours.
         gaps = np.diff(azimuths, append=azimuths[0] + 360)
         width = 360.0 if gaps.max() < MAX_GAP_DEG else 360.0 - float(gaps.max())
-        elevations = np.degrees(np.arcsin(np.clip(z, -1, 1)))
+        elevations = np.degrees(arcsin(np.clip(z, -1, 1)))
         return f"{width:.4g}°, {elevations.min():.3g}° to {elevations.max():.3g}°"
 
     def _rate(self) -> str:
