@@ -43,6 +43,7 @@ from lidarpool.playback.sources import open_source, scenario_job
 from lidarsim.columns.cloud import Cloud
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
+from lidarsim.simulator.batch import columns_of
 from lidarsim.sweeps.instruments import IMU_FILE, Instrument
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
@@ -292,6 +293,11 @@ def test_a_port_of_the_interface_that_is_in_use_is_refused(tmp_path):
 def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(
     receiver, tmp_path, monkeypatch
 ):
+    def columns_of_slow_cast(batches):
+        time.sleep(0.2)
+        return columns_of(batches)
+
+    monkeypatch.setattr("lidarpool.playback.sources.columns_of", columns_of_slow_cast)
     monkeypatch.setattr("lidarpool.playback.sources.casting_threads", lambda: 1)
     (tmp_path / "s.yaml").write_text(VLP16)
     to = f"127.0.0.1:{port_of(receiver)}"
