@@ -71,6 +71,7 @@ def measure(
         returns=Returns(subrays=7),
         noise=Noise(range_m=0.02, detection_range_m=100.0),
         rain_mm_h=10.0,
+        threads=1,  # sweeps are cast beside each other
     )
     first, *others = packets.encoder.ports.values()
     ports = [port, *(port + other - first for other in others)]
