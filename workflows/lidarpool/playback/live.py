@@ -23,7 +23,7 @@ from ..base.fork_server import keep_freed_memory
 from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 
-_AHEAD = 4  # sweeps that each thread casts before they are due, of a trajectory that is known
+_AHEAD = 16  # sweeps that are cast before they are due, of a trajectory that is known
 _START_NS = 20e6  # from the start of the schedule to the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
 Rate = Annotated[float, Field(ge=0.001, le=1000)]
@@ -48,7 +48,8 @@ def play(
     Parameters
     ----------
     scanner
-        The scanner, with the columns of `Packets`.
+        The scanner, with the columns of `Packets`. Sweeps of a pose or trajectory are cast beside
+        each other, one on each core: ``threads=1`` is fastest then.
     trajectory
         Pose of a static sensor; trajectory of a moving sensor, at whose end this function returns;
         or a function that returns the pose, or trajectory, of the sweep that starts at a time,
@@ -101,8 +102,7 @@ def play(
             clouds = (task() for task in sweeps)
             _send_all(packets, clouds, Schedule(rate), transmitter, ready, note)
         else:
-            threads = casting_threads()
-            with MadeAhead(sweeps, _AHEAD * threads, threads) as made_ahead:
+            with MadeAhead(sweeps, _AHEAD, casting_threads()) as made_ahead:
                 _send_all(packets, iter(made_ahead), Schedule(rate), transmitter, ready, note)
         transmitter.sender.finish()
     return transmitter.sender.lateness

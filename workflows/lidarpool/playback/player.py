@@ -14,8 +14,8 @@ from .bridge import Bridge
 from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
 from .sources import Played
 
-# Sweeps that are cast before they are due, for each sensor and thread.
-AHEAD = 4
+# Sweeps that are cast before they are due, for each sensor: processors may be busy for a second.
+AHEAD = 16
 # From the start of the schedule to the first sweep, for what the bridge does before.
 _START_NS = 100e6
 _ShiftedSweep = tuple[int, Cloud, int]  # number, points, shift of times in nanoseconds
@@ -38,8 +38,7 @@ def play_sweeps(
     """
     late_sweeps = 0
     sensors = len(played.sweeps.sensors)
-    ahead = AHEAD * sensors * played.threads
-    with MadeAhead(_laps(played, loop=loop), ahead, played.threads) as made_ahead:
+    with MadeAhead(_laps(played, loop=loop), AHEAD * sensors, played.threads) as made_ahead:
         sweeps = iter(made_ahead)
         first = list(islice(sweeps, sensors))
         for sweep, points, _ in first:

@@ -16,6 +16,7 @@ Item = TypeVar("Item")
 _CHECK_S = 0.1
 # How late a sweep may be before the user reads that casting falls behind, seconds.
 BEHIND_S = 0.005
+_MAX_THREADS = 8  # sweeps in memory are bounded as well
 BEHIND = (
     "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
     "(--rate)."
@@ -23,14 +24,14 @@ BEHIND = (
 
 
 def casting_threads() -> int:
-    """Return how many sweeps are cast at the same time: as many as this process may use cores.
+    """Return how many sweeps are cast at the same time: one on each core of this process, up to 8.
 
     The threads of a single cast share only its rays; steps on their hits, a half of the time, would
     use one core.
     """
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    known = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+    return min(cores, _MAX_THREADS)
 
 
 class Schedule:

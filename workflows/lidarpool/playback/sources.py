@@ -149,7 +149,7 @@ def _cast(job: Job, stack: ExitStack) -> Played:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
         write_instruments(folder, survey, job.scene.origin)
         sweeps = replace(sweeps, instruments=replace(sweeps.instruments, folder=folder))
-    rig = Rig(job.scene, survey)
+    rig = Rig(job.scene, survey, threads=1)  # sweeps are cast beside each other
     table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
     origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
 
