@@ -1,4 +1,4 @@
-"""Views of recordings and clouds of other programs, which are held in memory."""
+"""Views of recordings and clouds of other programs, held in memory."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ASPRS_CLASSES = (
 
 @dataclass(eq=False)
 class Pieces:
-    """Points of sweeps, or of parts of a cloud, that are in memory."""
+    """Points of sweeps, or of parts of a cloud, in memory."""
 
     positions: list[Floats] = field(default_factory=list)
     columns: list[Mapping[str, AnyArray]] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Pieces:
     _used: set[str] = field(default_factory=set)  # columns with other values than zeros
 
     def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
-        """Add points at finite positions (n, 3); columns are those of a number for each point."""
+        """Add points at finite positions (n, 3), with the columns of a number for each point."""
         arrays = {name: np.asarray(values) for name, values in columns.items()}
         arrays = {
             name: values
@@ -126,7 +126,8 @@ def recorded_view(
     first = next(iter(sensors.values()))
     notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
     if first.is_cloud:
-        cloud, sweeps = _cloud_of(first), None
+        cloud = _cloud_of(first)
+        sweeps = None
     else:
         cloud, sweeps, further_notes = _sweeps_of(sensors)
         notes += further_notes
@@ -152,7 +153,7 @@ def sampled_view(recording: Recording, title: str) -> View:
 
 
 def _cloud_of(recording: Recording) -> Cloud:
-    """Read a cloud, of which one point in a few is taken if it is large."""
+    """Read a cloud; of a large cloud, take one point in a few."""
     total = recording.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
     pieces = Pieces()
@@ -177,7 +178,7 @@ class _TimedSweep:
 
 
 def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
-    """Return the sweeps of all sensors in the order of their times, and whether these are known."""
+    """Return the sweeps of all sensors in the order of times, and whether the times are known."""
     sweeps: list[_TimedSweep] = []
     is_timed = True
     for sensor, recording in enumerate(sensors):
@@ -250,7 +251,7 @@ def _add_sweep(
 def recorded_sweeps(
     ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
 ) -> Sweeps:
-    """Return sweeps of one scan each, without actors; `names` are those of the sensors."""
+    """Return sweeps of one scan each, without actors; `names` are the names of the sensors."""
     known = [np.eye(4) if pose is None else pose for pose in poses]
     matrices = np.array(known, np.float64).reshape(-1, 4, 4)
     count = len(ordered)
