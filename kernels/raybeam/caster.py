@@ -14,7 +14,7 @@ from .backend import Backend
 from .crossing import Crossing, Nearest, TimedBodies
 from .device import DeviceHits, DeviceNearest, OtherHits
 from .hits import Counted, Hits, ScanReturns
-from .instances import Instance, Mesh, check_instances, check_transforms, nested_scene
+from .instances import Instance, Mesh, check_instances, check_transforms
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
 from .rays import check_rays
@@ -226,7 +226,7 @@ class RayCaster:
         """The engine, after an update for all instances that have moved."""
         with self._lock:
             if self._moved:
-                self._scene = nested_scene(self._scene.meshes, self._scene.mesh, self._transforms)
+                self._scene = self._scene.moved(self._transforms)
                 self._engine.update_scene(self._scene)
                 self._moved = False
         return self._engine

@@ -18,7 +18,7 @@ from weakref import ref
 import numpy as np
 
 from . import embree_library
-from .arrays import Floats
+from .arrays import AnyArray, Floats
 from .backend import Backend, ClosestHits
 from .crossing import Crossing, Nearest
 from .hits import Part, join_hits
@@ -121,22 +121,19 @@ class EmbreeBackend(Backend):
         self._loops = embree_packets
         self._memory = embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
-        self._meshes = np.zeros(len(scene.meshes), embree_memory.MESH)
-        for record, mesh, corners in zip(self._meshes, scene.meshes, self._corners, strict=True):
-            record["corners"] = corners.ctypes.data
-            if (opacity := mesh.opacity) is not None:
-                record["uv"] = opacity.uv.ctypes.data
-                record["mask"] = opacity.mask.ctypes.data
-                record["mask_height"], record["mask_width"] = opacity.mask.shape
+        self._meshes = self._mesh_records(scene)
         # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
         width = embree_library.packet_width()
         packets = [embree_exact.propose] * min(16 // width, 4)  # unused if a packet is one ray
         single = embree_exact.propose
-        if not (scene.nested or masked):
-            packets = [embree_exact.plain_proposer(width, k) for k in range(len(packets))]
-            single = embree_exact.plain_proposer(1)
+        if not masked:
+            packets = [
+                embree_exact.opaque_proposer(width, number, nested=scene.nested)
+                for number in range(len(packets))
+            ]
+            single = embree_exact.opaque_proposer(1, nested=scene.nested)
         cast = np.zeros(1, embree_memory.CAST)
         cast["scene"] = (self._instances or trees[0]).address
         cast["mesh"] = self._meshes.ctypes.data
@@ -148,9 +145,31 @@ class EmbreeBackend(Backend):
         cast["width"] = width
         cast["coherence"] = _COHERENCE
         cast["index"] = self._index.ctypes.data
+        self._records = self._instance_records(scene)
+        if scene.nested:
+            cast["instances"] = self._records.ctypes.data
         self._trees = trees  # keeps the addresses in the record valid
         self._base = cast
         self.update_scene(scene)
+
+    def _mesh_records(self, scene: Scene) -> AnyArray:
+        """Return a `MESH` record for each mesh of a scene."""
+        records = np.zeros(len(scene.meshes), self._memory.MESH)
+        for record, mesh, corners in zip(records, scene.meshes, self._corners, strict=True):
+            record["corners"] = corners.ctypes.data
+            if (opacity := mesh.opacity) is not None:
+                record["uv"] = opacity.uv.ctypes.data
+                record["mask"] = opacity.mask.ctypes.data
+                record["mask_height"], record["mask_width"] = opacity.mask.shape
+        return records
+
+    def _instance_records(self, scene: Scene) -> AnyArray:
+        """Return an `INSTANCE` record for each instance of a scene, without matrices."""
+        records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
+        first_rows = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
+        records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
+        records["first"] = first_rows[scene.mesh]
+        return records
 
     def update_scene(self, scene: Scene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
@@ -163,13 +182,7 @@ class EmbreeBackend(Backend):
         base["upper"] = frame.upper
         if self._instances is not None:
             self._instances.update_scene(scene)
-            first = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
-            records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
-            records["matrix"] = scene.matrices
-            records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
-            records["first"] = first[scene.mesh]
-            self._records = records
-            self._base["instances"] = records.ctypes.data
+            self._records["matrix"] = scene.matrices
 
     def closest(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
@@ -237,14 +250,15 @@ class EmbreeBackend(Backend):
         cast = self._memory.Cast(self._base)
         poses = Poses(position, None, max(len(rays), 1))
         cast.set_beams(rays.directions, origins, poses, 0)
-        self._set_limits(cast, poses, origins, (rays.t_min, rays.t_max))
+        max_origin = 0.0 if origins is None else float(np.abs(origins).max(initial=0))
+        self._set_limits(cast, poses, max_origin, (rays.t_min, rays.t_max))
         return cast
 
     def _scan_cast(self, scan: Scan) -> Cast:
         """Return the `Cast` of a scan; the loops also write the rays to `scan.room`, if any."""
         pattern = scan.pattern
         cast = self._memory.Cast(self._base)
-        max_offset = cast.set_pattern(pattern, scan.poses, scan.first)
+        max_offset = pattern.max_origin + cast.set_pattern(pattern, scan.poses, scan.first)
         if scan.room is not None:
             cast.record["directions_out"] = scan.room[-3:].ctypes.data
             cast.record["ray_count"] = len(scan)
@@ -252,16 +266,15 @@ class EmbreeBackend(Backend):
                 cast.record["origins_out"] = scan.room.ctypes.data
                 if cast.record["shares_origin"]:
                     scan.room[:3] = scan.poses.positions.T
-        self._set_limits(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), max_offset)
+        self._set_limits(cast, scan.poses, max_offset, (scan.t_min, scan.t_max))
         return cast
 
     def _set_limits(
         self,
         cast: Cast,
         poses: Poses,
-        origins: Floats | None,
+        max_offset: float,
         limits: tuple[float, float],
-        max_offset: float = 0.0,
     ) -> None:
         """Write the limits of distances, and whether all rays start near the scene, to a cast.
 
@@ -271,12 +284,11 @@ class EmbreeBackend(Backend):
             The cast, to whose record the limits are written.
         poses
             Poses of the rays, with their motion.
-        origins
-            (n, 3): origins of the beams relative to the sensor, metres; None for no origins.
+        max_offset
+            Upper bound of the components of the vectors from the position of a pose to the starts
+            of its rays, in the axes of the sensor, metres.
         limits
             Closest and farthest distance of a hit, metres.
-        max_offset
-            Largest component of the vectors from a beam's origin to starts of sub-rays, metres.
         """
         motion = poses.motion
         frame = self._scene.frame
@@ -284,8 +296,6 @@ class EmbreeBackend(Backend):
         # Upper bound of the local coordinates of all origins.
         max_coordinate = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
         max_coordinate += 2 * max_offset * frame.scale
-        if origins is not None:
-            max_coordinate += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
             max_delay = np.abs(motion.delays).max(initial=0)
             path = max_delay * np.abs(motion.velocities).max(initial=0)

@@ -93,6 +93,9 @@ _SECOND = field_index("second_candidate")
 _ROUGH_32 = field_index("rough_32")
 _FIRST_32 = field_index("first_32")
 _SECOND_32 = field_index("second_32")
+_FIRST_INSTANCE_32 = field_index("first_instance_32")
+_SECOND_INSTANCE_32 = field_index("second_instance_32")
+_MATRIX = field_index("matrix")
 _T = field_index("t")
 _KEY = field_index("key")
 _SURE = field_index("sure")
@@ -165,6 +168,39 @@ def shear_all(scratch):  # type: ignore[no-untyped-def]
     floats = float64s(scratch)
     for lane in range(LANES):
         store_shear(numbers, floats, lane, scene_ray(floats, lane))
+
+
+@inlined
+def _transform(floats, matrix_row, vector):  # type: ignore[no-untyped-def]
+    """Return the product of a row of a matrix of `matrix` and a vector, without the shift.
+
+    `matrix_row` is the index of the row's first number.
+    """
+    x, y, z = vector
+    k = matrix_row
+    return (floats[k] * x + floats[k + LANES] * y) + floats[k + 2 * LANES] * z
+
+
+@stage
+def _enter_and_shear_all(scratch):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the shear of all rays of a group, each in the mesh of the instance in `matrix`.
+
+    The operations are those of `enter_instance`.
+    """
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    for lane in range(LANES):
+        ox, oy, oz, dx, dy, dz = scene_ray(floats, lane)
+        row = _MATRIX + lane
+        x = _transform(floats, row, (dx, dy, dz))
+        y = _transform(floats, row + 4 * LANES, (dx, dy, dz))
+        z = _transform(floats, row + 8 * LANES, (dx, dy, dz))
+        length = np.sqrt((x * x + y * y) + z * z)
+        u = _transform(floats, row, (ox, oy, oz)) + floats[row + 3 * LANES]
+        v = _transform(floats, row + 4 * LANES, (ox, oy, oz)) + floats[row + 7 * LANES]
+        w = _transform(floats, row + 8 * LANES, (ox, oy, oz)) + floats[row + 11 * LANES]
+        floats[_LENGTH + lane] = length
+        store_shear(numbers, floats, lane, (u, v, w, x / length, y / length, z / length))
 
 
 @stage
@@ -265,19 +301,20 @@ def _is_transparent(mesh, instances, numbers, floats, lane, key):  # type: ignor
 
 
 @cache
-def plain_proposer(count: int, packet_number: int = 0) -> Any:
-    """Return a filter function like `propose`, for a scene without instances and masks.
+def opaque_proposer(count: int, packet_number: int = 0, *, nested: bool = False) -> Any:
+    """Return a filter function like `propose`, for a scene without masks.
 
     With a constant number of rays `count` of a packet, and all numbers at constant distances from a
     single address, the loop becomes a few vector instructions. `packet_number` counts the packets
-    of a group from 0; a filter for single rays has the lane from the scratch memory.
+    of a group from 0; a filter for single rays has the lane from the scratch memory. `nested` says
+    that the scene has instances.
     """
     packet = field_index("single") if count == 1 else _PACKET + 22 * count * packet_number
     first_lane = packet_number * count
 
     @callback(types.void(types.CPointer(types.int64)))
     def propose(arguments):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-        """Keep the closest triangle and a second, in `rough_32`, `first_32` and `second_32`."""
+        """Keep the closest triangle and a second in the fields of the scratch memory in 32 bits."""
         valid = int32s(arguments[0])
         scratch = arguments[2]
         hits = int32s(arguments[4])
@@ -293,6 +330,10 @@ def plain_proposer(count: int, packet_number: int = 0) -> Any:
             first = integers[_FIRST_32 + ray_lane]
             known_second = integers[_SECOND_32 + ray_lane]
             triangle = hits[5 * count + k]
+            if nested:
+                first_instance = integers[_FIRST_INSTANCE_32 + ray_lane]
+                second_instance = integers[_SECOND_INSTANCE_32 + ray_lane]
+                instance = hits[7 * count + k]
             closer = is_asked & (rough < nearest)
             clearly = is_asked & (rough < nearest - np.float32(MARGIN))
             new_second = triangle if known_second == -1 else np.int32(-2)  # a third is too many
@@ -302,6 +343,9 @@ def plain_proposer(count: int, packet_number: int = 0) -> Any:
             integers[_SECOND_32 + ray_lane] = (
                 np.int32(-1) if clearly else (new_second if is_asked else known_second)
             )
+            if nested:
+                integers[_FIRST_INSTANCE_32 + ray_lane] = instance if clearly else first_instance
+                integers[_SECOND_INSTANCE_32 + ray_lane] = instance if is_asked else second_instance
             valid[k] = np.int32(-1) if closer else np.int32(0)
 
     return propose
@@ -521,14 +565,56 @@ def _copy_corners(table, numbers, floats, candidate_field):  # type: ignore[no-u
                 floats[target + 2 * LANES] = table[base + 3 * k + axis]
 
 
+@stage
+def _copy_matrices(scratch, instances, candidate_field):  # type: ignore[no-untyped-def]
+    """Copy the matrix of the instance of each ray's candidate to `matrix`.
+
+    Without a candidate, the matrix of instance 0 is copied.
+    """
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    for lane in range(LANES):
+        number = max(numbers[candidate_field + lane], 0) // KEYS_PER_INSTANCE
+        matrix = float64s(instances + memory.INSTANCE_BYTES * number)
+        for k in range(12):
+            floats[_MATRIX + LANES * k + lane] = matrix[k]
+
+
+@stage
+def _copy_corners_in_meshes(scratch, instances, candidate_field):  # type: ignore[no-untyped-def]
+    """Copy corners as `_copy_corners`, from the mesh of each candidate's instance."""
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    for lane in range(LANES):
+        key = max(numbers[candidate_field + lane], 0)
+        record = int64s(instances + memory.INSTANCE_BYTES * (key // KEYS_PER_INSTANCE))
+        table = float64s(int64s(record[memory.MESH_FIELD])[0])
+        triangle = key & (KEYS_PER_INSTANCE - 1)
+        (a, b, c), (d, e, f), (g, h, i) = corners_of(table, triangle, numbers[_AXIS + lane])
+        for k, number in enumerate((a, b, c, d, e, f, g, h, i)):
+            floats[_CORNERS + LANES * k + lane] = number
+
+
+@inlined
+def _enter_candidates(scratch, instances, candidate_field):  # type: ignore[no-untyped-def]
+    """Write the shear of all rays, and corners, in the meshes of the candidates of the rays."""
+    _copy_matrices(scratch, instances, candidate_field)
+    _enter_and_shear_all(scratch)
+    _copy_corners_in_meshes(scratch, instances, candidate_field)
+
+
 @inlined
 def _plane_hit(floats, lane):  # type: ignore[no-untyped-def]
-    """Return the `PlaneHit` of a ray and the triangle that `_copy_corners` copied for the lane."""
+    """Return the `PlaneHit` of a ray and the triangle whose corners were copied for the lane.
+
+    The distance is local to the scene.
+    """
     k = _CORNERS + lane
     p = floats[k], floats[k + LANES], floats[k + 2 * LANES]
     q = floats[k + 3 * LANES], floats[k + 4 * LANES], floats[k + 5 * LANES]
     r = floats[k + 6 * LANES], floats[k + 7 * LANES], floats[k + 8 * LANES]
-    return areas((p, q, r), _load_shear(floats, lane))
+    hit = areas((p, q, r), _load_shear(floats, lane))
+    return PlaneHit(hit.a, hit.b, hit.c, hit.det, hit.t / floats[_LENGTH + lane])
 
 
 @stage
@@ -564,12 +650,8 @@ def _verify_second(scratch, t_min):  # type: ignore[no-untyped-def]
 
 
 @stage
-def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
-    """Test the candidates of all rays of a group as `verify`, without instances and masks.
-
-    Numbers that all rays share are arguments: a load would keep loops from becoming vector
-    instructions.
-    """
+def _widen_candidates(scratch, nested):  # type: ignore[no-untyped-def]
+    """Write the candidates that are in 32 bits as keys; return the number of second candidates."""
     numbers = int64s(scratch)
     floats = float64s(scratch)
     singles = float32s(scratch)
@@ -580,12 +662,41 @@ def verify_all(table, scratch, t_min):  # type: ignore[no-untyped-def]
         numbers[_FIRST + lane] = integers[_FIRST_32 + lane]
         numbers[_SECOND + lane] = integers[_SECOND_32 + lane]
         second_count += np.int64(integers[_SECOND_32 + lane] >= 0)
-    shear_all(scratch)
-    _copy_corners(table, numbers, floats, _FIRST)
+    if nested:
+        for lane in range(LANES):
+            first = numbers[_FIRST + lane]
+            second = numbers[_SECOND + lane]
+            first_key = first + KEYS_PER_INSTANCE * integers[_FIRST_INSTANCE_32 + lane]
+            second_key = second + KEYS_PER_INSTANCE * integers[_SECOND_INSTANCE_32 + lane]
+            numbers[_FIRST + lane] = first_key if first >= 0 else first
+            numbers[_SECOND + lane] = second_key if second >= 0 else second
+            numbers[_INSIDE + lane] = -1  # the shear will be that of a candidate's mesh
+    return second_count
+
+
+@stage
+def verify_all(scratch, mesh, instances, t_min):  # type: ignore[no-untyped-def]
+    """Test the candidates of all rays of a group as `verify`, without masks.
+
+    Numbers that all rays share are arguments: a load would keep loops from becoming vector
+    instructions.
+    """
+    numbers = int64s(scratch)
+    floats = float64s(scratch)
+    second_count = _widen_candidates(scratch, instances != 0)
+    if instances != 0:
+        _enter_candidates(scratch, instances, _FIRST)
+    else:
+        shear_all(scratch)
+        _copy_corners(float64s(int64s(mesh)[0]), numbers, floats, _FIRST)
     _verify_first(scratch, t_min)
-    if second_count:
-        _copy_corners(table, numbers, floats, _SECOND)
-        _verify_second(scratch, t_min)
+    if second_count == 0:
+        return
+    if instances != 0:
+        _enter_candidates(scratch, instances, _SECOND)
+    else:
+        _copy_corners(float64s(int64s(mesh)[0]), numbers, floats, _SECOND)
+    _verify_second(scratch, t_min)
 
 
 @inlined

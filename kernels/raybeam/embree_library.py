@@ -190,7 +190,8 @@ class EmbreeInstances(EmbreeScene):
     def update_scene(self, scene: Scene) -> None:
         """Set the transforms of the instances to the transforms of a scene, and build the tree."""
         embree = load_library()
-        transforms = scene.to_scene()
+        transforms = scene.to_scene
+        assert transforms is not None
         changed = np.flatnonzero((transforms != self._transforms).any(axis=(1, 2)))
         matrices = np.ascontiguousarray(transforms[changed], np.float32)
         address = matrices.ctypes.data

@@ -123,14 +123,16 @@ SCRATCH = np.dtype(
         ("inside", "i8", LANES), ("length", "f8", LANES),
         # Candidates of the filters: the shortest distance in float32, its triangle, and a second
         # triangle that is as near; -1 for none, -2 for several. The fields in 32 bits are for
-        # scenes without instances and masks.
+        # scenes without masks: triangles, and in a scene of instances the instances of these.
         ("rough", "f8", LANES), ("first_candidate", "i8", LANES), ("second_candidate", "i8", LANES),
         ("rough_32", "f4", LANES), ("first_32", "i4", LANES), ("second_32", "i4", LANES),
+        ("first_instance_32", "i4", LANES), ("second_instance_32", "i4", LANES),
         # The closest triangle that the ray hits: local distance; key, the row of the mesh's corners
         # plus `KEYS_PER_INSTANCE` times the instance's number; whether the hit needs no second
         # cast. Of equally close triangles, the lowest key.
         ("t", "f8", LANES), ("key", "i8", LANES), ("sure", "i8", LANES),
-        ("corners", "f8", 9 * LANES),  # of a triangle of each ray: (9, `LANES`)
+        # Of a triangle of each ray, and of the triangle's instance: (9, `LANES`), (12, `LANES`).
+        ("corners", "f8", 9 * LANES), ("matrix", "f8", 12 * LANES),
         # Row in the pattern, number of the pose, and number of the ray within the pose.
         ("row", "i8", LANES), ("pose", "i8", LANES), ("within", "i8", LANES),
         # Components of a sub-ray's direction along its beam, across and up.
@@ -206,7 +208,7 @@ class Cast:
         record["origins"] = self.address_of(None if origins is None else origins.T)
         record["positions"] = self.address_of(poses.positions.T)
         record["rotations"] = self.address_of(
-            None if rotations is None else np.moveaxis(rotations, 0, -1)
+            None if rotations is None else rotations.transpose(1, 2, 0)
         )
         if motion is not None:
             record["delays"] = self.address_of(motion.delays)

@@ -52,6 +52,7 @@ _T_MAX = field_index("t_max")
 _SCENE = field_index("scene")
 _NEARBY = field_index("nearby")
 _INSIDE = field_index("inside")
+_LENGTH = field_index("length")
 _ROUGH = field_index("rough")
 _FIRST = field_index("first_candidate")
 _SECOND = field_index("second_candidate")
@@ -107,6 +108,8 @@ def prepare(cast):  # type: ignore[no-untyped-def]
                 integers[k + 11 * width] = 0
                 for field in (18, 19, 20):
                     integers[k + field * width] = -1
+    for lane in range(LANES):  # without instances nothing writes it again
+        floats[_LENGTH + lane] = 1.0
 
 
 @inlined
@@ -193,14 +196,14 @@ def _select_rays(scratch, first_ring, rays_across, step, count):  # type: ignore
 
 
 @stage
-def _reset(scratch, plain):  # type: ignore[no-untyped-def]
-    """Reset the candidates; in 32 bits alone if `plain`, without instances and masks."""
+def _reset(scratch, masked):  # type: ignore[no-untyped-def]
+    """Reset the candidates; in 32 bits alone unless `masked`."""
     singles = float32s(scratch)
     integers = int32s(scratch)
     for lane in range(LANES):
         singles[_ROUGH_32 + lane] = np.float32(np.inf)
         integers[_FIRST_32 + lane] = integers[_SECOND_32 + lane] = np.int32(-1)
-    if not plain:
+    if masked:
         numbers = int64s(scratch)
         floats = float64s(scratch)
         for lane in range(LANES):
@@ -288,8 +291,7 @@ def _cast_group(address, real, has_origins):  # type: ignore[no-untyped-def]
     masked = cast.masked
     numbers = int64s(scratch)
     floats = float64s(scratch)
-    plain = instances == 0 and not masked
-    _reset(scratch, plain)
+    _reset(scratch, masked)
     if masked and instances == 0:  # `propose` looks at masks
         exact.shear_all(scratch)
     if cast.width == 1 or real == 1 or _is_incoherent(floats, cast.coherence):
@@ -297,10 +299,10 @@ def _cast_group(address, real, has_origins):  # type: ignore[no-untyped-def]
     else:
         _cast_packets(cast, has_origins)
     candidates, axis_rays = _count_candidates(scratch)
-    if plain and candidates + axis_rays == 0:
+    if not masked and candidates + axis_rays == 0:
         return False
-    if plain:
-        exact.verify_all(float64s(int64s(mesh)[0]), scratch, cast.t_min)
+    if not masked:
+        exact.verify_all(scratch, mesh, instances, cast.t_min)
     else:
         for lane in range(LANES):
             exact.verify(mesh, instances, numbers, floats, lane)

@@ -80,6 +80,38 @@ class Instance:
 
 
 @dataclass(frozen=True, eq=False)
+class MeshFrames:
+    """Frames of the meshes of n instances.
+
+    Attributes
+    ----------
+    scale
+        float64 (n,): `Frame.scale`.
+    centre
+        float64 (n, 3): `Frame.centre`, metres.
+    middle
+        float64 (n, 3): middle of the mesh's box, relative to `centre`, metres.
+    half
+        float64 (n, 3): halves of the sides of the mesh's box, metres.
+    """
+
+    scale: Floats
+    centre: Floats
+    middle: Floats
+    half: Floats
+
+    @classmethod
+    def of_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
+        """Return the frames of the meshes of instances; arguments as in `Scene`."""
+        frames = [local.frame for local in meshes]
+        scale = np.array([frame.scale for frame in frames])[mesh]
+        lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
+        upper = np.array([frame.upper for frame in frames])[mesh] / scale[:, None]
+        centre = np.array([frame.centre for frame in frames])[mesh]
+        return cls(scale, centre, (lower + upper) / 2, (upper - lower) / 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Instances and meshes in the form for backends.
 
@@ -96,6 +128,11 @@ class Scene:
         mesh's. None if the scene is plain: a single mesh without a transform.
     boxes
         float64 (n, 2, 3): lower and upper corner of each instance, local to the scene.
+    to_scene
+        float64 (n, 3, 4): matrix from the mesh's local coordinates to the scene's. The inverse of
+        `matrices` up to rounding; None if the scene is plain.
+    mesh_frames
+        Frames of the meshes of the instances; None if the scene is plain.
     """
 
     meshes: tuple[LocalMesh, ...]
@@ -103,6 +140,8 @@ class Scene:
     frame: Frame
     matrices: Floats | None
     boxes: Floats
+    to_scene: Floats | None = None
+    mesh_frames: MeshFrames | None = None
 
     @property
     def nested(self) -> bool:
@@ -125,13 +164,13 @@ class Scene:
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
-    def to_scene(self) -> Floats:
-        """Return matrices (n, 3, 4) from the meshes' local coordinates to the scene's."""
-        assert self.matrices is not None
-        matrices = self.matrices.reshape(-1, 3, 4)
-        inverse, _ = _inverse(matrices[:, :, :3])
-        move = -_product(inverse, matrices[:, :, 3])
-        return np.concatenate([inverse, move[:, :, None]], axis=2)
+    def moved(self, transforms: Floats) -> Scene:
+        """Return the scene of the same instances with other transforms (n, 3, 4), checked.
+
+        The scene must be nested.
+        """
+        assert self.mesh_frames is not None
+        return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
         """Return rows (k,) in a tally of triangles (k,) of instances (k,)."""
@@ -195,7 +234,8 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
         raise ValueError(f"{total:,} triangles are too many: the limit is {MAX_TRIANGLES:,}.")
     if len(listed) == 1 and listed[0].transform is None:
         return plain(meshes[0]), transforms
-    return nested_scene(meshes, mesh, transforms), transforms
+    frames = MeshFrames.of_instances(meshes, mesh)
+    return _nested_scene(meshes, mesh, frames, transforms), transforms
 
 
 def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
@@ -253,7 +293,7 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
     rotation_scale = transforms[:, :, :3]
     with np.errstate(all="ignore"):
         lengths = np.sqrt((rotation_scale**2).sum(axis=1))
-        volume = np.abs(_inverse(rotation_scale)[1]) / lengths.prod(axis=1)
+        volume = np.abs(_determinants(rotation_scale)) / lengths.prod(axis=1)
     regular = volume >= _FLAT  # also False when it is not a number
     if not regular.all():
         row = int(regular.argmin())
@@ -264,29 +304,36 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
         )
 
 
-def nested_scene(meshes: tuple[LocalMesh, ...], mesh: Indices, transforms: Floats) -> Scene:
+def _nested_scene(
+    meshes: tuple[LocalMesh, ...], mesh: Indices, mesh_frames: MeshFrames, transforms: Floats
+) -> Scene:
     """Return a nested scene: instances with transforms.
 
     Parameters
     ----------
     meshes, mesh
         Meshes, and the number of each instance's mesh, intp (n,), as in `Scene`.
+    mesh_frames
+        Frames of these meshes.
     transforms
         (n, 3, 4), checked.
     """
-    frames = [local.frame for local in meshes]
     rotation_scale = transforms[:, :, :3]
-    scale = np.array([frame.scale for frame in frames])[mesh]
+    scale = mesh_frames.scale
     # Centre of each mesh's coordinates in the scene, metres: large numbers are subtracted first.
-    centre = np.array([frame.centre for frame in frames])[mesh]
-    centre = _product(rotation_scale, centre) + transforms[:, :, 3]
-    shift, half = _instance_boxes(frames, mesh, rotation_scale)
+    centre = _product(rotation_scale, mesh_frames.centre) + transforms[:, :, 3]
+    shift = _product(rotation_scale, mesh_frames.middle)
+    half = _product(np.abs(rotation_scale), mesh_frames.half)
     frame, boxes = _scene_frame(centre, shift, half)
-    inverse, _ = _inverse(rotation_scale)
-    translation = _product(inverse, frame.centre - centre) * scale[:, None]
-    linear = inverse * (scale / frame.scale)[:, None, None]
-    matrices = np.concatenate([linear, translation[:, :, None]], axis=2)
-    return Scene(meshes, mesh, frame, matrices.reshape(-1, 12), boxes)
+    offset = frame.centre - centre
+    inverse = _inverse(rotation_scale)
+    matrices = np.empty((len(mesh), 3, 4))
+    matrices[:, :, :3] = inverse * (scale / frame.scale)[:, None, None]
+    matrices[:, :, 3] = _product(inverse, offset) * scale[:, None]
+    to_scene = np.empty((len(mesh), 3, 4))
+    to_scene[:, :, :3] = rotation_scale * (frame.scale / scale)[:, None, None]
+    to_scene[:, :, 3] = offset * -frame.scale
+    return Scene(meshes, mesh, frame, matrices.reshape(-1, 12), boxes, to_scene, mesh_frames)
 
 
 def _scene_frame(centre: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:
@@ -304,33 +351,13 @@ def _scene_frame(centre: Floats, shift: Floats, half: Floats) -> tuple[Frame, Fl
     return Frame(origin, unit, lower, upper), boxes
 
 
-def _instance_boxes(
-    frames: list[Frame], mesh: Indices, rotation_scale: Floats
-) -> tuple[Floats, Floats]:
-    """Return the boxes of instances (n,), by rotation and scale (n, 3, 3), metres.
-
-    Returns
-    -------
-    shift
-        (n, 3): centre of the box, relative to the centre of the mesh's coordinates.
-    half
-        (n, 3): halves of the sides.
-    """
-    scale = np.array([frame.scale for frame in frames])[mesh]
-    lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
-    upper = np.array([frame.upper for frame in frames])[mesh] / scale[:, None]
-    shift = _product(rotation_scale, (lower + upper) / 2)
-    half = _product(np.abs(rotation_scale), (upper - lower) / 2)
-    return shift, half
-
-
 def _product(matrices: Floats, vectors: Floats) -> Floats:
     """Return matrices (n, 3, 3) times vectors (n, 3), with the same bits on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
-def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
-    """Return inverses and determinants of matrices (n, 3, 3), with the same bits everywhere."""
+def _inverse(matrices: Floats) -> Floats:
+    """Return the inverses of matrices (n, 3, 3), with the same bits everywhere."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
     # Rows are the cross products of columns; `numpy.cross` takes four times as long for few.
     across = np.empty((3, 3, len(matrices)))
@@ -339,4 +366,10 @@ def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
     across[2] = b * f - c * e, c * d - a * f, a * e - b * d
     across = across.transpose(2, 0, 1)
     volume = (matrices[:, :, 0] * across[:, 0]).sum(axis=1)
-    return across / volume[:, None, None], volume
+    return across / volume[:, None, None]
+
+
+def _determinants(matrices: Floats) -> Floats:
+    """Return the determinants (n,) of matrices (n, 3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
+    return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))

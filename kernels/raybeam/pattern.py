@@ -58,11 +58,13 @@ class Pattern:
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
         self._origins: Floats | None = None
+        self.max_origin = 0.0  # upper bound of the coordinates of origins, metres
         rows = self._directions.shape[1]
         if origins is not None:
             self._origins = np.empty((3, rows))
             self._origins[...] = check_origins(origins, rows).T
             self._origins.flags.writeable = False
+            self.max_origin = float(np.abs(self._origins).max(initial=0))
         self.sub_rays = sub_rays
         self.offsets: Floats | None = None  # (2, n)
         if sub_rays is not None and offsets is not None:

@@ -8,7 +8,7 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import AnyArray, Bools, Floats, Indices, Ints
+from .arrays import AnyArray, Floats, Indices, Ints
 from .rays import finite_rows, real_rows, refuse_rows
 
 _SLACK = 2e-9  # on products of a rotation's rows
@@ -175,11 +175,16 @@ def check_poses(
             "give more poses, more rays_per_pose, or a smaller window."
         )
     return Poses(
-        np.broadcast_to(by_component(position_rows), (count, 3)),
-        None if matrices is None else np.broadcast_to(matrices, (count, 3, 3)),
+        _repeated(by_component(position_rows), count),
+        None if matrices is None else _repeated(matrices, count),
         rays_of_pose,
         None if motion is None else _check_motion(motion, count, rays_of_pose),
     )
+
+
+def _repeated(table: Floats, count: int) -> Floats:
+    """Return a table (1, ...) or (count, ...) as (count, ...)."""
+    return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
 
 def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMotion:
@@ -202,11 +207,13 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 def _check_rotations(rotations: ArrayLike) -> Floats:
     """Return rotations (k, 3, 3) as float64; ValueError for a matrix that deforms or mirrors."""
     matrices = by_component(real_rows("rotations", rotations, (3, 3)))
-    # Written out for all matrices at once: a product of each matrix takes longer than casting
-    # the rays. NaN compares as false.
     rows = matrices.transpose(1, 2, 0)
+    x, y, z = rows.transpose(1, 0, 2)
+    # NaN compares as false.
     with np.errstate(over="ignore", invalid="ignore"):
-        orthonormal = _are_orthonormal(rows)
+        products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # of two rows each
+        deviations = np.abs(products - np.eye(3)[:, :, None])
+        orthonormal = (deviations <= _SLACK).all(axis=(0, 1))
         mirrored = orthonormal & ~(_determinants(rows) > 0)
     invalid = np.flatnonzero(~orthonormal | mirrored)
     if not len(invalid):
@@ -223,18 +230,6 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     )
 
 
-def _are_orthonormal(rows: Floats) -> Bools:
-    """Return a mask (k,) of the matrices, by rows (3, 3, k), whose rows are orthonormal."""
-    orthonormal = np.ones(rows.shape[2], np.bool_)
-    for first in range(3):
-        for second in range(first, 3):
-            a, b, c = rows[first]
-            d, e, f = rows[second]
-            product = (a * d + b * e) + c * f
-            orthonormal &= np.abs(product - (first == second)) <= _SLACK
-    return orthonormal
-
-
 def _determinants(rows: Floats) -> Floats:
     """Return the determinants (k,) of matrices by rows (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
@@ -243,5 +238,7 @@ def _determinants(rows: Floats) -> Floats:
 
 def by_component(table: AnyArray) -> Floats:
     """Return a table (k, ...) as float64, each component contiguous over the k entries."""
-    components_first = np.moveaxis(table, 0, -1)
-    return np.moveaxis(np.ascontiguousarray(components_first, dtype=np.float64), -1, 0)
+    # Not by `numpy.moveaxis`, which takes as long as casting 100 rays.
+    components_first = table.transpose(*range(1, table.ndim), 0)
+    contiguous = np.ascontiguousarray(components_first, dtype=np.float64)
+    return contiguous.transpose(-1, *range(table.ndim - 1))

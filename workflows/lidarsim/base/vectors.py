@@ -51,10 +51,20 @@ def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
     """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k)."""
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)
-    product: Floats = first[..., :, 0, None] * second[..., None, 0, :]
-    for column in range(1, first.shape[-1]):
-        product += first[..., :, column, None] * second[..., None, column, :]
-    return product
+    # Components first: loops over many matrices are long, loops over three columns are short.
+    axes = max(first.ndim, second.ndim)
+    rows = _components_first(first, axes)  # (i, j, ...)
+    columns = _components_first(second, axes)  # (j, k, ...)
+    product: Floats = rows[:, 0, None] * columns[None, 0]
+    for number in range(1, rows.shape[1]):
+        product += rows[:, number, None] * columns[None, number]
+    return product.transpose(*range(2, product.ndim), 0, 1)
+
+
+def _components_first(matrices: Floats, axes: int) -> Floats:
+    """Return matrices (..., i, j) as a contiguous array (i, j, ...) with a number of axes."""
+    matrices = matrices[(None,) * (axes - matrices.ndim)]
+    return np.ascontiguousarray(matrices.transpose(axes - 2, axes - 1, *range(axes - 2)))
 
 
 def applied(matrices: ArrayLike, vectors: ArrayLike) -> Floats:
@@ -97,8 +107,10 @@ def inverse(matrices: Floats) -> Floats:
 
 
 def determinant(matrices: Floats) -> Floats:
-    """Return the determinants (...) of matrices (..., 3, 3)."""
-    return adjugates(matrices)[1]
+    """Return the determinants (...) of matrices (..., 3, 3), with the bits of `adjugates`."""
+    axes = matrices.ndim - 2, matrices.ndim - 1, *range(matrices.ndim - 2)
+    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(axes)
+    return np.asarray((a * (e * i - f * h) + b * (f * g - d * i)) + c * (d * h - e * g))
 
 
 def rank(matrices: Floats) -> Ints:

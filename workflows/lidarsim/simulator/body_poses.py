@@ -14,7 +14,7 @@ from ..base.validation import shown
 from ..sensor import Pose, StaticPose, Track, Trajectory
 from ..sensor.trajectory import CENTRE, check_rotations, pose_of
 
-_ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
+ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
 
 
 class BodyPoses(NamedTuple):
@@ -91,7 +91,7 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
 def check_matrices(matrices: Floats) -> None:
     """Check that matrices (k, 4, 4) are rigid transforms; LidarError if not."""
     _check_finite(matrices)
-    if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= _ROW_SLACK).all():
+    if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
         raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
     check_rotations(matrices[:, :3, :3])
 

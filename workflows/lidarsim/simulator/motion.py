@@ -70,7 +70,9 @@ class Firings:
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
         """Return the firings of consecutive scans; the whole sequence `repetitions` times."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
-        return cls(sensor, np.tile(numbers, repetitions), specs[0])
+        if repetitions > 1:
+            numbers = np.tile(numbers, repetitions)
+        return cls(sensor, numbers, specs[0])
 
     def times(self, ray: Integers) -> Ints:
         """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,).

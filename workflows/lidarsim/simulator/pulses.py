@@ -49,6 +49,8 @@ class PulseCaster:
         self.setup = setup = setup_of(scene, survey, sensor_number)
         self._caster = caster
         self._surfaces = surfaces
+        # Known once: copies of this caster have the same materials and the same sensor.
+        self._has_several_returns = setup.has_several_returns
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
@@ -99,7 +101,7 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first_row, poses, firings, self.emitter)
 
         all_beams = batch(0, beam_count)
-        if self.setup.has_several_returns:
+        if self._has_several_returns:
             pose_beams = poses.rays_per_pose or self.setup.sensor.channels
             chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
             chunk_starts = range(0, beam_count, chunk_beams)

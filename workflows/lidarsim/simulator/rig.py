@@ -22,6 +22,7 @@ from .device import DeviceColumns, DevicePoints
 from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
 from .points import BatchPoints
 from .pulses import PulseCaster
+from .returns import required
 from .scene_caster import SceneCaster
 from .static_bodies import largest_range_m
 from .surfaces import Surfaces
@@ -158,7 +159,7 @@ class Rig:
         rig = copy(self)
         rig.scene = scene = self.scene.moved(rows, positions[index], rotations[index])
         assert scene.instances is not None
-        rig.surfaces = surfaces = self.surfaces.moved(scene, rows)
+        rig.surfaces = surfaces = self.surfaces.moved(scene)
         rig.scene_caster.move_instances(surfaces, scene.instances, rows)
         rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
         rig._device = self._device and self._device.moved(scene, surfaces)
@@ -363,8 +364,11 @@ class Rig:
             .returns
         )
         assert returns.reported is not None  # steps have set the ranges of reported returns
-        nearest = returns.number == 1
-        image[returns.ray[nearest]] = returns.reported[nearest]
+        nearest = required(returns.number) == 1
+        if nearest.all():
+            image[returns.ray] = returns.reported
+        else:
+            image[returns.ray[nearest]] = returns.reported[nearest]
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings in the frame of the carrier, stored for the next calls."""

@@ -37,7 +37,7 @@ from ..sensor import (
 )
 from ..sensor.trajectory import CENTRE, pose_of
 from .batch import columns_of
-from .body_poses import poses_of_bodies, poses_of_body
+from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
 from .motion import check_trajectory
 from .rig import Rig
 from .scene_caster import check_backend_here
@@ -45,6 +45,7 @@ from .static_bodies import warn_of_reach
 from .surfaces import warn_of_grey
 
 MAX_SCANS = 1 << 31  # the type of the column `scan`
+_MAX_REVOLUTIONS = 4  # whose scans are stored
 MAX_START_S = 9e9  # times are int64, nanoseconds
 SweepNumber = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
 StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
@@ -164,6 +165,7 @@ class Scanner:
         self._casts = 0  # sweeps under way
         self._moves = 0  # moves of instances under way or waiting
         self._unnumbered = 0  # sweeps and images that were scanned without a `number` so far
+        self._revolutions: dict[int, list[ScanSpec]] = {}  # by number
 
     def __getstate__(self) -> dict[str, Any]:
         with self._lock:
@@ -315,7 +317,7 @@ class Scanner:
             if not len(positions):
                 firings = specs[-1].firings[1] - specs[0].firings[0]
                 return np.empty((0, firings, specs[0].channels), np.float32)
-            rays = sum(spec.ray_count for spec in specs)
+            rays = (specs[-1].firings[1] - specs[0].firings[0]) * specs[0].channels
             try:
                 checked_poses = check_poses(positions, rotations, rays, rays * len(positions), None)
             except ValueError as error:
@@ -477,8 +479,9 @@ class Scanner:
                 revolutions_ahead = self._unnumbered
                 self._unnumbered += count
         specs, late_ns = self._scans_of(rig, number or 0, start_s, revolutions_ahead)
-        begin_ns, end_ns = _span_ns(rig, specs)
-        rig.check_actors(begin_ns, end_ns)
+        if rig.scene.actors:
+            begin_ns, end_ns = _span_ns(rig, specs)
+            rig.check_actors(begin_ns, end_ns)
         return specs, late_ns
 
     def _scans_of(
@@ -489,18 +492,27 @@ class Scanner:
         Random numbers are those of a revolution that is `revolutions_ahead`, see `ScanSpec.ahead`.
         """
         sensor = rig.survey.sensor
-        steps = sensor.steps_of_revolution(number)
-        if steps.stop > MAX_SCANS:
+        specs = self._revolution(sensor, number)
+        if specs[-1].scan >= MAX_SCANS:
             raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
         late_ns = (
             0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
-        ahead = revolutions_ahead * len(steps)
-        specs = [
-            ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
-            for step in steps
-        ]
-        return specs, late_ns
+        ahead = revolutions_ahead * len(specs)
+        return [replace(spec, start_ns=late_ns, ahead=ahead) for spec in specs], late_ns
+
+    def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:
+        """Return the scans of revolution `number`, stored for the next sweeps."""
+        specs = self._revolutions.get(number)
+        if specs is None:
+            specs = [
+                ScanSpec(step, 0, sensor.firings(step), channels=sensor.channels)
+                for step in sensor.steps_of_revolution(number)
+            ]
+            if len(self._revolutions) >= _MAX_REVOLUTIONS:
+                self._revolutions.clear()
+            self._revolutions[number] = specs
+        return specs
 
     @contextmanager
     def _casting(self) -> Iterator[Rig]:
@@ -546,7 +558,8 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
     if table.shape == (3,) or (table.ndim == 2 and table.shape[1] == 3):
         return table.reshape(-1, 3), None
     if table.ndim == 3 and table.shape[1:] == (4, 4):
-        if not np.allclose(table[:, 3], [0, 0, 0, 1]):
+        # Not by `numpy.allclose`, which takes as long as casting 1,000 rays.
+        if not (np.abs(table[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
             raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
         return table[:, :3, 3], table[:, :3, :3]
     raise LidarError(

@@ -182,14 +182,16 @@ class StaticBodies:
             self._trees = None  # `cover` builds them
             return
         first = trees.caster.instance_count - len(trees.rows)
+        if trees.region is None:  # all instances have a tree
+            trees.caster.move(first + rows, instances.transforms[rows])
+            return
         numbers = first + np.searchsorted(trees.rows, rows)
         has_tree = np.isin(rows, trees.rows)
-        if trees.region is not None:
-            is_cut = has_tree & np.isin(numbers, list(trees.origins))
-            comes = ~has_tree & _is_near(instances, trees.region)[rows]
-            if (is_cut | comes | (has_tree & is_remote)).any():
-                self._trees = self._build(trees.region)
-                return
+        is_cut = has_tree & np.isin(numbers, list(trees.origins))
+        comes = ~has_tree & _is_near(instances, trees.region)[rows]
+        if (is_cut | comes | (has_tree & is_remote)).any():
+            self._trees = self._build(trees.region)
+            return
         trees.caster.move(numbers[has_tree], instances.transforms[rows[has_tree]])
 
     def _build(self, region: Floats | None) -> _Trees:

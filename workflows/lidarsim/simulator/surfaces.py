@@ -132,9 +132,14 @@ class Surfaces:
         # Objects of the triangles of faces and of actors; the last is of no triangle.
         objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(objects)
-        self._normal_matrices = (
-            np.zeros((0, 3, 3)) if instances is None else _normal_matrices(instances.transforms)
-        )
+
+    @cached_property
+    def _normal_matrices(self) -> Floats:
+        """Matrices (n, 3, 3) from normals of parts to normals of instances, of any length."""
+        instances = self._scene.instances
+        if instances is None:
+            return np.zeros((0, 3, 3))
+        return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
 
     @property
     def materials(self) -> MaterialTable:
@@ -145,13 +150,12 @@ class Surfaces:
         """Materials of kinds of surfaces at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
-    def moved(self, scene: Scene, rows: Indices) -> Surfaces:
-        """Return the surfaces of a scene in which the instances `rows` have new transforms."""
+    def moved(self, scene: Scene) -> Surfaces:
+        """Return the surfaces of a scene in which instances have new transforms."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
-        surfaces._normal_matrices = self._normal_matrices.copy()
-        surfaces._normal_matrices[rows] = _normal_matrices(scene.instances.transforms[rows])
+        vars(surfaces).pop("_normal_matrices", None)
         surfaces.grids = self.grids and self.grids.moved(scene.instances)
         return surfaces
 
@@ -707,11 +711,6 @@ class Surfaces:
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
         return self._parts_start + np.cumsum([0, *sizes[:-1]])
-
-
-def _normal_matrices(transforms: Floats) -> Floats:
-    """Return matrices (n, 3, 3) from normals of parts to normals of instances, of any length."""
-    return np.ascontiguousarray(inverse(transforms[:, :, :3]).transpose(0, 2, 1))
 
 
 def _normals(corners: Floats) -> Floats32:
