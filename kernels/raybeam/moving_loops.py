@@ -322,30 +322,73 @@ def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyp
     return (enters <= leaves) & (leaves >= 0) & (enters * (1 - 1e-6) <= reach)
 
 
-@stage
-def _test_cell(rays, n, reaches, pose, corners, pad, passing):  # type: ignore[no-untyped-def]
-    """Write whether each ray of a cell passes through a box at a pose.
+@inlined
+def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the centre (3), in the scene, and the radius of a sphere around a box at a pose.
 
-    `rays` is the address of the cell's first ray in (6, n). `reaches`, where each ray ends, and the
-    output `passing`, 0 or 1, are addresses of float64 and int64 (`CELL`,). `pose` is a position and
-    a rotation by rows. Corners are in the axes of the body.
+    The sphere encloses what `passes_box` adds to the box for a ray from the sphere's centre;
+    `_near_sphere` adds what grows with the distance.
+    """
+    (a, b, c), (d, e, f) = corners
+    (px, py, pz), (row_1, row_2, row_3) = pose
+    x = (a + d) / 2
+    y = (b + e) / 2
+    z = (c + f) / 2
+    u = (d - a) / 2
+    v = (e - b) / 2
+    w = (f - c) / 2
+    radius = np.sqrt(u * u + v * v + w * w) + 2 * pad + 4e-6 * (abs(x) + abs(y) + abs(z))
+    centre = (
+        px + (row_1[0] * x + row_1[1] * y + row_1[2] * z),
+        py + (row_2[0] * x + row_2[1] * y + row_2[2] * z),
+        pz + (row_3[0] * x + row_3[1] * y + row_3[2] * z),
+    )
+    return centre, radius
+
+
+@stage
+def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
+    """Write whether each ray of a cell passes through the sphere around a body; return how many do.
+
+    `rays` is the address of the cell's first ray in (6, n). `x`, `y`, `z` and `radius` are of the
+    sphere, metres. The output `near`, 0 or 1, is the address of int64 (`CELL`,).
     """
     ray = float64s(rays)
-    reach = float64s(reaches)
-    passes = int64s(passing)
-    (px, py, pz), rotation = pose
+    is_near = int64s(near)
+    near_count = np.int64(0)
     for k in range(CELL):
-        origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
-        direction = to_body_axes(rotation, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
-        passes[k] = np.int64(passes_box(corners, pad, reach[k], origin, direction))
+        u = x - ray[k]
+        v = y - ray[n + k]
+        w = z - ray[2 * n + k]
+        dx = ray[3 * n + k]
+        dy = ray[4 * n + k]
+        dz = ray[5 * n + k]
+        along = u * dx + v * dy + w * dz
+        squared = u * u + v * v + w * w
+        reach = radius + 8e-6 * (abs(u) + abs(v) + abs(w))
+        outside = squared - reach * reach  # above 0 for a ray that starts outside
+        length = dx * dx + dy * dy + dz * dz
+        is_near[k] = np.int64((outside <= 0) | ((along >= 0) & (outside * length <= along * along)))
+        near_count += is_near[k]
+    return near_count
+
+
+@inlined
+def _ray_passes_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
+    """Return whether ray k of rays (6, n), at an address, passes through a box at a pose."""
+    ray = float64s(rays)
+    (px, py, pz), rotation = pose
+    origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
+    direction = to_body_axes(rotation, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
+    return passes_box(corners, pad, reach, origin, direction)
 
 
 @compiled(types.int64(_f64_2, _f64_1, _PAIRS, _f64_2, _f64_2, _i64_1, _i64_2))
-def _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs):  # type: ignore[no-untyped-def]
+def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the rays that pass through boxes to `ray_pairs`, with the pair of each.
 
     Returns the number of columns written: number of the ray, and of the pair of a cell and a body.
-    `passing` is memory for a cell. Arguments are those of `rays_through_boxes`.
+    `near` is memory for a cell. Arguments are those of `rays_through_boxes`.
     """
     cell, pose_of_pair, shape, pads = pairs
     written = 0
@@ -358,12 +401,16 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs):  # type:
         first = min(begin, count - CELL)
         pose = (poses[0, p], poses[1, p], poses[2, p]), pose_rotation(poses, p)
         ray = rays.ctypes.data + 8 * first
-        reach = reaches.ctypes.data + 8 * first
-        _test_cell(ray, count, reach, pose, corners, pads[pair], passing.ctypes.data)
+        (x, y, z), radius = _sphere_around(corners, pose, pads[pair])
+        if not _near_sphere(ray, count, x, y, z, radius, near.ctypes.data):
+            continue
         for k in range(begin, end):
-            ray_pairs[0, written] = k
-            ray_pairs[1, written] = pair
-            written += passing[k - first]
+            if near[k - first] and _ray_passes_box(
+                ray, count, k - first, reaches[k], pose, corners, pads[pair]
+            ):
+                ray_pairs[0, written] = k
+                ray_pairs[1, written] = pair
+                written += 1
     return written
 
 
@@ -397,6 +444,6 @@ def rays_through_boxes(
         rays = np.concatenate([rays, np.zeros((6, CELL - len(reaches)))], axis=1)
         # A ray that ends at NaN passes no box.
         reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
-    passing = np.empty(CELL, np.int64)
-    count = _pair_rays(rays, reaches, pairs, poses, boxes, passing, ray_pairs)
+    near = np.empty(CELL, np.int64)
+    count = _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs)
     return ray_pairs[0, :count], ray_pairs[1, :count]

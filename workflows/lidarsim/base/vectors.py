@@ -51,14 +51,20 @@ def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
     """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k)."""
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)
-    # Components first: loops over many matrices are long, loops over three columns are short.
     axes = max(first.ndim, second.ndim)
-    rows = _components_first(first, axes)  # (i, j, ...)
-    columns = _components_first(second, axes)  # (j, k, ...)
-    product: Floats = rows[:, 0, None] * columns[None, 0]
-    for number in range(1, rows.shape[1]):
-        product += rows[:, number, None] * columns[None, number]
+    product = matmul_of_components(_components_first(first, axes), _components_first(second, axes))
     return product.transpose(*range(2, product.ndim), 0, 1)
+
+
+def matmul_of_components(first: Floats, second: Floats) -> Floats:
+    """Return the products (i, k, ...) of small matrices (i, j, ...) and (j, k, ...).
+
+    Faster than `matmul` for many matrices, since the long axis is the last.
+    """
+    product: Floats = first[:, 0, None] * second[None, 0]
+    for number in range(1, first.shape[1]):
+        product += first[:, number, None] * second[None, number]
+    return product
 
 
 def _components_first(matrices: Floats, axes: int) -> Floats:

@@ -15,7 +15,7 @@ from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields, one_line, shown
-from ..base.vectors import applied, determinant, hypot, length, matmul
+from ..base.vectors import applied, determinant, hypot, length, matmul, matmul_of_components
 from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -121,9 +121,10 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
     LidarError
         If a matrix mirrors or deforms.
     """
-    products = matmul(rotations.transpose(0, 2, 1), rotations)
+    rows = np.ascontiguousarray(rotations.transpose(1, 2, 0))
+    products = matmul_of_components(rows.transpose(1, 0, 2), rows)
     # Written so that NaN is an error.
-    rigid = np.asarray((np.abs(products - np.eye(3)) <= slack).all(axis=(1, 2)))
+    rigid = np.asarray((np.abs(products - np.eye(3)[:, :, None]) <= slack).all(axis=(0, 1)))
     right_handed = determinant(rotations) > 0
     bad = np.flatnonzero(~(rigid & right_handed))
     if len(bad):
@@ -593,16 +594,16 @@ def _segments(
     `starts` and `first` are those at the start of each segment, `stops` and `last` at its end;
     durations (s,) are seconds.
     """
-    velocities = (stops - starts) / durations_s[:, None]
-    axes, rates = _rotations_between(first, last, durations_s)
-    rotations = matrices(first)
-    spins = applied(rotations, axes * rates)
+    first_positions = np.ascontiguousarray(starts.T)
+    first_quaternions = np.ascontiguousarray(first.T)
+    axes, rates = _rotations_between(first_quaternions, np.ascontiguousarray(last.T), durations_s)
+    rotations = _matrices_by_component(first_quaternions)
     return Segments(
-        starts=np.ascontiguousarray(starts.T),
-        velocities=np.ascontiguousarray(velocities.T),
+        starts=first_positions,
+        velocities=(stops.T - first_positions) / durations_s,
         rotation_terms=_rotation_terms(rotations, axes),
-        rates=rates[:, 0],
-        spins=np.ascontiguousarray(spins.T),
+        rates=rates,
+        spins=matmul_of_components(rotations, (axes * rates)[:, None])[:, 0],
     )
 
 
@@ -704,40 +705,47 @@ class _SegmentTimes(NamedTuple):
 
 
 def _rotation_terms(rotations: Floats, axes: Floats) -> Floats:
-    """Return the terms (3, 9, s) of rotations (s, 3, 3) that go on about unit axes (s, 3)."""
-    x, y, z = axes.T
+    """Return the terms (3, 9, s) of rotations (3, 3, s) that go on about unit axes (3, s)."""
+    x, y, z = axes
     zero = np.zeros_like(x)
-    cross_matrix = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    tilted = matmul(rotations, cross_matrix)
-    square = matmul(tilted, cross_matrix)
-    terms = np.stack([rotations + square, tilted, -square]).reshape(3, -1, 9)
-    return np.ascontiguousarray(terms.transpose(0, 2, 1))
+    cross_matrix = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    tilted = matmul_of_components(rotations, cross_matrix)
+    square = matmul_of_components(tilted, cross_matrix)
+    return np.stack([rotations + square, tilted, -square]).reshape(3, 9, -1)
 
 
 def _rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
-    """Return the axes (s, 3) and rates (s, 1), rad/s, of rotations between quaternions (s, 4).
+    """Return the axes (3, s) and rates (s,), rad/s, of rotations between quaternions (4, s).
 
     Axes are in the frame of the first pose. A rotation takes its duration (s,), seconds.
     """
     # conjugate(p) q
-    (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (first, last))
-    axis = pw * q - qw * p - np.cross(p, q)
-    cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
+    a, b, c, pw = first
+    d, e, f, qw = last
+    cross = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+    axis = pw * last[:3] - qw * first[:3] - cross
+    cosine = ((a * d + b * e) + c * f) + pw * qw
     axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
-    sine = length(axis)[:, None]
-    rates = 2 * arctan2(sine, np.abs(cosine)) / durations_s[:, None]
+    x, y, z = axis
+    sine = np.sqrt((x * x + y * y) + z * z)
+    rates = 2 * arctan2(sine, np.abs(cosine)) / durations_s
     return axis / np.where(sine > 0, sine, 1), rates
 
 
 def matrices(quaternions: Floats) -> Floats:
     """Return the rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
-    x, y, z, w = quaternions.T
+    return _matrices_by_component(quaternions.T).transpose(2, 0, 1)
+
+
+def _matrices_by_component(quaternions: Floats) -> Floats:
+    """Return the rotation matrices (3, 3, k) of unit quaternions x, y, z, w (4, k)."""
+    x, y, z, w = quaternions
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    return np.array(rows)
 
 
 def quaternions_of(rotations: Floats) -> Floats:
@@ -747,19 +755,26 @@ def quaternions_of(rotations: Floats) -> Floats:
     iteration: plus one, the smaller eigenvalues are about as small as the matrices are rounded, and
     zero for exact rotations.
     """
-    matrix = np.moveaxis(rotations, 0, -1)
-    table = np.zeros((len(rotations), 4, 4))
+    matrix = np.ascontiguousarray(rotations.transpose(1, 2, 0))
+    table = np.zeros((4, 4, len(rotations)))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        table[:, i, i] = matrix[i, i] - matrix[j, j] - matrix[k, k]
-        table[:, i, j] = table[:, j, i] = matrix[i, j] + matrix[j, i]
-        table[:, k, 3] = table[:, 3, k] = matrix[j, i] - matrix[i, j]
-    table[:, 3, 3] = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    table += np.eye(4)
-    best = np.diagonal(table, axis1=1, axis2=2).argmax(axis=1)
-    vectors = table[np.arange(len(table)), best]
+        table[i, i] = matrix[i, i] - matrix[j, j] - matrix[k, k]
+        table[i, j] = table[j, i] = matrix[i, j] + matrix[j, i]
+        table[k, 3] = table[3, k] = matrix[j, i] - matrix[i, j]
+    table[3, 3] = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    table += np.eye(4)[:, :, None]
+    best = np.diagonal(table).argmax(axis=1)
+    vectors = np.take_along_axis(table, best[None, None], axis=0)[0]
     for _ in range(_ROUNDS):
-        vectors = applied(table, vectors / length(vectors)[:, None])
-    return np.asarray(vectors / length(vectors)[:, None])
+        unit = vectors / _lengths(vectors)
+        vectors = matmul_of_components(table, unit[:, None])[:, 0]
+    return np.ascontiguousarray((vectors / _lengths(vectors)).T)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    """Return the lengths (k,) of vectors (4, k)."""
+    x, y, z, w = vectors * vectors
+    return np.asarray(np.sqrt(((x + y) + z) + w))
 
 
 def _travel_quaternions(slopes: Floats) -> Floats:

@@ -39,6 +39,7 @@ from .static_bodies import StaticBodies, mesh_of
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
+_MAX_ROOM_RAYS = 1 << 18  # rays that are stored for casts on static bodies and on actors: 13 MB
 REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
 
 
@@ -201,9 +202,12 @@ class SceneCaster:
             `SceneCaster`, and the tally is by `Surfaces.counter`. With instances or actors,
             `instance` is 0.
         """
+        start, stop = (0, len(pattern)) if window is None else window
+        if room is None and self._shapes is not None and stop - start <= _MAX_ROOM_RAYS:
+            room = np.empty((6, stop - start))  # so that the rays are computed once
         common: dict[str, Any] = {
             **poses.caster_arguments,
-            "window": (0, len(pattern)) if window is None else window,
+            "window": (start, stop),
             "t_min": t_min,
             "t_max": t_max,
             "room": room,
