@@ -144,7 +144,7 @@ class Backend(ABC):
 
     def scan(self, scan: Scan) -> ScanReturns:
         """Return the kept hits of the rays of a scan, and counts of all hits."""
-        collector = Collector(scan, self._scene.face_count)
+        collector = Collector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
             if scan.tally:
                 collector.tally(self._scene.tally_rows(instance, triangle))

@@ -47,6 +47,13 @@ def products(first: Floats, second: Floats) -> Floats:
     return np.asarray(product)
 
 
+def cross(first: Floats, second: Floats) -> Floats:
+    """Return the vector products (3, ...) of vectors (3, ...)."""
+    a, b, c = first
+    d, e, f = second
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
 def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
     """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k)."""
     first = np.asarray(first, np.float64)

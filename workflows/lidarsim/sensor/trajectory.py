@@ -15,7 +15,16 @@ from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields, one_line, shown
-from ..base.vectors import applied, determinant, hypot, length, matmul, matmul_of_components
+from ..base.vectors import (
+    applied,
+    cross,
+    determinant,
+    hypot,
+    length,
+    matmul,
+    matmul_of_components,
+    products,
+)
 from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -719,12 +728,11 @@ def _rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tupl
 
     Axes are in the frame of the first pose. A rotation takes its duration (s,), seconds.
     """
+    p = first[:3]
+    q = last[:3]
     # conjugate(p) q
-    a, b, c, pw = first
-    d, e, f, qw = last
-    cross = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
-    axis = pw * last[:3] - qw * first[:3] - cross
-    cosine = ((a * d + b * e) + c * f) + pw * qw
+    axis = first[3] * q - last[3] * p - cross(p, q)
+    cosine = products(p, q) + first[3] * last[3]
     axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
     x, y, z = axis
     sine = np.sqrt((x * x + y * y) + z * z)

@@ -499,7 +499,7 @@ class Scanner:
             0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
         ahead = revolutions_ahead * len(specs)
-        return [replace(spec, start_ns=late_ns, ahead=ahead) for spec in specs], late_ns
+        return [spec.shifted(late_ns, ahead) for spec in specs], late_ns
 
     def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:
         """Return the scans of revolution `number`, stored for the next sweeps."""

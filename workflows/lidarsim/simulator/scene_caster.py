@@ -202,12 +202,12 @@ class SceneCaster:
             `SceneCaster`, and the tally is by `Surfaces.counter`. With instances or actors,
             `instance` is 0.
         """
-        start, stop = (0, len(pattern)) if window is None else window
-        if room is None and self._shapes is not None and stop - start <= _MAX_ROOM_RAYS:
-            room = np.empty((6, stop - start))  # so that the rays are computed once
+        window = (0, len(pattern)) if window is None else window
+        if room is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
+            room = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
         common: dict[str, Any] = {
             **poses.caster_arguments,
-            "window": (start, stop),
+            "window": window,
             "t_min": t_min,
             "t_max": t_max,
             "room": room,
@@ -235,8 +235,7 @@ class SceneCaster:
                 self._surfaces.counter(triangle), minlength=self._surfaces.counters
             )
         if keep_every > 1:
-            number_in_group = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
-            rows = np.flatnonzero(number_in_group % keep_every == 0)
+            rows = _rows_to_keep(counts, keep_every)
             ray = ray[rows]
             distance = distance[rows]
             triangle = triangle[rows]
@@ -312,6 +311,13 @@ class SceneCaster:
             frames,
         )
         return moving, shapes
+
+
+def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
+    """Return the rows of the first and then every n-th hit of groups with `counts` (g,) hits."""
+    starts = np.cumsum(counts) - counts
+    number_in_group = np.arange(int(counts.sum())) - np.repeat(starts, counts)
+    return np.flatnonzero(number_in_group % keep_every == 0)
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
