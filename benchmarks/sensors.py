@@ -137,8 +137,9 @@ class Peer:
 
     def __init__(self, name: str, python: str, job: Path, clock: str) -> None:
         script = Path(__file__).with_name("sensors_peers.py")
+        # -P: the folder of the script, which has a module `mujoco` too, is not searched.
         self._process = subprocess.Popen(
-            [python, str(script), name, str(job), clock],
+            [python, "-P", str(script), name, str(job), clock],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
