@@ -279,3 +279,43 @@ def test_garbled_traces_are_read_or_refused(tmp_path):
             build(scenario(tmp_path, "a_gt.osi"))
         except LidarError as error:
             assert "\n" not in str(error)
+
+
+def carried(folder, file, vehicle, **traffic):
+    """A scenario whose sensors are on a moving object of a trace."""
+    data = {
+        "scene": {"ground": {"margin_m": 60}, "copies": [{"name": "Post", "box": [1, 1, 3],
+                  "at": [[0, 9, 0]]}]},
+        "trajectory": {"vehicle": vehicle},
+        "sensor": {"model": "velodyne/vlp16"},
+        "mount": [0, 0, 2],
+        "traffic": {"file": file, **traffic},
+    }  # fmt: skip
+    return build(Scenario.from_data(data, folder=folder))
+
+
+@pytest.mark.parametrize("vehicle", ["host", 0])
+@pytest.mark.parametrize("host", [True, False])
+def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
+    written(tmp_path / "town_gt.osi", truths())
+    built = carried(tmp_path, "town_gt.osi", vehicle, host=host)
+    assert [actor.name for actor in built.scene.actors] == ["bus (7)", "pedestrian (9)"]
+    position, rotation = built.survey.trajectory.poses(0, np.array([1.5e9]))
+    # The bottom of a box of 1.5 m, whose middle is at height 0.75.
+    np.testing.assert_allclose(position + built.scene.origin, [[15, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(rotation[0], np.eye(3), atol=1e-12)
+
+    on_bus = carried(tmp_path, "town_gt.osi", 7, host=host)
+    names = ["car (0)"] if host else []
+    assert [actor.name for actor in on_bus.scene.actors] == [*names, "pedestrian (9)"]
+    with pytest.raises(LidarError, match=r"vehicle is '8', which .* There are 0, 7, 9, host\."):
+        carried(tmp_path, "town_gt.osi", 8)
+
+
+def test_the_carrier_of_a_survey_comes_back_from_its_trace(drive, tmp_path):
+    save_cloud(drive, tmp_path / "cloud.mcap", format="osi_mcap")
+    built = carried(tmp_path, "cloud.mcap", "host", offset_s=-START_NS / 1e9)
+    assert [actor.name for actor in built.scene.actors] == ["car (1)"]
+    position, rotation = built.survey.trajectory.poses(0, np.zeros(1))
+    np.testing.assert_allclose(position + built.scene.origin, [[0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(rotation[0], np.eye(3), atol=1e-6)

@@ -343,3 +343,57 @@ def test_what_is_wrong_with_traffic_is_told(tmp_path):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
     with pytest.raises(LidarError, match="surfaces names 'Street'"):
         build(scenario(tmp_path, traffic={"surfaces": "Street"}))
+
+
+def carried(folder, trajectory, text=FCD, **traffic):
+    """A scenario whose sensors are on a vehicle of the traffic."""
+    (folder / "fcd.xml").write_text(text)
+    data = {
+        "scene": {"ground": {"margin_m": 60}, "copies": [{"name": "Post", "box": [1, 1, 3],
+                  "at": [[0, 9, 0]]}]},
+        "trajectory": trajectory,
+        "mount": [0, 0, 2],
+        "sensor": {"model": "velodyne/vlp16"},
+        "traffic": {"file": "fcd.xml", "vehicles": SHAPES, **traffic},
+    }  # fmt: skip
+    return Scenario.from_data(data, folder=folder)
+
+
+def test_a_vehicle_of_the_traffic_carries_the_sensors(tmp_path):
+    rider = '<vehicle id="r" x="9" y="9" angle="0" type="car"/><person id="p" x="0"'
+    text = FCD.replace('<person id="p" x="0"', rider)
+    built = build(carried(tmp_path, {"vehicle": "p"}, text, offset_s=10))
+    assert [actor.name for actor in built.scene.actors] == ["car (r)"]
+    survey = built.survey
+    assert survey.trajectory.start_s == 11 and survey.duration_ns == pytest.approx(1e9, rel=0.11)
+    position, rotation = survey.trajectory.poses(0, np.array([0.5e9]))
+    # The frame of the mesh, whose foremost point is where SUMO says: it walks north.
+    np.testing.assert_allclose(position + built.scene.origin, [[0, 0.5 - 0.2, 0.5]], atol=1e-9)
+    np.testing.assert_allclose(rotation[0, :, 0], [0, 1, 0], atol=1e-9)
+
+    second = build(carried(tmp_path, {"vehicle": "a.1", "start_s": 3.25, "duration_s": 0.5}))
+    assert [actor.name for actor in second.scene.actors] == []
+    position, _ = second.survey.trajectory.poses(0, np.zeros(1))
+    front = position + second.scene.origin + [2 * 0.5**0.5, 2 * 0.5**0.5, 0]
+    np.testing.assert_allclose(front, [[42.5, 5, 0]], atol=1e-9)
+
+
+def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
+    for trajectory, message in (
+        ({"vehicle": "a.2"}, r"vehicle is 'a\.2', which fcd\.xml does not have .*'a\.1'"),
+        ({"vehicle": 7}, r"vehicle is '7', which .* There are a\.1, bus, p\."),
+        ({"vehicle": "bus"}, "vehicle is 'bus', which fcd.xml does not have for two time steps"),
+        ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
+        ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
+        ({"vehicle": "p", "offset_s": 1}, r"leave out trajectory\.offset_s"),
+        ({"vehicle": "p", "file": "a.tum"}, "give one of file, points and vehicle"),
+        ({"vehicle": ""}, "vehicle"),
+    ):
+        with pytest.raises(LidarError, match=message) as caught:
+            build(carried(tmp_path, trajectory))
+        assert "\n" not in str(caught.value)
+    with pytest.raises(LidarError, match=r"give traffic\.file"):
+        Scenario.from_data({"trajectory": {"vehicle": "p"}}, folder=tmp_path)
+    follower = {"name": "Van", "box": [4, 2, 2], "trajectory": {"vehicle": "p"}}
+    with pytest.raises(LidarError, match="vehicles of traffic are actors"):
+        scenario(tmp_path, actors=[follower])

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 from xml.parsers import expat
 
 import numpy as np
-from pydantic import Strict, model_validator
+from pydantic import BeforeValidator, Strict, model_validator
 
 from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.arrays import Floats
@@ -31,7 +31,7 @@ from lidarsim.base.declared import (
 )
 from lidarsim.base.errors import LidarError, message_of, prefixed
 from lidarsim.base.input_files import open_input
-from lidarsim.base.words import printable
+from lidarsim.base.words import did_you_mean, plural, printable
 from lidarsim.base.xmlfile import refuse_entity
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -125,8 +125,11 @@ class TimedPose(Section, Pose):
     time_s: Annotated[Seconds, about("seconds, by the clock of the trajectory")]
 
 
+Identity = Annotated[Text, BeforeValidator(lambda v: str(v) if type(v) is int else v)]
+
+
 class TrajectorySection(Section):
-    """Poses over time, from a file or from points; in YAML also just the file's name."""
+    """Poses over time, from a file, points or traffic; in YAML also just the file's name."""
 
     file: Annotated[
         Text | None,
@@ -167,6 +170,14 @@ class TrajectorySection(Section):
     points: Annotated[
         Several[TimedPose], about("instead of a file: time_s, position and angles, world metres")
     ] = ()
+    vehicle: Annotated[
+        Identity | None,
+        about(
+            "instead of a file, of the survey: identity of the vehicle of traffic that carries the "
+            "sensors; host is the host vehicle of OSI",
+            "host",
+        ),
+    ] = None
     interpolation: Annotated[
         Literal["linear", "smooth"], about("of positions and rotations; IMUs need smooth")
     ] = "linear"
@@ -194,7 +205,7 @@ class TrajectorySection(Section):
         ),
     ] = "refuse"
 
-    _one_source = one_of("file", "points")
+    _one_source = one_of("file", "points", "vehicle")
 
     def track(
         self, path: PathOf, standing: StandingSurfaces, start_s: float | None = None
@@ -310,6 +321,10 @@ class ActorSection(DeformingSection):
             trajectory.start_s is not None or trajectory.duration_s is not None
         ):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
+        if trajectory is not None and trajectory.vehicle is not None:
+            raise ValueError(
+                "trajectory.vehicle is of the survey's trajectory: vehicles of traffic are actors."
+            )
         if not self.robot and self.joints is not None:
             raise ValueError("joints are those of a robot: give a .urdf as its file.")
         if self.robot and (self.animation or self.wheels):
@@ -427,13 +442,46 @@ class TrafficPassage(Protocol):
     def kind(self) -> str:
         """Type in the simulation."""
 
-    def entry(self, section: TrafficSection) -> VehicleSection:
-        """Return the entry with the shape; LidarError if there is none."""
+    def entry(self, section: TrafficSection) -> VehicleSection | None:
+        """Return the entry with the shape.
+
+        None for a carrier of OSI without dimensions; LidarError if a vehicle of SUMO has none.
+        """
 
     def track(
-        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+        self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
         """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
+
+
+class TravellerChoice(NamedTuple):
+    """The vehicles and persons of a simulation that are read.
+
+    Attributes
+    ----------
+    only
+        Identity of the only one; None for all.
+    without
+        Identity of one that is left out.
+    """
+
+    only: str | None = None
+    without: str | None = None
+
+    def has(self, *identities: str) -> bool:
+        """Return whether one with these identities is read."""
+        if self.only is not None:
+            return self.only in identities
+        return self.without not in identities
+
+
+class TrafficContent(NamedTuple):
+    """Vehicles, persons and objects of a file of traffic between two times."""
+
+    passages: Sequence[TrafficPassage]  # in the order of their starts
+    counted: str  # number of vehicles and persons until the end, in words
+    left_out: Set[str] = frozenset()  # identities of those that were not to be read
+    notes: Sequence[str] = ()  # on what is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,9 +504,10 @@ class Passage:
         )
 
     def track(
-        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+        self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
         """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
+        assert mesh is not None, "each has an entry"
         times = np.array(self.times_s) + section.offset_s
         x, y, angle, z, slope = np.array(self.rows).reshape(-1, len(_ROW)).T
         fronts = np.column_stack([x, y, z]) + section.translation
@@ -479,14 +528,16 @@ class _PassageCollector:
     Rows before the first time are dropped, but for the last.
     """
 
-    def __init__(self, first_s: float, ignore: Sequence[str]) -> None:
+    def __init__(self, first_s: float, ignore: Sequence[str], choice: TravellerChoice) -> None:
         self.passages: list[Passage] = []
+        self.left_out: set[str] = set()  # identities that are not in `choice`
         # {(tag, identity): (last step, passage)}
         self.travellers: dict[tuple[str, str], tuple[int, Passage]] = {}
         self.step = -1
         self.time_s = -math.inf
         self._first_s = first_s
         self._ignore = ignore
+        self._choice = choice
         self._known_attributes = set(_KNOWN)
         self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
 
@@ -508,6 +559,9 @@ class _PassageCollector:
         if tag == "vehicle":
             self._vehicle_xy = xy
         elif xy == self._vehicle_xy:  # SUMO writes the riders of a vehicle after the vehicle
+            return
+        if not self._choice.has(attributes["id"]):
+            self.left_out.add(attributes["id"])
             return
         passage = self._passage(tag, attributes)
         if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
@@ -533,23 +587,23 @@ class _PassageCollector:
 
 
 def read_fcd(
-    path: Path, first_s: float, last_s: float, ignore: Sequence[str] = ()
-) -> tuple[list[Passage], int]:
+    path: Path,
+    first_s: float,
+    last_s: float,
+    ignore: Sequence[str] = (),
+    choice: TravellerChoice = TravellerChoice(),  # noqa: B008 - it never changes
+) -> TrafficContent:
     """Read the vehicles and persons between two times, with the time steps before and after.
 
     The file may be of any length: only these rows stay in memory. `ignore` are names of attributes
     to leave out, with * and ?.
-
-    Returns
-    -------
-    Passages in the order of their starts, and the number of vehicles and persons until the end.
 
     Raises
     ------
     LidarError
         If the file cannot be read, is no floating car data, or has unknown attributes.
     """
-    collector = _PassageCollector(first_s, ignore)
+    collector = _PassageCollector(first_s, ignore, choice)
     try:
         for tag, attributes in _elements(path):
             if tag == "timestep":
@@ -571,7 +625,8 @@ def read_fcd(
         for passage in collector.passages
         if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
     ]
-    return present, len(collector.travellers)
+    count = len(collector.travellers)
+    return TrafficContent(present, plural(count, "vehicle") + " and persons", collector.left_out)
 
 
 def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
@@ -600,6 +655,65 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
     parser.Parse(b"", True)
 
 
+def carrier_of(
+    entry: TrajectorySection,
+    section: TrafficSection,
+    content: TrafficContent,
+    shape_of: Callable[[VehicleSection], SceneMesh],
+    standing: StandingSurfaces,
+) -> Track:
+    """Return the local trajectory of the vehicle of the traffic that carries the sensors.
+
+    Its frame is that of the vehicle's mesh. `content` has passages of that vehicle alone; the
+    other arguments are as for `actors_of`.
+
+    Raises
+    ------
+    LidarError
+        If the vehicle is not in the simulation, has no shape, or is in the simulation for several
+        times and `entry` does not say for which.
+    """
+    tracks: list[Track] = []
+    for passage in content.passages:
+        shape = passage.entry(section)
+        mesh = None if shape is None else shape_of(shape)
+        tracks += _tracks_of(passage, section, mesh, standing, 0.0)
+    if not tracks:
+        known = sorted(content.left_out)
+        hint = did_you_mean(entry.vehicle or "", known) or (
+            f" There are {', '.join(known[:5])}." if known else ""
+        )
+        raise LidarError(
+            f"trajectory.vehicle is {entry.vehicle!r}, which {section.file} does not have for two "
+            f"time steps.{hint}"
+        )
+    start_s = entry.start_s
+    if start_s is not None:
+        covering = [t for t in tracks if t.times_s[0] <= start_s <= t.times_s[-1]]
+        tracks = covering or tracks
+    if len(tracks) > 1:
+        spans = ", ".join(f"{t.times_s[0]:g} to {t.times_s[-1]:g}" for t in tracks[:4])
+        raise LidarError(
+            f"vehicle {entry.vehicle!r} is in the traffic from {spans} s: give trajectory.start_s "
+            "and duration_s within one of these times."
+        )
+    return replace(tracks[0], start_s=start_s, duration_s=entry.duration_s, beyond="refuse")
+
+
+def _tracks_of(
+    passage: TrafficPassage,
+    section: TrafficSection,
+    mesh: SceneMesh | None,
+    standing: StandingSurfaces,
+    start_s: float,
+) -> Sequence[Track]:
+    """Return the local trajectories of a passage: several if it leaves `section.surfaces`."""
+    track = passage.track(section, mesh, standing.origin, start_s)
+    if section.surfaces:
+        return follow_surfaces(track, standing.of_objects(section.surfaces))
+    return [track]
+
+
 def actors_of(
     section: TrafficSection,
     passages: Sequence[TrafficPassage],
@@ -625,12 +739,11 @@ def actors_of(
         If a type has no shape, or there are too many actors.
     """
     actors: list[tuple[Actor, VehicleSection]] = []
-    surfaces = section.surfaces and standing.of_objects(section.surfaces)
     for passage in passages:
         entry = passage.entry(section)
+        assert entry is not None, "objects without a shape are no actors"
         mesh = shape_of(entry)
-        track = passage.track(section, mesh, standing.origin, start_s)
-        tracks = follow_surfaces(track, surfaces) if surfaces else [track]
+        tracks = _tracks_of(passage, section, mesh, standing, start_s)
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
         # Actors of an entry do not walk in step.
         share = zlib.crc32(passage.name.encode()) / 2**32

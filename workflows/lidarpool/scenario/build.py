@@ -44,10 +44,12 @@ from ..plan.planning import Search
 from .actor_motion import (
     ActorSection,
     MountSection,
-    TrafficPassage,
+    TrafficContent,
     TrafficSection,
+    TravellerChoice,
     VehicleSection,
     actors_of,
+    carrier_of,
     read_fcd,
 )
 from .ground import StandingSurfaces
@@ -178,7 +180,7 @@ def build(
     shapes = Shapes(scenario, findings)
     epsg = _common_epsg(scenario, findings)
     with prefixed(scenario.source):  # errors begin with the scenario's name
-        track = _carrier_track(scenario, static.standing)
+        track = _carrier_track(shapes, static.standing)
         sensors = _mounted_sensors(shapes)
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
@@ -249,11 +251,30 @@ class _SurveyParts(NamedTuple):
     epsg: int | None  # EPSG code of the rasters' coordinate system
 
 
-def _carrier_track(scenario: Scenario, standing: StandingSurfaces) -> Track | None:
+def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
     """Return the trajectory of the carrier in local coordinates; None without a trajectory."""
-    if scenario.trajectory is None:
+    scenario = shapes.scenario
+    entry = scenario.trajectory
+    if entry is None:
         return None
-    return scenario.trajectory.track(scenario.path, standing)
+    if entry.vehicle is None:
+        return entry.track(scenario.path, standing)
+    section = scenario.traffic
+    assert section is not None, "checked with the scenario"
+    content = _traffic_content(scenario, -np.inf, np.inf, TravellerChoice(only=entry.vehicle))
+    return carrier_of(entry, section, content, shapes.mesh_of, standing)
+
+
+def _traffic_content(
+    scenario: Scenario, first_s: float, last_s: float, choice: TravellerChoice
+) -> TrafficContent:
+    """Read the traffic of a scenario between two times, by the clock of its file."""
+    section = scenario.traffic
+    assert section is not None
+    file = scenario.path(section.file)
+    if file.suffix.lower() in OSI_SUFFIXES:
+        return read_osi(file, section, first_s, last_s, choice)
+    return read_fcd(file, first_s, last_s, section.ignore, choice)
 
 
 def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
@@ -417,24 +438,20 @@ def _traffic_actors(
     """
     file_start_s = start_s - section.offset_s
     findings = shapes.findings
-    file = shapes.scenario.path(section.file)
+    scenario = shapes.scenario
     file_stop_s = file_start_s + duration_s
-    passages: Sequence[TrafficPassage]
-    if file.suffix.lower() in OSI_SUFFIXES:
-        passages, count, notes = read_osi(file, section, file_start_s, file_stop_s)
-        findings.notes += notes
-        counted = plural(count, "moving object")
-    else:
-        passages, count = read_fcd(file, file_start_s, file_stop_s, section.ignore)
-        counted = f"{plural(count, 'vehicle')} and persons"
-    actors = actors_of(section, passages, shapes.mesh_of, standing, start_s)
+    carrier = None if scenario.trajectory is None else scenario.trajectory.vehicle
+    choice = TravellerChoice(without=carrier)
+    content = _traffic_content(scenario, file_start_s, file_stop_s, choice)
+    findings.notes += content.notes
+    actors = actors_of(section, content.passages, shapes.mesh_of, standing, start_s)
     if not actors:
         findings.notes.append(
             f"{section.file}: no vehicle or person is in the scene from {file_start_s:g} to "
             f"{file_stop_s:g} s of the file: check offset_s, translation and surfaces"
         )
     findings.sources[section.file] = (
-        f"{plural(len(actors), 'actor')} during the survey, of {counted} until its end"
+        f"{plural(len(actors), 'actor')} during the survey, of {content.counted} until its end"
     )
     return actors
 

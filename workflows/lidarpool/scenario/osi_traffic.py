@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,11 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Track
 from lidarsim.sensor.trajectory import quaternions_of, rotations_of
 
-from .actor_motion import TrafficSection, VehicleSection
+from .actor_motion import TrafficContent, TrafficSection, TravellerChoice, VehicleSection
 
 OSI_SUFFIXES = (".osi", ".mcap")
 _MAX_SIZE_M = 1e4  # of a moving object: ships and trains are shorter
+HOST = "host"  # identity of the host vehicle, beside its number
 _ROW = 6  # x, y, z of the box's centre, metres; yaw, pitch and roll, radians
 
 
@@ -37,28 +38,32 @@ class ObjectPassage:
     times_s: array[float] = field(default_factory=lambda: array("d"))
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` numbers at each time
 
-    def entry(self, section: TrafficSection) -> VehicleSection:
-        """Return the first entry that fits the type, or else a box of the object's size."""
+    def entry(self, section: TrafficSection) -> VehicleSection | None:
+        """Return the first entry that fits the type, or else a box of the object's size.
+
+        None without an entry and a size: the object is a carrier, since others are left out.
+        """
         matching = section.entry_of(self.kind)
-        if matching is not None:
+        if matching is not None or self.size is None:
             return matching
-        assert self.size is not None, "objects without a size and an entry are left out"
         return VehicleSection(box=self.size)
 
     def track(
-        self, section: TrafficSection, mesh: SceneMesh, origin: Floats, start_s: float
+        self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
         """Return the local trajectory of a mesh, above `section.surfaces` if there are any.
 
         OSI gives the middle of the object's box. The mesh stands on the bottom of the box, its
-        middle under that of the box.
+        middle under that of the box. Without a mesh, the trajectory is that of OSI's position.
         """
         rows = np.array(self.rows).reshape(-1, _ROW)
         centres = rows[:, :3] + section.translation
         angles_deg = np.degrees(rows[:, 3:])
-        lower, upper = mesh.bounds
-        height_m = upper[2] - lower[2] if self.size is None else self.size[2]
-        offset = np.array([*(lower[:2] + upper[:2]) / 2, lower[2] + height_m / 2])
+        offset = np.zeros(3)
+        if mesh is not None:
+            lower, upper = mesh.bounds
+            height_m = upper[2] - lower[2] if self.size is None else self.size[2]
+            offset = np.array([*(lower[:2] + upper[:2]) / 2, lower[2] + height_m / 2])
         if section.surfaces:
             centres[:, 2] = section.translation[2] + offset[2]
             angles_deg[:, 1:] = 0.0
@@ -69,18 +74,10 @@ class ObjectPassage:
         return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
 
 
-class TraceContent(NamedTuple):
-    """Moving objects of a trace between two times."""
-
-    passages: list[ObjectPassage]  # in the order of their starts
-    object_count: int  # number of moving objects until the end
-    notes: list[str]  # on what is left out
-
-
 class _PassageCollector:
     """Collects passages from messages; of those before the first time, the last is kept."""
 
-    def __init__(self, section: TrafficSection, first_s: float) -> None:
+    def __init__(self, section: TrafficSection, first_s: float, choice: TravellerChoice) -> None:
         self.passages: list[ObjectPassage] = []
         self.travellers: dict[int, tuple[int, ObjectPassage]] = {}  # {id: (last message, passage)}
         self.shapeless: dict[int, str] = {}  # {id: type} of objects without a size and an entry
@@ -88,6 +85,8 @@ class _PassageCollector:
         self.message = -1
         self._section = section
         self._first_s = first_s
+        self._choice = choice
+        self.left_out: set[str] = set()  # identities that are not in `choice`
 
     def add(self, truth: Any) -> None:
         """Add the moving objects of a message GroundTruth; ValueError if it is not valid."""
@@ -103,7 +102,11 @@ class _PassageCollector:
         host = None if truth.host_vehicle_id is None else truth.host_vehicle_id.value
         for moving in truth.moving_object:
             identity = 0 if moving.id is None else int(moving.id.value)
-            if self._section.host or identity != host:
+            is_host = identity == host
+            identities = (str(identity), HOST) if is_host else (str(identity),)
+            if not self._choice.has(*identities):
+                self.left_out.update(identities)
+            elif not is_host or self._section.host or self._choice.only is not None:
                 self._add_object(identity, moving)
 
     def _add_object(self, identity: int, moving: Any) -> None:
@@ -124,7 +127,8 @@ class _PassageCollector:
         if passage is None or last_message < self.message - 1:
             kind = _kind_of(moving)
             size = _size_of(moving)
-            if size is None and self._section.entry_of(kind) is None:
+            is_shapeless = size is None and self._section.entry_of(kind) is None
+            if is_shapeless and self._choice.only is None:
                 self.shapeless[identity] = kind
                 return None
             passage = ObjectPassage(str(identity), kind, size)
@@ -133,7 +137,13 @@ class _PassageCollector:
         return passage
 
 
-def read_osi(path: Path, section: TrafficSection, first_s: float, last_s: float) -> TraceContent:
+def read_osi(
+    path: Path,
+    section: TrafficSection,
+    first_s: float,
+    last_s: float,
+    choice: TravellerChoice = TravellerChoice(),  # noqa: B008 - it never changes
+) -> TrafficContent:
     """Read the moving objects of a trace between two times, and the messages before and after.
 
     Only these messages stay in memory.
@@ -144,7 +154,7 @@ def read_osi(path: Path, section: TrafficSection, first_s: float, last_s: float)
         If betterosi is missing, or the file cannot be read or has no ground truth.
     """
     need("betterosi", "osi", f"{path} is read")
-    collector = _PassageCollector(section, first_s)
+    collector = _PassageCollector(section, first_s, choice)
     stationary = 0
     for truth in _ground_truths(path):
         previous_s = collector.time_s
@@ -175,7 +185,8 @@ def read_osi(path: Path, section: TrafficSection, first_s: float, last_s: float)
         for passage in collector.passages
         if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
     ]
-    return TraceContent(present, len(collector.travellers), notes)
+    counted = plural(len(collector.travellers), "moving object")
+    return TrafficContent(present, counted, collector.left_out, notes)
 
 
 def _ground_truths(path: Path) -> Iterator[Any]:

@@ -117,7 +117,7 @@ class Scenario(Section):
         TrajectoryEntry | None,
         about(
             "instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
-            ".csv file, or points",
+            ".csv file, points, or a vehicle of traffic",
             "drive.tum",
         ),
     ] = None
@@ -296,6 +296,15 @@ class Scenario(Section):
             yield "trajectory.beyond is for actors; the carrier's has to cover the survey."
         if self.trajectory is not None and self.poses is not None:
             yield "give either poses or a trajectory, not both."
+        if self.trajectory is not None and self.trajectory.vehicle is not None:
+            if self.traffic is None:
+                yield "trajectory.vehicle is a vehicle of traffic: give traffic.file."
+            others = self.trajectory.model_fields_set - {"vehicle", "start_s", "duration_s"}
+            if others:
+                yield (
+                    f"leave out trajectory.{min(others)}: beside trajectory.vehicle there are "
+                    "start_s and duration_s; offsets, surfaces and interpolation are traffic's."
+                )
         carriers = [entry for entry in self.actors if entry.is_carrier]
         if carriers and self.trajectory is None:
             yield (
