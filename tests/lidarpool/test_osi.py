@@ -310,6 +310,11 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     assert [actor.name for actor in on_bus.scene.actors] == [*names, "pedestrian (9)"]
     with pytest.raises(LidarError, match=r"vehicle is '8', which .* There are 0, 7, 9, host\."):
         carried(tmp_path, "town_gt.osi", 8)
+    for truth in (nobody := list(truths())):
+        truth.host_vehicle_id = None
+    written(tmp_path / "nobody_gt.osi", nobody)
+    with pytest.raises(LidarError, match=r"may not name its host .*identity\. There are 0, 7, 9\."):
+        carried(tmp_path, "nobody_gt.osi", "host")
 
 
 def test_the_carrier_of_a_survey_comes_back_from_its_trace(drive, tmp_path):

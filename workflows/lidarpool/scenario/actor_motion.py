@@ -362,6 +362,7 @@ class ActorSection(DeformingSection):
             return self.trajectory.track(path, standing, start_s)
 
 
+HOST = "host"  # identity of the host vehicle of OSI, beside its number
 MAX_ACTORS = 10_000
 _PIECE_BYTES = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
@@ -683,6 +684,8 @@ def carrier_of(
         hint = did_you_mean(entry.vehicle or "", known) or (
             f" There are {', '.join(known[:5])}." if known else ""
         )
+        if entry.vehicle == HOST:
+            hint = f" It may not name its host vehicle: give an identity.{hint}"
         raise LidarError(
             f"trajectory.vehicle is {entry.vehicle!r}, which {section.file} does not have for two "
             f"time steps.{hint}"

@@ -20,11 +20,10 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Track
 from lidarsim.sensor.trajectory import quaternions_of, rotations_of
 
-from .actor_motion import TrafficContent, TrafficSection, TravellerChoice, VehicleSection
+from .actor_motion import HOST, TrafficContent, TrafficSection, TravellerChoice, VehicleSection
 
 OSI_SUFFIXES = (".osi", ".mcap")
 _MAX_SIZE_M = 1e4  # of a moving object: ships and trains are shorter
-HOST = "host"  # identity of the host vehicle, beside its number
 _ROW = 6  # x, y, z of the box's centre, metres; yaw, pitch and roll, radians
 
 
