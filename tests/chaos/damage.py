@@ -104,7 +104,7 @@ def merged(shards: Path) -> str:
         lidarpool.merge([shards / "part-1", shards / "part-2"], out)
         if not (out / "dataset.json").exists():
             return digest_of(np.fromfile(out / "cloud.ply", np.uint8))
-        return read_sweeps(out) + read_verified(out)
+        return read_sweeps(out) + read_verified(out).replace(str(out), "")
 
 
 class Resumed:

@@ -283,7 +283,7 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     [["sensors"], pytest.param(["run", "s.yaml", "--only", "cloud", "-q"], marks=pytest.mark.slow)],
 )
 def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nplanning: {enabled: false}\n")
+    (tmp_path / "s.yaml").write_text("sensor: {layers: 8}\nplanning: {enabled: false}\n")
     with subprocess.Popen(
         [sys.executable, "-m", "lidarpool", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,

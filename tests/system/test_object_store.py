@@ -319,7 +319,9 @@ def test_shards_in_the_bucket_are_merged_there_and_here(environment, lidarpool, 
                 assert lidarpool(*run, "--shard", f"{number}/2", "--out", place).code == 0
             for out in (f"{BUCKET}/{name}/all", tmp_path / f"{name}-all"):
                 done = lidarpool("merge", *shards, "--out", out, "-q")
-                assert (done.code, done.err) == (0, ""), done
+                assert done.code == 0, done
+                notice = "warning: 1 job has no points: 0000" if name == "campaign" else ""
+                assert done.err.partition(";")[0] == notice, done
     system, folder = fsspec.url_to_fs(f"{BUCKET}/campaign/all")
     system.invalidate_cache()
     found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
