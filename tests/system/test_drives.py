@@ -33,7 +33,7 @@ BAD = [
     ("trajectory: {file: t.txt, topic: /odom}", LINE, "topic is of bags"),
     ("trajectory: {file: t.txt, origin: [95, 0, 0]}", LINE, "origin"),
     ("trajectory: {file: t.txt, format: csv}", "x,y,z\n1,2,3\n", "no column 'time_s'"),
-    ("trajectory: {file: t.txt, points: [" + POINTS + "]}", LINE, "one of file, points and vehicle"),
+    ("trajectory: {file: t.txt, points: [" + POINTS + "]}", LINE, "one of file, points and"),
     ("trajectory: {points: [{position: [0, 0, 0]}]}", "", "time_s is missing"),
     ("trajectory: t.txt\nposes: [[0, 0, 1]]", LINE, "either poses or a trajectory"),
     ("sensors: {a: {}}\nmount: {yaw_deg: 3}", "", "either sensor and mount, or sensors"),
