@@ -547,6 +547,14 @@ def test_unknown_elements_are_named_once(tmp_path):
     assert [note.partition(" is read ")[2] for note in notes] == ["without 1 railroad, 2 bridge"]
 
 
+def test_what_is_left_out_is_counted_in_words(tmp_path):
+    for count, words in ((1, "1 object without a size"), (3, "3 objects without a size")):
+        notes = []
+        things = "".join(f"<object id='{k}' s='1' t='0' type='pole'/>" for k in range(count))
+        load(tmp_path, document(road(more=f"<objects>{things}</objects>")), notes)
+        assert [note.partition(" is read without ")[2] for note in notes] == [words]
+
+
 TINY_DASHES = mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken")
 ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
 

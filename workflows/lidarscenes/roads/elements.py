@@ -7,6 +7,7 @@ from collections.abc import Collection
 from math import isfinite
 from xml.etree.ElementTree import Element
 
+from lidarsim.base.words import plural
 from lidarsim.scene.files.scene_graph import MeshFileError
 
 MAX_SHOWN = 40  # letters of a value that an error shows
@@ -62,5 +63,11 @@ class UnreadElements:
                 self.add(child.tag)
 
     def __str__(self) -> str:
-        """Return counts and tags: «2 bridge, 1 CRG»; empty without elements."""
-        return ", ".join(f"{count} {tag}" for tag, count in self._counts.items())
+        """Return counts and tags, or words: «2 bridge, 3 objects without a size»; may be empty."""
+        return ", ".join(_counted(count, tag) for tag, count in self._counts.items())
+
+
+def _counted(count: int, tag: str) -> str:
+    """Return a count and a tag; of words, the first is in the plural for several."""
+    noun, space, rest = tag.partition(" ")
+    return f"{plural(count, noun)} {rest}" if space else f"{count} {tag}"

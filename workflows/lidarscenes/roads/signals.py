@@ -49,7 +49,7 @@ class SignalBuilder(NamedTuple):
             for element in group.iterfind("signal"):
                 self.unread.check(element, _KNOWN)
                 if _is_painted(element):
-                    self.unread.add("signal that is paint")
+                    self.unread.add("signal painted on the road")
                     continue
                 is_light = element.get("dynamic") in ("yes", "true", "1")
                 kind = "traffic light" if is_light else "traffic sign"
