@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
 from .mesh import Frame, LocalMesh, centre_and_scale, local_mesh
 from .opacity import Opacity
+from .poses import determinants
 from .tree import PAD
 
 MAX_TRIANGLES = 2**28 - 1  # of all meshes: positions in a tree have 31 bits, 3 of them for a leaf
@@ -293,7 +294,7 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
     rotation_scale = transforms[:, :, :3]
     with np.errstate(all="ignore"):
         lengths = np.sqrt((rotation_scale**2).sum(axis=1))
-        volume = np.abs(_determinants(rotation_scale)) / lengths.prod(axis=1)
+        volume = np.abs(determinants(rotation_scale.transpose(1, 2, 0))) / lengths.prod(axis=1)
     regular = volume >= _FLAT  # also False when it is not a number
     if not regular.all():
         row = int(regular.argmin())
@@ -367,9 +368,3 @@ def _inverse(matrices: Floats) -> Floats:
     across = across.transpose(2, 0, 1)
     volume = (matrices[:, :, 0] * across[:, 0]).sum(axis=1)
     return across / volume[:, None, None]
-
-
-def _determinants(matrices: Floats) -> Floats:
-    """Return the determinants (n,) of matrices (n, 3, 3)."""
-    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
-    return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))

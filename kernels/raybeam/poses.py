@@ -214,7 +214,7 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
         products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # of two rows each
         deviations = np.abs(products - np.eye(3)[:, :, None])
         orthonormal = (deviations <= _SLACK).all(axis=(0, 1))
-        mirrored = orthonormal & ~(_determinants(rows) > 0)
+        mirrored = orthonormal & ~(determinants(rows) > 0)
     invalid = np.flatnonzero(~orthonormal | mirrored)
     if not len(invalid):
         return matrices
@@ -230,7 +230,7 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     )
 
 
-def _determinants(rows: Floats) -> Floats:
+def determinants(rows: Floats) -> Floats:
     """Return the determinants (k,) of matrices by rows (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))

@@ -94,7 +94,7 @@ def test_the_estimate_is_safe_and_near(name):
         taken = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert taken < cast_bytes(SCENE, survey, scans) < 1.6 * taken
+    assert taken < cast_bytes(SCENE, survey, scans) < 1.5 * taken
 
 
 @given(st.floats(0, 1e10), st.sampled_from(sorted(SURVEYS)))

@@ -774,15 +774,9 @@ def quaternions_of(rotations: Floats) -> Floats:
     best = np.diagonal(table).argmax(axis=1)
     vectors = np.take_along_axis(table, best[None, None], axis=0)[0]
     for _ in range(_ROUNDS):
-        unit = vectors / _lengths(vectors)
+        unit = vectors / length(vectors.T)
         vectors = matmul_of_components(table, unit[:, None])[:, 0]
-    return np.ascontiguousarray((vectors / _lengths(vectors)).T)
-
-
-def _lengths(vectors: Floats) -> Floats:
-    """Return the lengths (k,) of vectors (4, k)."""
-    x, y, z, w = vectors * vectors
-    return np.asarray(np.sqrt(((x + y) + z) + w))
+    return np.ascontiguousarray((vectors / length(vectors.T)).T)
 
 
 def _travel_quaternions(slopes: Floats) -> Floats:

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ..base.elementary import exp
 from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor import Survey
@@ -164,7 +165,8 @@ def _returns(setup: Setup) -> float:
     if mode == "all":
         added = sum(added_by_step)
     elif reports_two:
-        added = sum(min(count, 1.0) for count in added_by_step)
+        # The share of pulses to which a step adds a return, if returns are added independently.
+        added = sum(1 - float(exp(-count)) for count in added_by_step)
     if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added
     in_leaves = setup.leafy and subrays > 1 and mode == "all"
