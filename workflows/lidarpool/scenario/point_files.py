@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +12,18 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance, bytes_of, memory
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints
-from lidarsim.base.errors import LidarError, explained, prefixed
+from lidarsim.base.errors import LidarError, explained, prefixed, unreadable
 from lidarsim.base.extras import need
-from lidarsim.base.input_files import check_input, input_size, read_input, read_input_text
+from lidarsim.base.input_files import check_input, input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, printable
+from lidarsim.scene.files.cloud_formats import SCAN_READERS
+from lidarsim.scene.files.cloud_scan import CloudScan, with_usual_names
 from lidarsim.scene.files.las import las_units, open_las
 from lidarsim.scene.files.mesh_formats import advice_on
-from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import read_ply_columns
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.transform import affine
-
-from ..base.open3d_module import load_open3d
 
 MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
@@ -91,6 +88,8 @@ class _FileContent:
     columns: Columns
     scanners: Floats | None = None  # (n, 3): NaN where unknown
     ignored: list[str] = field(default_factory=list)
+    no_returns: int = 0  # points at zero that are left out
+    units_m: tuple[float, float, float] | None = None  # of x, y and z, if the file states them
 
 
 def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> ScannedPoints:
@@ -120,16 +119,23 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
         )
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
-            check_input(path)
+            if not check_input(path):
+                raise LidarError("it is empty (0 bytes).")
             metres = _unit_lengths_m(path, unit, tell)
             content = _READERS[suffix](path)
+            if content.units_m is not None and unit is None:
+                metres = np.array(content.units_m)
             points = _scanned_points(content, metres)
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
-        reason = printable(str(error).partition("\n")[0])[:200] or type(error).__name__
-        raise LidarError(f"{path} is broken or cut short ({reason}).") from error
+        raise LidarError(unreadable(path, error)) from error
     _check_points(path, points)
+    if content.no_returns:
+        tell(
+            f"{path}: {content.no_returns:,} points at zero are left out, as pulses without a "
+            "return"
+        )
     if names := _left_out(content):
         tell(f"{path}: not kept, because surfels have no room for them: {', '.join(names)}")
     return points
@@ -139,8 +145,7 @@ def _check_points(path: Path, points: ScannedPoints) -> None:
     """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
     if len(points) < MIN_POINTS:
         raise LidarError(
-            f"{path} has {len(points)} points, and at least {MIN_POINTS} are needed: it is empty, "
-            "cut short, or no point cloud."
+            f"{path} has {plural(len(points), 'point')}, and at least {MIN_POINTS} are needed."
         )
     if (reach := np.abs(points.positions).max()) > MAX_COORDINATE_M:
         raise LidarError(
@@ -248,65 +253,82 @@ def _from_columns(columns: Columns) -> _FileContent:
 
 def _read_ply(path: Path) -> _FileContent:
     """Read the vertices of a .ply."""
-    return _from_columns(read_ply_columns(read_input(path)))
+    return _from_columns(with_usual_names(read_ply_columns(read_input(path))))
 
 
-def _read_pcd(path: Path) -> _FileContent:
-    """Read points of a .pcd; Open3D reads all encodings but text.
-
-    Open3D returns uninitialised memory as points for truncated text.
-    """
-    header = checked_pcd(path)
-    count = int(header["POINTS"][0])
-    if header["DATA"][0] == "ascii":
-        content = _from_columns(_read_pcd_text(path, header))
-    else:
-        o3d = load_open3d()
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            cloud = o3d.t.io.read_point_cloud(str(path), format="pcd")
-        content = _from_columns(_open3d_columns(cloud))
-    if len(content.positions) != count:
-        raise ValueError(f"{count:,} points announced, and {len(content.positions):,} are there")
+def _read_scans(path: Path) -> _FileContent:
+    """Read a cloud of a format whose reader returns scans, joined in the frame of the file."""
+    scans = SCAN_READERS[path.suffix.lower()](path)
+    _check_count(sum(len(scan.positions) for scan in scans))
+    content = _joined([_placed(scan) for scan in scans])
+    content.units_m = scans[0].units_m
     return content
 
 
-def _open3d_columns(cloud: Any) -> Columns:
-    """Return the columns of a cloud of Open3D, with x, y and z, nx, ny and nz, red, green, blue."""
-    vectors = {"positions": "xyz", "normals": _NORMALS[0], "colors": _COLOURS[0]}
-    columns: Columns = {}
-    for name, tensor in cloud.point.items():
-        values = tensor.numpy()
-        for axis, values_of_axis in enumerate(values.T):
-            columns[vectors[name][axis] if name in vectors else name] = values_of_axis
-    return columns
+def _placed(scan: CloudScan) -> _FileContent:
+    """Return a scan in the frame of the file, without the pulses that had no return."""
+    positions = scan.positions
+    columns = scan.columns
+    scanner = np.full(3, np.nan) if scan.scanner is None else scan.scanner
+    # Drivers write zeros for pulses without a return; a few points at zero may be points.
+    is_return = positions.any(axis=1)
+    no_returns = int(len(positions) - is_return.sum())
+    if no_returns < MIN_POINTS:
+        no_returns = 0
+    else:
+        positions = positions[is_return]
+        columns = {name: values[is_return] for name, values in columns.items()}
+    if scan.pose is not None:
+        rotation = scan.pose[:3, :3]
+        offset = scan.pose[:3, 3]
+        positions = positions @ rotation.T + offset
+        columns |= _rotated(columns, _NORMALS, rotation, np.zeros(3))
+        columns |= _rotated(columns, _ORIGINS, rotation, offset)
+    if all(name in columns for name in _ORIGINS[0]):
+        scanner = np.full(3, np.nan)  # an origin for each ray is more exact
+    return _FileContent(
+        positions,
+        columns,
+        np.tile(scanner, (len(positions), 1)),
+        list(scan.unread),
+        no_returns=no_returns,
+    )
 
 
-def _read_pcd_text(path: Path, header: Mapping[str, list[str]]) -> Columns:
-    """Return the columns of a .pcd of text."""
-    repeats = list(map(int, header.get("COUNT", ["1"] * len(header["FIELDS"]))))
-    starts = accumulate(repeats, initial=0)
-    _, _, rows = read_input(path).partition(b"\nDATA ascii")
-    values = np.loadtxt(io.BytesIO(rows), skiprows=1, ndmin=2)
-    columns = dict(zip(header["FIELDS"], values.T[list(starts)[:-1]], strict=True))
-    for name in ("rgb", "rgba"):  # bits 0x00RRGGBB, as an integer or as a real number
-        if name not in columns:
-            continue
-        is_real = header["TYPE"][header["FIELDS"].index(name)] == "F"
-        packed = columns.pop(name)
-        bits = packed.astype("<f4").view("<u4") if is_real else packed.astype(np.uint32)
-        for shift, colour in zip((16, 8, 0), _COLOURS[0], strict=True):
-            columns[colour] = (bits >> shift & 255).astype(np.uint8)
-    return columns
+def _rotated(
+    columns: Columns, names: Iterable[Vectors], rotation: Floats, offset: Floats
+) -> Columns:
+    """Return columns of vectors, rotated and moved by an offset."""
+    rotated: Columns = {}
+    for axes in names:
+        if all(name in columns for name in axes):
+            vectors = np.stack([columns[name] for name in axes], axis=1).astype(np.float64)
+            rotated |= zip(axes, (vectors @ rotation.T + offset).T, strict=True)
+    return rotated
 
 
-def _read_xyz(path: Path) -> _FileContent:
-    """Read the first three numbers of each line."""
-    text = read_input_text(path)
-    positions = np.loadtxt(io.StringIO(text), usecols=(0, 1, 2), ndmin=2)
-    lines = (line.split("#")[0].split() for line in text.splitlines())
-    surplus = len(next((words for words in lines if words), ())) - 3
-    ignored = [f"{plural(surplus, 'column')} after x, y and z"] if surplus > 0 else []
-    return _FileContent(positions, {}, ignored=ignored)
+def _joined(scans: Sequence[_FileContent]) -> _FileContent:
+    """Return the content of scans in the frame of one file.
+
+    A quantity that only some scans have is zero in the others.
+    """
+    kinds = {name: values.dtype for scan in scans for name, values in scan.columns.items()}
+    columns = {
+        name: np.concatenate(
+            [scan.columns.get(name, np.zeros(len(scan.positions), kind)) for scan in scans]
+        )
+        for name, kind in kinds.items()
+    }
+    positions = np.concatenate([scan.positions for scan in scans])
+    scanners = np.concatenate([scan.scanners for scan in scans if scan.scanners is not None])
+    has_scanner = np.isfinite(scanners).any()
+    return _FileContent(
+        positions,
+        columns,
+        scanners if has_scanner else None,
+        list(dict.fromkeys(name for scan in scans for name in scan.ignored)),
+        no_returns=sum(scan.no_returns for scan in scans),
+    )
 
 
 def _check_count(count: int) -> None:
@@ -342,18 +364,7 @@ def _read_e57(path: Path) -> _FileContent:
         file.close()
     if not scans:
         raise ValueError("it has no scans")
-    # A quantity that only some scans have is zero in the others.
-    columns = {
-        name: np.concatenate(
-            [scan.columns.get(name, np.zeros(len(scan.positions), values.dtype)) for scan in scans]
-        )
-        for name, values in {n: c for scan in scans for n, c in scan.columns.items()}.items()
-    }
-    positions = np.concatenate([scan.positions for scan in scans])
-    scanners = np.concatenate([scan.scanners for scan in scans if scan.scanners is not None])
-    ignored = list(dict.fromkeys(name for scan in scans for name in scan.ignored))
-    has_pose = np.isfinite(scanners).any()
-    return _FileContent(positions, columns, scanners if has_pose else None, ignored)
+    return _joined(scans)
 
 
 def _read_scan(file: Any, number: int, header: Any) -> _FileContent:
@@ -390,10 +401,9 @@ def _positions_of_scan(columns: Columns, kind: str) -> Floats:
 
 _READERS: dict[str, Callable[[Path], _FileContent]] = {
     ".ply": _read_ply,
-    ".pcd": _read_pcd,
-    ".xyz": _read_xyz,
     ".las": _read_las,
     ".laz": _read_las,
     ".e57": _read_e57,
+    **dict.fromkeys(SCAN_READERS, _read_scans),
 }
 SUFFIXES = tuple(_READERS)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
 from lidarsim.scene.files.scene_graph import MeshFileError
 
@@ -60,7 +60,7 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(f"it is broken or cut short ({error}): export it again.") from error
+        raise LidarError(unreadable("it", error)) from error
 
 
 def _materials(world: World) -> dict[str, Any]:

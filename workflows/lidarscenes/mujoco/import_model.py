@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import arctan2, cos, sin
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import length, turned
 from lidarsim.base.words import printable
@@ -101,7 +101,7 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(f"it is broken or cut short ({error}): export it again.") from error
+        raise LidarError(unreadable("it", error)) from error
 
 
 def _groups(model: Any) -> dict[_Group, list[int]]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from .words import printable
+
 MAX_MISTAKES = 20
+_MAX_REASON = 400  # letters: libraries may quote a whole file
 
 
 class LidarError(Exception):
@@ -14,6 +17,10 @@ class LidarError(Exception):
     The message says in one or two lines what was given, what was expected and what to do. The
     command prints the message without a traceback and exits with code 2.
     """
+
+
+class CutShortError(ValueError):
+    """An error of a file whose end is missing: what is announced, and what is there."""
 
 
 def message_of(error: Exception) -> str:
@@ -28,6 +35,25 @@ def message_of(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         message = error.strerror
     return " ".join(message.split()).rstrip(".") + "."
+
+
+def unreadable(subject: object, error: Exception, advice: str = "") -> str:
+    """Return a sentence on the error, of any class, of reading a file.
+
+    Examples
+    --------
+    >>> unreadable("vlp16.yaml", KeyError("lasers"))
+    "vlp16.yaml cannot be read: 'lasers' is missing."
+    >>> unreadable("a.stl", CutShortError("line 7 is the last"), "export it again")
+    'a.stl is cut short (line 7 is the last): export it again.'
+    """
+    failure = "is cut short" if isinstance(error, CutShortError) else "cannot be read"
+    reason = type(error).__name__
+    if str(error):
+        reason = printable(message_of(error), _MAX_REASON).rstrip(".")
+    return f"{subject} {failure} ({reason}): {advice}." if advice else (
+        f"{subject} {failure}: {reason}."
+    )
 
 
 @contextmanager

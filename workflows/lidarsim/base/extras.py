@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from .errors import LidarError, prefixed
-from .words import printable
+from .errors import LidarError, prefixed, unreadable
 
 
 def install_command(*requirements: str) -> str:
@@ -38,5 +37,4 @@ def reading(name: str) -> Iterator[None]:
         file = "" if error.filename in (None, name) else f", {error.filename}"
         raise LidarError(f"{name} cannot be read: {error.strerror or error}{file}.") from error
     except Exception as error:  # libraries raise errors of any class
-        reason = printable(str(error).partition("\n")[0]) or type(error).__name__
-        raise LidarError(f"{name} is broken or cut short ({reason}).") from error
+        raise LidarError(unreadable(name, error)) from error

@@ -61,10 +61,10 @@ def as_text(name: bytes) -> str:
         return name.decode("latin-1")
 
 
-def printable(text: str) -> str:
-    """Return text from a file in a line of at most 200 letters, without control characters."""
+def printable(text: str, max_letters: int = 200) -> str:
+    """Return text from a file in a line of limited length, without control characters."""
     cleaned = "".join(letter if letter.isprintable() else " " for letter in text)
-    return " ".join(cleaned.split())[:200]
+    return " ".join(cleaned.split())[:max_letters]
 
 
 def shortened(name: str, max_letters: int = 18) -> str:

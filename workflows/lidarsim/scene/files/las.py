@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ...base.allowance import Allowance
-from ...base.errors import LidarError
+from ...base.errors import CutShortError, LidarError
 from ...base.extras import install_command
 from ...base.input_files import open_input
 from .las_units import CoordinateUnits, units_of
@@ -28,6 +28,8 @@ _PROJECTION = b"LASF_Projection"
 _MAX_EXTENDED = 1_000  # extended records that are searched for a coordinate system
 _MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
 _WKT_BIT = 16  # of the global encoding: the coordinate system is WKT
+_SIGNATURE = b"LASF"  # first bytes
+_EARLY_END = "failed to fill whole buffer"  # in the error of lazrs at the end of a file
 _SMALLER = "write it as .las, or thin it first"
 
 
@@ -56,9 +58,16 @@ def open_las(path: Path) -> Iterator[Any]:
             header = reader.header
             announced = header.point_count * header.point_format.size
             if not header.are_points_compressed and points_start + announced > size:
-                raise ValueError(f"{header.point_count:,} points announced, but there are fewer")
+                raise CutShortError(
+                    f"{header.point_count:,} points announced, and there are fewer"
+                )
             Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
-            yield reader
+            try:
+                yield reader
+            except Exception as error:  # lazrs has an error of its own, whose text tells its kind
+                if _EARLY_END not in str(error):
+                    raise
+                raise CutShortError("its packed points end too early") from error
 
 
 def las_units(path: Path) -> CoordinateUnits | None:
@@ -96,7 +105,7 @@ def _records(
         file.seek(start)
         data = file.read(head.size)
         if len(data) < head.size:
-            raise ValueError("its variable-length records are cut short")
+            raise CutShortError("its variable-length records end too early")
         user, number, size = head.unpack(data)
         if user.rstrip(b"\0") == _PROJECTION and size <= _MAX_RECORD:
             yield number, file.read(size)
@@ -110,9 +119,19 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
     four thousand million records.
     """
     header_size, points_start, records = _unpacked(file, *_LAYOUT)
+    file.seek(0)
+    if file.read(len(_SIGNATURE)) != _SIGNATURE:
+        raise ValueError("its first bytes are not LASF, with which a .las or .laz begins")
     size = os.fstat(file.fileno()).st_size
-    if header_size + _VLR.size * records > points_start or points_start > size:
-        raise ValueError("its header is wrong")
+    if points_start > size:
+        raise CutShortError(
+            f"its points begin at byte {points_start:,}, and it has {size:,}"
+        )
+    if header_size + _VLR.size * records > points_start:
+        raise ValueError(
+            f"its header announces {records:,} variable-length records, which do not fit between "
+            f"its end and its points (bytes {header_size:,} to {points_start:,})"
+        )
     return header_size, points_start, records
 
 
@@ -121,5 +140,5 @@ def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, 
     file.seek(offset)
     data = file.read(layout.size)
     if len(data) < layout.size:
-        raise ValueError("its header is cut short")
+        raise CutShortError("its header ends too early")
     return layout.unpack(data)

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
-from ...base.errors import LidarError, prefixed
+from ...base.errors import CutShortError, LidarError, prefixed, unreadable
 from ...base.extras import install_command
 from ...base.input_files import open_input, read_input
 from ...base.validation import checked
@@ -399,10 +399,14 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
             raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
         # Readers raise errors of any class: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
-        reason = printable(str(error)) or type(error).__name__
         raise LidarError(
-            f"{path} is broken or cut short ({reason}): export it again.{_other_format(path, data)}"
+            f"{unreadable(path, error, _advice(error))}{_other_format(path, data)}"
         ) from error
+
+
+def _advice(error: Exception) -> str:
+    """Return the advice on a file that a reader refused."""
+    return f"{'' if isinstance(error, CutShortError) else 'correct it, or '}export it again"
 
 
 def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOptions) -> Content:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
+from ...base.errors import CutShortError
 from ...base.words import as_text
 from ..colours import Colours, as_bytes
 from ..scene_mesh import SceneMesh
@@ -436,7 +437,9 @@ def _ply_header(data: bytes) -> _PlyHeader:
     header_match = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
     header_match = header_match or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
     if not header_match:
-        raise ValueError("no PLY header, or cut within it")
+        if data.startswith(b"ply"):
+            raise CutShortError("its header has no line end_header")
+        raise ValueError("its first line is not 'ply', with which the header of a .ply begins")
     elements: list[_Element] = []
     order = ""
     for line in (header_match[1] or b"").decode("latin-1").splitlines():
@@ -568,7 +571,7 @@ class _PlyElementReader:
             spans.append((offset, size))
             offset += size * self._kinds[name].itemsize
         if offset > len(body):
-            raise ValueError(
-                f"{element.count:,} rows of {element.name[:20]} announced, but there are fewer"
+            raise CutShortError(
+                f"{element.count:,} rows of {element.name[:20]} announced, and there are fewer"
             )
         return spans, offset

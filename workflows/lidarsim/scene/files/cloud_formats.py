@@ -1,0 +1,27 @@
+"""Formats of cloud files that are read as scans: a row for each ending."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from .cloud_scan import CloudScan
+from .float_rows import read_float_rows
+from .npy_cloud import read_npy_cloud
+from .pcd import read_pcd
+from .pts import read_pts
+from .ptx import read_ptx
+from .text_cloud import read_text_cloud
+
+# {ending: reader, which raises ValueError for a broken file}
+SCAN_READERS: dict[str, Callable[[Path], list[CloudScan]]] = {
+    ".pcd": read_pcd,
+    ".xyz": read_text_cloud,
+    ".txt": read_text_cloud,
+    ".asc": read_text_cloud,
+    ".csv": read_text_cloud,
+    ".pts": read_pts,
+    ".ptx": read_ptx,
+    ".npy": read_npy_cloud,
+    ".bin": read_float_rows,
+}

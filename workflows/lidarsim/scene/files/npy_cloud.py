@@ -1,0 +1,93 @@
+"""Clouds in arrays of NumPy (.npy): rows of numbers, or records with the fields x, y and z."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from ...base.arrays import AnyArray
+from ...base.errors import CutShortError
+from ...base.input_files import check_input, open_input
+from ...base.words import printable
+from .cloud_scan import CloudScan, with_usual_names
+
+_EXPECTED = "an array (points, 3 or more), or records with the fields x, y and z, were expected"
+
+
+def read_npy_cloud(path: Path) -> list[CloudScan]:
+    """Read the points of an array: x, y and z are its first three columns, or fields.
+
+    Columns after z are `column_4`, …. The rows of a range image (rows, columns, 3 or more) are
+    points, too.
+
+    Raises
+    ------
+    ValueError
+        If the array is not that of a cloud, or the file is shorter than the array.
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        If the file cannot be read.
+    """
+    size = check_input(path)
+    with open_input(path) as file:
+        array = _read_array(file, size)
+    columns: dict[str, AnyArray]
+    if array.dtype.names is not None:
+        columns = _fields(array.reshape(-1))
+    elif array.ndim in (2, 3) and array.shape[-1] >= 3:
+        rows = array.reshape(-1, array.shape[-1])
+        names = ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, rows.shape[1]))]
+        columns = dict(zip(names, rows.T, strict=True))
+    else:
+        raise ValueError(f"its array has the shape {array.shape}: {_EXPECTED}")
+    positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
+    return [CloudScan(positions, columns)]
+
+
+def _fields(records: AnyArray) -> dict[str, AnyArray]:
+    """Return the fields of records (n,) by their usual names; ValueError without x, y and z."""
+    columns: dict[str, AnyArray] = {}
+    for name in records.dtype.names or ():
+        values = records[name]
+        if values.ndim == 1:
+            columns[name] = values
+            continue
+        numbers = values.reshape(len(values), -1)
+        columns |= {f"{name}_{index}": column for index, column in enumerate(numbers.T)}
+    columns = with_usual_names(columns)
+    if not {*"xyz"} <= columns.keys():
+        raise ValueError(f"its fields are {printable(', '.join(columns))}: {_EXPECTED}")
+    return columns
+
+
+def _read_array(file: BinaryIO, size: int) -> AnyArray:
+    """Return the array of numbers in a file of a size in bytes; ValueError for other files."""
+    layout: Any = np.lib.format
+    readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
+    version = layout.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"it has the version {version} of .npy: 1.0 or 2.0 were expected")
+    shape, is_fortran, kind = readers[version](file)
+    if not _holds_numbers(kind):
+        raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}: {_EXPECTED}")
+    announced = math.prod(shape) * kind.itemsize
+    there = size - file.tell()
+    if announced != there:
+        failure = CutShortError if there < announced else ValueError
+        raise failure(
+            f"its array {shape} has {announced:,} bytes, and {there:,} are there"
+        )
+    array: AnyArray = np.frombuffer(file.read(), kind)
+    array = array.astype(kind.newbyteorder("="))
+    return array.reshape(shape, order="F" if is_fortran else "C")
+
+
+def _holds_numbers(kind: np.dtype[Any]) -> bool:
+    """Return True if an array of a type has real numbers alone."""
+    if kind.names is not None:
+        return all(_holds_numbers(kind[name]) for name in kind.names)
+    return kind.base.kind in "biuf"

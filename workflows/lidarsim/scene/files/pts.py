@@ -1,0 +1,115 @@
+"""Clouds of Leica's .pts: the number of points, and a point in each line; often several of these.
+
+Leica Cyclone writes x, y, z, an intensity from -2048 to 2047, and red, green and blue; other
+programs leave out the intensity, the colours, or the number of points.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+
+from ...base.arrays import AnyArray, Floats
+from ...base.errors import CutShortError
+from ...base.input_files import check_input, open_input
+from ...base.words import plural, printable
+from .cloud_scan import CloudScan
+from .text_rows import RowReader
+
+COLOURS = ("red", "green", "blue")
+_NAMES = {  # {cells of a line: names}
+    3: ("x", "y", "z"),
+    4: ("x", "y", "z", "intensity"),
+    6: ("x", "y", "z", *COLOURS),
+    7: ("x", "y", "z", "intensity", *COLOURS),
+}
+_LOWEST_INTENSITY = -2048  # of Leica's scale, which is 4096 wide
+
+
+def read_pts(path: Path) -> list[CloudScan]:
+    """Read the clouds of a .pts, all in one frame.
+
+    Intensities are shifted to begin at 0 if some are negative.
+
+    Raises
+    ------
+    ValueError
+        If a line is wrong, or a cloud has another number of points than announced; the message
+        names the line.
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        If the file cannot be read.
+    """
+    check_input(path)
+    scans = []
+    with open_input(path) as file:
+        lines = enumerate(io.TextIOWrapper(file, "utf-8-sig", "replace"), 1)
+        while (entry := next_line(lines)) is not None:
+            number, line = entry
+            count: int | None = None
+            if line.strip().isdecimal():
+                count = int(line)
+            else:
+                lines = chain([entry], lines)
+            scans.append(_read_cloud(lines, number, count))
+    if not scans:
+        raise ValueError("it is empty: the number of points was expected")
+    return scans
+
+
+def next_line(lines: Iterator[tuple[int, str]]) -> tuple[int, str] | None:
+    """Return the next line that is not blank, with its number; None at the end."""
+    return next(((number, line) for number, line in lines if not line.isspace()), None)
+
+
+def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None) -> CloudScan:
+    """Return the next `count` points, or all points without a count, after line `number`."""
+    if count == 0:
+        return CloudScan(np.zeros((0, 3)), {})
+    first = next_line(lines)
+    if first is None:
+        raise CutShortError(
+            f"line {number} announces {count:,} points, and none follow"
+        )
+    names = names_of_cells(first, _NAMES)
+    texts = (line for _, line in chain([first], lines))
+    values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
+    if count is not None and len(values) < count:
+        raise CutShortError(
+            f"line {number} announces {count:,} points, and {len(values):,} follow"
+        )
+    columns = point_columns(values, names)
+    intensities = columns.get("intensity")
+    if intensities is not None and intensities.min() < 0:
+        columns["intensity"] = intensities - _LOWEST_INTENSITY
+    return CloudScan(values[:, :3], columns)
+
+
+def names_of_cells(
+    entry: tuple[int, str], names: dict[int, tuple[str, ...]]
+) -> tuple[str, ...]:
+    """Return the names of the cells of a line, by their number; ValueError for another number."""
+    number, line = entry
+    count = len(line.split())
+    if count not in names:
+        expected = " or ".join(" ".join(cells) for cells in names.values())
+        raise ValueError(
+            f"line {number} is {printable(line)[:60]!r}, which has {plural(count, 'cell')}: "
+            f"{expected} was expected"
+        )
+    return names[count]
+
+
+def point_columns(values: Floats, names: Sequence[str]) -> dict[str, AnyArray]:
+    """Return the columns of rows (n, k) after x, y and z; colours of 0 to 255 as bytes."""
+    columns: dict[str, AnyArray] = {}
+    for index, name in enumerate(names[3:], 3):
+        columns[name] = values[:, index]
+        if name in COLOURS:
+            columns[name] = np.clip(np.rint(values[:, index]), 0, 255).astype(np.uint8)
+    return columns

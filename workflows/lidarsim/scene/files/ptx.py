@@ -1,0 +1,148 @@
+"""Scans of Leica's .ptx: a header of ten lines, then a point for each cell of the scanner's grid.
+
+The header is the number of columns and of rows, the scanner's position and its axes x, y and z, and
+a matrix of four rows by which a point is multiplied from the left: its last row is the position.
+Points without a return are zeros.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.errors import CutShortError
+from ...base.input_files import check_input, open_input
+from ...base.words import plural, printable
+from ..transform import affine
+from .cloud_scan import CloudScan
+from .pts import COLOURS, names_of_cells, next_line, point_columns
+from .text_rows import RowReader
+
+_NAMES = {  # {cells of a line: names}
+    4: ("x", "y", "z", "intensity"),
+    7: ("x", "y", "z", "intensity", *COLOURS),
+}
+_HEADER_LINES = (  # numbers of each line, and their meaning
+    (1, "the number of columns"),
+    (1, "the number of rows"),
+    (3, "the position of the scanner"),
+    (3, "the scanner's axis x"),
+    (3, "the scanner's axis y"),
+    (3, "the scanner's axis z"),
+    (4, "the first row of the transformation"),
+    (4, "the second row of the transformation"),
+    (4, "the third row of the transformation"),
+    (4, "the last row of the transformation"),
+)
+_MAX_ROTATION_ERROR = 1e-3  # of the transformation's axes, which are rounded
+
+_Lines = Iterator[tuple[int, str]]
+
+
+def read_ptx(path: Path) -> list[CloudScan]:
+    """Read the scans of a .ptx, each in the frame of its scanner, with its pose.
+
+    Raises
+    ------
+    ValueError
+        If a line is wrong, or a scan has fewer points than its header announces; the message names
+        the line.
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        If the file cannot be read.
+    """
+    size = check_input(path)
+    scans = []
+    with open_input(path) as file:
+        lines = enumerate(io.TextIOWrapper(file, "utf-8-sig", "replace"), 1)
+        while (entry := next_line(lines)) is not None:
+            scans.append(_read_scan(entry, lines, size))
+    if not scans:
+        raise ValueError("it is empty: the header of a .ptx was expected")
+    return scans
+
+
+def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
+    """Return the scan whose header begins with a line, from a file of a size in bytes."""
+    start = entry[0]
+    header = [_header_numbers(entry, *_HEADER_LINES[0])]
+    for width, meaning in _HEADER_LINES[1:]:
+        following = next_line(lines)
+        if following is None:
+            raise CutShortError(
+                f"its header of ten lines from line {start} on has "
+                f"{plural(len(header), 'line')}, and {meaning} was expected next"
+            )
+        header.append(_header_numbers(following, width, meaning))
+    (columns,), (rows,), position = header[:3]
+    if min(columns, rows) < 0 or columns % 1 or rows % 1:
+        raise ValueError(
+            f"line {start} and the next are {columns:g} and {rows:g}: the numbers of columns and "
+            "rows were expected"
+        )
+    count = int(columns) * int(rows)
+    pose = _pose(np.array(header[6:]), start)
+    # Programs that write points in the frame of the file give no transformation.
+    is_placed = np.array_equal(pose, np.eye(4))
+    scanner = np.array(position) if is_placed else pose[:3, 3]
+    if not count:
+        return CloudScan(np.zeros((0, 3)), {}, pose, scanner)
+    first = next_line(lines)
+    names = ("x", "y", "z", "intensity") if first is None else names_of_cells(first, _NAMES)
+    values = np.zeros((0, len(names)))
+    if first is not None and 8 * count <= size:  # a digit and a space for each of four numbers
+        texts = (line for _, line in lines)
+        values = RowReader(names, range(len(names))).read(
+            _begun(first[1], islice(texts, count - 1)), first[0]
+        )
+    if len(values) < count:
+        following_points = f"{len(values):,} follow" if len(values) else "there are fewer"
+        raise CutShortError(
+            f"line {start} and the next announce {int(columns):,} x "
+            f"{int(rows):,} points, and {following_points}"
+        )
+    values = values[values[:, :3].any(axis=1)]
+    return CloudScan(values[:, :3], point_columns(values, names), pose, scanner)
+
+
+def _begun(first: str, lines: Iterator[str]) -> Iterator[str]:
+    """Yield a line, and further lines."""
+    yield first
+    yield from lines
+
+
+def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[float]:
+    """Return the numbers of a line of the header; ValueError if they are others."""
+    number, line = entry
+    try:
+        values = list(map(float, line.split()))
+    except ValueError:
+        values = []
+    if len(values) != width or not np.isfinite(values).all():
+        raise ValueError(
+            f"line {number} is {printable(line)[:60]!r}: {meaning} was expected, "
+            f"{plural(width, 'number')}"
+        )
+    return values
+
+
+def _pose(rows: Floats, start: int) -> Floats:
+    """Return the matrix (4, 4) from the frame of the scan to the frame of the file.
+
+    `rows` (4, 4) are the transformation, whose header begins with line `start`. ValueError if it is
+    not a rotation and a position.
+    """
+    rotation = rows[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _MAX_ROTATION_ERROR or not np.array_equal(rows[:, 3], [0, 0, 0, 1]):
+        raise ValueError(
+            f"the transformation of the header that begins with line {start} is not a rotation "
+            "(three rows that end with 0) and a position (a row that ends with 1)"
+        )
+    return affine(rotation.T, rows[3, :3])

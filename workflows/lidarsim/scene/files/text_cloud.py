@@ -1,0 +1,315 @@
+"""Text clouds: .xyz, .txt, .asc and .csv, with and without a header.
+
+CloudCompare begins with `//X Y Z R G B` and the number of points; others with `x,y,z`, `# x y z` or
+`X;Y;Z`. Without a header, x, y and z are the first numbers of a line.
+"""
+
+from __future__ import annotations
+
+import codecs
+import io
+import re
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import AnyArray, Floats
+from ...base.errors import CutShortError
+from ...base.input_files import check_input, open_input
+from ...base.tables import column_name
+from ...base.vocabulary import UNITS_M
+from ...base.words import plural, printable
+from .cloud_scan import CloudScan, usual_names
+from .text_rows import REMARKS, RowReader, cells_of
+
+_SEPARATORS = (";", "\t", ",", None)
+_HEAD_BYTES = 1 << 12
+_MAX_HEAD_LINES = 1_000  # remarks before the first point
+# A name of a header that spaces separate, with its unit: X [m]
+_WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
+# {name without case and separators: axis}; of several, the first in this order counts.
+_AXES = {
+    **{axis: axis for axis in "xyz"},
+    **{f"points{index}": axis for index, axis in enumerate("xyz")},  # of ParaView
+    "easting": "x",
+    "northing": "y",
+    "east": "x",
+    "north": "y",
+    "elevation": "z",
+    "height": "z",
+    "altitude": "z",
+    "up": "z",
+}
+_ROTATIONS = {"qx", "qy", "qz", "qw", "roll", "pitch", "yaw", "heading"}
+_DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
+_TUM_COLUMNS = 8  # time, position and quaternion
+_KITTI_COLUMNS = 12  # three rows of a matrix, in each of them a rotation and an offset
+_RASTER = "ncols"  # first word of an Esri ASCII grid
+_MIN_AMBIGUOUS = 6  # cells between commas that may be three numbers with decimal commas
+_MAX_EXACT = 1 << 53  # integers that double precision holds
+_MANY_POINTS = 3  # of a column that counts the points
+
+
+class _Head(NamedTuple):
+    """What precedes the points of a file."""
+
+    names: list[str] | None  # of the columns; None without a header
+    names_line: int  # number of the header's line
+    is_remark: bool  # whether the header is a remark
+    announced: int | None  # points, in a line of their own
+    first: str  # first line of the points
+    first_line: int
+
+
+def read_text_cloud(path: Path) -> list[CloudScan]:
+    """Read a cloud of a point in each line.
+
+    Columns are named by the header; without a header, those after z are `column_4`, …. Cells are
+    separated by spaces, tabs, commas or semicolons. Decimal commas are read where something else
+    separates cells. Columns of words are left out.
+
+    Raises
+    ------
+    ValueError
+        If a line is wrong, or the columns are not those of a cloud; the message names the line.
+    LidarError
+        If the file is larger than the memory.
+    OSError
+        If the file cannot be read.
+    """
+    check_input(path)
+    with open_input(path) as file:
+        _check_text(file.peek(_HEAD_BYTES)[:_HEAD_BYTES])
+        lines = io.TextIOWrapper(file, "utf-8-sig", "replace")
+        head = _read_head(lines)
+        separator = _separator(head.first)
+        first_cells = cells_of(head.first, separator)
+        if len(first_cells) > 1 and not first_cells[-1]:
+            first_cells.pop()  # a separator at the end of the line
+        names = _names(head, first_cells, separator)
+        axes, units_m = _axes(head, names)
+        numeric = _numeric_cells(head, first_cells, separator, axes)
+        used = None if len(numeric) == len(first_cells) else numeric
+        reader = RowReader(names, axes, separator, used)
+        values = reader.read(chain([head.first], lines), head.first_line)
+    _check_rows(head, reader, values)
+    arrays = {
+        index: _column(values[:, position], first_cells[index])
+        for position, index in enumerate(numeric)
+    }
+    positions = np.stack([arrays.pop(index) for index in axes], axis=1).astype(np.float64)
+    usual = usual_names(["x", "y", "z", *(names[index] for index in arrays)])[3:]
+    columns = dict(zip(usual, arrays.values(), strict=True))
+    unread = tuple(name for index, name in enumerate(names) if index not in numeric)
+    return [CloudScan(positions, columns, units_m=units_m, unread=unread)]
+
+
+def is_text_raster(path: Path) -> bool:
+    """Return True if a text file begins as an Esri ASCII grid, a raster of heights."""
+    with open_input(path) as file:
+        return file.read(_HEAD_BYTES).lstrip()[: len(_RASTER)].lower() == _RASTER.encode()
+
+
+def _check_text(start: bytes) -> None:
+    """Check that a file begins as text in UTF-8, and is no raster; ValueError if not."""
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError("it is text in UTF-16: save it as UTF-8")
+    if b"\0" in start:
+        raise ValueError("it is binary, and lines of text were expected")
+    if start.lstrip()[: len(_RASTER)].lower() == _RASTER.encode():
+        raise ValueError("it is a raster of heights, and no cloud: give it as a scene")
+
+
+# -- the head ------------------------------------------------------------------------------------
+
+
+def _read_head(lines: Iterator[str]) -> _Head:
+    """Read up to the first line of points; ValueError if there is none."""
+    names: list[str] | None = None
+    names_line = 0
+    is_remark = False
+    announced: int | None = None
+    for number, line in enumerate(lines, 1):
+        text = line.strip()
+        if names is None and (header := _header_names(text.lstrip("#/% "))) is not None:
+            names = header
+            names_line = number
+            is_remark = text.startswith(REMARKS)
+        elif not text or text.startswith(REMARKS):
+            if number > _MAX_HEAD_LINES:
+                raise ValueError(f"its first {_MAX_HEAD_LINES:,} lines have no points")
+        elif text.isdecimal() and announced is None:
+            announced = int(text)
+        elif names is None and not _begins_with_numbers(text):
+            raise ValueError(
+                f"line {number} is {printable(text)[:60]!r}, and x, y and z were expected, or a "
+                "header that names the columns"
+            )
+        else:
+            return _Head(names, names_line, is_remark, announced, line, number)
+    raise ValueError("it is empty" if not names else f"it has no points after line {names_line}")
+
+
+def _header_names(text: str) -> list[str] | None:
+    """Return the names of the columns in a line, or None if it is no header of a cloud."""
+    for separator in _SEPARATORS:
+        cells = cells_of(text, separator) if separator else _WORD.findall(text)
+        words = [column_name(cell).words for cell in cells]
+        if {_AXES.get(word) for word in words} >= {"x", "y", "z"} or len(
+            _DEGREES.intersection(words)
+        ) >= 2:
+            return cells
+    return None
+
+
+def _begins_with_numbers(text: str) -> bool:
+    """Return True if the first cells of a line are three numbers."""
+    separator = _separator(text)
+    cells = cells_of(text, separator)[:3]
+    return len(cells) == 3 and all(_is_number(cell, separator) for cell in cells)
+
+
+def _separator(line: str) -> str | None:
+    """Return what separates the cells of a line of numbers; None for spaces and tabs."""
+    if ";" in line:
+        return ";"
+    words = line.split()
+    if "," in line and not (
+        len(words) >= 3 and all(word[-1] != "," and _is_number(word, None) for word in words)
+    ):
+        return "\t" if line.count("\t") >= 2 else ","
+    return "\t" if _is_number(line.split("\t")[0].strip(), "\t") and line.count("\t") >= 2 else None
+
+
+def _is_number(cell: str, separator: str | None) -> bool:
+    """Return True if a cell is a number, with a decimal comma if commas separate no cells."""
+    if separator != "," and cell.count(",") == 1:
+        cell = cell.replace(",", ".")
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return "_" not in cell
+
+
+# -- the columns ---------------------------------------------------------------------------------
+
+
+def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> list[str]:
+    """Return the names of all cells of a line; ValueError if the header has other cells."""
+    names = head.names or []
+    count = len(first_cells)
+    if len(names) == count + 1 and not names[-1]:
+        names = names[:-1]
+    if len(names) == count:
+        return [name or f"column_{index + 1}" for index, name in enumerate(names)]
+    # A remark in prose, «x y z in metres», says nothing else than that.
+    if not names or (head.is_remark and [name.lower() for name in names[:3]] == ["x", "y", "z"]):
+        return ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, count))]
+    hint = ""
+    if separator == "," and count > len(names):
+        hint = "; decimal commas are read beside another separator, such as a semicolon"
+    raise ValueError(
+        f"line {head.names_line} names {plural(len(names), 'column')} "
+        f"({printable(', '.join(names))}), and line {head.first_line} has {plural(count, 'cell')}{hint}"
+    )
+
+
+def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, float, float] | None]:
+    """Return the indices of x, y and z, and their units in metres, or None without any.
+
+    ValueError if the columns are those of a trajectory, or have no lengths.
+    """
+    columns = [column_name(name) for name in names]
+    words = [column.words for column in columns]
+    if len(_ROTATIONS.intersection(words)) >= 2:
+        raise ValueError(
+            f"line {head.names_line} names rotations ({printable(', '.join(names))}): it is a "
+            "trajectory, and no cloud"
+        )
+    if len(_DEGREES.intersection(words)) >= 2:
+        raise ValueError(
+            f"line {head.names_line} names latitude and longitude, and x and y in a unit of length "
+            "were expected: project it"
+        )
+    indices = []
+    units_m = []
+    for axis in "xyz":
+        word = next(word for word, name in _AXES.items() if name == axis and word in words)
+        index = words.index(word)
+        unit = columns[index].unit
+        if unit is not None and unit not in UNITS_M:
+            raise ValueError(
+                f"line {head.names_line} names {printable(names[index])!r}: {axis} in a unit of "
+                f"length was expected ({', '.join(UNITS_M)})"
+            )
+        indices.append(index)
+        units_m.append(1.0 if unit is None else UNITS_M[unit])
+    x_m, y_m, z_m = units_m
+    stated = any(columns[index].unit is not None for index in indices)
+    return indices, (x_m, y_m, z_m) if stated else None
+
+
+def _numeric_cells(
+    head: _Head, first_cells: Sequence[str], separator: str | None, axes: Sequence[int]
+) -> list[int]:
+    """Return the indices of the cells that are numbers; ValueError if x, y or z is none."""
+    numeric = [index for index, cell in enumerate(first_cells) if _is_number(cell, separator)]
+    for axis, index in zip("xyz", axes, strict=True):
+        if index not in numeric:
+            raise ValueError(
+                f"line {head.first_line} has {printable(first_cells[index])[:40]!r} as {axis}, and "
+                "a number was expected"
+            )
+    return numeric
+
+
+def _column(values: Floats, first_cell: str) -> AnyArray:
+    """Return a column, as integers if it was written so: the class 2, and not the share 1.0."""
+    if not first_cell.strip("+-").isdecimal() or (values % 1 != 0).any():  # also NaN
+        return values
+    return values.astype(np.int64) if np.abs(values).max(initial=0) < _MAX_EXACT else values
+
+
+# -- the points ----------------------------------------------------------------------------------
+
+
+def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
+    """Check the number of points, and that headless rows are points; ValueError if not."""
+    if head.announced is not None and len(values) != head.announced:
+        failure = CutShortError if len(values) < head.announced else ValueError
+        raise failure(
+            f"{head.announced:,} points announced, and {len(values):,} lines follow"
+        )
+    if head.names is not None:
+        return
+    width = len(reader.names)
+    if reader.separator == "," and width >= _MIN_AMBIGUOUS and not reader.point_line:
+        raise ValueError(
+            "its numbers have no decimal points, and its commas may separate decimals as well as "
+            "columns: write decimal points, or name the columns in a header, as in x,y,z"
+        )
+    if _are_poses(values):
+        raise ValueError(
+            "its lines are poses: it is a trajectory, and no cloud; name the columns in a header "
+            "if it is a cloud"
+        )
+    counts_points = len(values) >= _MANY_POINTS and (np.diff(values[:, 0]) == 1).all()
+    if width > 3 and counts_points and values[0, 0] in (0, 1):
+        raise ValueError(
+            "its first column counts the points: name the columns in a header, as in id x y z"
+        )
+
+
+def _are_poses(values: Floats) -> bool:
+    """Return True if rows (n, k) are poses as TUM or KITTI write them."""
+    if values.shape[1] == _TUM_COLUMNS:
+        units = values[:, None, 4:]
+    elif values.shape[1] == _KITTI_COLUMNS:
+        units = values.reshape(-1, 3, 4)[:, :, :3]
+    else:
+        return False
+    return bool((np.abs((units**2).sum(axis=2) - 1) < 0.01).all())

@@ -1,0 +1,143 @@
+"""Rows of numbers in text: read at once where they are regular, else cell by cell.
+
+NumPy reads ten lines in the time in which Python reads one, but it neither names a line that is
+wrong, nor reads decimal commas, columns of words and empty cells.
+"""
+
+from __future__ import annotations
+
+import csv
+from array import array
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.words import plural, printable
+
+REMARKS = ("#", "//", "%")  # starts of lines that hold no points
+_BLOCK = 1 << 16  # lines that are read at once
+_SHOWN = 40  # letters of a cell in a message
+
+
+def cells_of(line: str, separator: str | None) -> list[str]:
+    """Return the cells of a line, without quotes and the spaces around them."""
+    if separator is not None and '"' in line:
+        with suppress(csv.Error):
+            (cells,) = csv.reader([line.strip()], delimiter=separator, skipinitialspace=True)
+            return [cell.strip() for cell in cells]
+    return [cell.strip().strip('"') for cell in line.split(separator)]
+
+
+@dataclass
+class RowReader:
+    """Reader of lines that have the same cells.
+
+    Parameters
+    ----------
+    names
+        Names of the cells of a line.
+    required
+        Indices of the cells that must be numbers; others may be empty, for NaN.
+    separator
+        What separates the cells; None for spaces and tabs.
+    used
+        Indices of the cells that are read; None for all.
+    """
+
+    names: Sequence[str]
+    required: Collection[int]
+    separator: str | None = None
+    used: Sequence[int] | None = None
+    point_line: int = field(default=0, init=False)  # first line with a decimal point; 0 for none
+    comma_line: int = field(default=0, init=False)  # first line with a decimal comma; 0 for none
+
+    def read(self, lines: Iterable[str], number: int) -> Floats:
+        """Return the numbers (n, k) of all lines but blank ones and remarks.
+
+        `number` is the number of the first line in its file. ValueError names a line that is wrong.
+        """
+        width = len(self.names if self.used is None else self.used)
+        blocks = [np.empty((0, width))]
+        iterator = iter(lines)
+        while block := list(islice(iterator, _BLOCK)):
+            blocks.append(self._read_block(block, number, width))
+            number += len(block)
+        if self.point_line and self.comma_line:
+            raise ValueError(
+                f"line {self.point_line} has decimal points and line {self.comma_line} decimal "
+                "commas: write all numbers in one way"
+            )
+        return np.concatenate(blocks)
+
+    def _read_block(self, lines: list[str], number: int, width: int) -> Floats:
+        """Return the numbers (n, width) of some lines."""
+        has_points = any("." in line for line in lines)
+        has_commas = self.separator != "," and any("," in line for line in lines)
+        if self.used is None and not (has_points and has_commas):
+            filled = [line for line in lines if not line.isspace()]
+            if has_commas:
+                filled = [line.replace(",", ".") for line in filled]
+            try:
+                values = np.loadtxt(filled, delimiter=self.separator, comments=None, ndmin=2)
+            except ValueError:
+                pass  # cell by cell, which names the line
+            else:
+                if values.shape == (len(filled), width):
+                    self._note(number, points=has_points, commas=has_commas)
+                    return np.asarray(values, np.float64)
+        return self._read_cells(lines, number, width)
+
+    def _note(self, number: int, *, points: bool, commas: bool) -> None:
+        """Note a line with a decimal point or comma, if it is the first."""
+        if points and not self.point_line:
+            self.point_line = number
+        if commas and not self.comma_line:
+            self.comma_line = number
+
+    def _read_cells(self, lines: list[str], number: int, width: int) -> Floats:
+        """Return the numbers (n, width) of some lines, read cell by cell."""
+        numbers = array("d")
+        used = range(width) if self.used is None else self.used
+        for line_number, line in enumerate(lines, number):
+            text = line.strip()
+            if not text or text.startswith(REMARKS):
+                continue
+            cells = cells_of(text, self.separator)
+            if len(cells) == len(self.names) + 1 and not cells[-1]:
+                cells.pop()  # a separator at the end of the line
+            if len(cells) != len(self.names):
+                raise ValueError(self._wrong_width(line_number, cells))
+            numbers.extend(self._number(cells[index], index, line_number) for index in used)
+        return np.frombuffer(numbers, np.float64).reshape(-1, width)
+
+    def _number(self, cell: str, index: int, line_number: int) -> float:
+        """Return the number in a cell; ValueError if there is none."""
+        text = cell
+        has_comma = self.separator != "," and "," in cell
+        self._note(line_number, points="." in cell, commas=has_comma)
+        if has_comma:
+            text = cell.replace(",", ".")
+        if not text and index not in self.required:
+            return float("nan")
+        try:
+            return float(text.replace("_", "no"))  # Python allows underscores in numbers
+        except ValueError as error:
+            raise ValueError(
+                f"line {line_number} has {printable(cell)[:_SHOWN]!r} as {self.names[index]}, and a "
+                "number was expected"
+            ) from error
+
+    def _wrong_width(self, line_number: int, cells: Sequence[str]) -> str:
+        """Return the message on a line with too few or too many cells."""
+        names = printable(", ".join(self.names))
+        message = (
+            f"line {line_number} has {plural(len(cells), 'cell')}, and {len(self.names)} were "
+            f"expected ({names})"
+        )
+        if self.separator == "," and len(cells) > len(self.names):
+            message += "; decimal commas are read beside another separator, such as a semicolon"
+        return message
