@@ -220,8 +220,6 @@ FORMATS = {
         "lidarpool.export.pcd",
         "Pieces",
         in_pieces=True,
-        packages=("pypcd4",),
-        extra="pcd",
         needs=("scan",),
         raw_or_compensated=True,
         inside=r"\d+\.pcd",

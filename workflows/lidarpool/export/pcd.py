@@ -1,16 +1,13 @@
-"""PCD, a file for each sweep, through pypcd4."""
+"""PCD, a file for each sweep."""
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
-from pypcd4.pypcd4 import Encoding, PointCloud
-
 from lidarsim.base.arrays import AnyArray
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLOURS, NORMAL
 from lidarsim.scene.colours import as_float
+from lidarsim.scene.files.pcd import pcd_bytes
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED
 
 from . import pieces
@@ -30,16 +27,10 @@ class Pieces(pieces.Pieces):
         """Return the file of a sweep."""
         as_fired = "time" in points.columns and not self.compensated
         fields = self._fields(number, points, as_fired=as_fired)
-        names = [name for name, _ in fields]
-        arrays = [array for _, array in fields]
-        file = PointCloud.from_points(arrays, names, [array.dtype for array in arrays])
         x, y, z, w = self.sweeps.pose.quaternions[number].tolist()
         position = self.sweeps.pose.positions[number].tolist()
-        file.metadata.viewpoint = (*position, w, x, y, z)
-        memory = io.BytesIO()
-        file.save(memory, Encoding.BINARY)
-        comment = f"# {AS_FIRED if as_fired else COMPENSATED}\n".encode()
-        return {f"{number:06}.pcd": comment + memory.getvalue()}, None
+        comment = AS_FIRED if as_fired else COMPENSATED
+        return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
         """Return names and arrays of the fields of a sweep's points, as fired or compensated."""

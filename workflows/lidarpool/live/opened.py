@@ -14,12 +14,14 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
+from lidarsim.scene.files.text_cloud import is_text_raster
 from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_result
 
 from ..datasets.dataset import INDEX_FILE
 from .downloads import downloads
 
 _TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
+_TRAJECTORY_ADVICE = "name it in a scenario, as trajectory: FILE"
 _HEADER_BYTES = 1 << 16  # of a .ply, in which its elements are named
 
 
@@ -67,7 +69,8 @@ def open_view(path: Path) -> View:
             raise LidarError(f"{path} has no points.")
         return view
     mesh_format = format_of(path)
-    if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice):
+    is_cloud = suffix == ".asc" and not is_text_raster(path)
+    if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice and not is_cloud):
         return _preview(path)
     return _recorded(path, title)
 
@@ -81,15 +84,19 @@ def _recorded(path: Path, title: str) -> View:
     from ..recordings.recordings import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
+    may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
     try:
         return recorded_view(open_sensors(path), title, downloads())
     except UnknownFormatError as error:
-        trajectory = "name a trajectory in a scenario, as trajectory: FILE, or "
-        advice = trajectory if path.suffix.lower() in _TRAJECTORIES else error.advice
+        advice = f"{_TRAJECTORY_ADVICE}, or " if may_be_trajectory else error.advice
         raise LidarError(
             f"{path} is not read: {advice}give a result, data set, cloud, recording, "
             "scenario or mesh of a format that lidarpool view --help names."
         ) from error
+    except LidarError as error:
+        if not may_be_trajectory:
+            raise
+        raise LidarError(f"{error} If it is a trajectory, {_TRAJECTORY_ADVICE}.") from error
 
 
 def growing_view(path: Path) -> GrowingView | None:

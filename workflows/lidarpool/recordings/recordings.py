@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size, open_input, read_input
 from lidarsim.base.vocabulary import UNITS_M
@@ -30,10 +30,13 @@ from lidarsim.columns.bags import (
 )
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.scene.files.cloud_formats import SCAN_READERS
+from lidarsim.scene.files.cloud_scan import with_usual_names
 from lidarsim.scene.files.las import las_units, open_las
-from lidarsim.scene.files.pcd import checked_pcd
+from lidarsim.scene.files.pcd import read_pcd
 from lidarsim.scene.files.polygon_files import read_ply_columns
-from lidarsim.sweeps.sweeps import SWEEPS_FILE, SweepPoses, Sweeps
+from lidarsim.scene.files.ptx import read_ptx
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.fingerprint import fingerprint
 from ..columns.parts import StoredCloud
@@ -58,8 +61,8 @@ if TYPE_CHECKING:
     from laspy import LasReader
 
 KINDS = (
-    "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .bin of KITTI, "
-    ".pcap of Velodyne or Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, "
+    "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .xyz, .txt, "
+    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap of Velodyne or Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, "
     "WebDataset or range images"
 )
 # Names of the columns of rings and of intensities in other programs; the first column present is
@@ -72,14 +75,14 @@ _VELODYNE_BYTES = (1248, 554)  # first frame of a Velodyne's .pcap: points, or a
 _HESAI_STARTS = (b"\xee\xff", b"\xff\xee")  # first bytes of a Hesai's datagrams
 
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
-    **dict.fromkeys((".xyz", ".pts"), "write its points as .ply or .las"),
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
     ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
     ".rrd": "it is a recording of Rerun, open it with the command rerun",
     ".osi": "it is a trace of OSI, name it as the traffic of a scenario",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
 }
-_UNIT_SUFFIXES = (".las", ".laz", ".ply", ".pcd")  # of clouds that may have another unit
+# Endings of clouds that may have another unit.
+_UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))
 
 # A sample of a .las consists of this many runs of points, which begin where chunks of a .laz begin:
 # 50,000 points each, unless a program chooses otherwise.
@@ -349,6 +352,10 @@ def _open_file(
         return replace(_open_pcd([path], name, intensity), metres=metres or _METRES)
     if suffix in (".las", ".laz"):
         return _open_las(path, name, intensity, metres)
+    if suffix == ".ptx":
+        return _open_ptx(path, name, intensity, metres)
+    if suffix in SCAN_READERS and suffix != ".bin":
+        return _open_scans(path, name, intensity, metres)
     if suffix == ".mcap":
         return _open_bag(path, name, sensor, intensity)
     if suffix in (".osf", ".pcap"):
@@ -439,7 +446,7 @@ def _open_ply(path: Path, name: str, sensor: str | None, intensity: str | None) 
     except LidarError:  # text, or of another program
 
         def read(_: int) -> Read:
-            columns = read_ply_columns(read_input(path))
+            columns = with_usual_names(read_ply_columns(read_input(path)))
             return _positions(columns), columns, None
 
         return Recording(name, 1, read, intensity, is_cloud=True)
@@ -471,25 +478,46 @@ def _open_data_set(path: Path, name: str, sensor: str | None, intensity: str | N
 
 def _open_pcd(files: list[Path], name: str, intensity: str | None) -> Recording:
     """Open files of a sweep each; VIEWPOINT has the pose of the sensor."""
-    need("pypcd4", "pcd", f"{name} is read")
 
     def read(number: int) -> Read:
-        from pypcd4.pypcd4 import PointCloud  # an extra
-
         path = files[number]
         with reading(path.name) if len(files) > 1 else nullcontext():
-            checked_pcd(path)
-            with open_input(path) as opened:
-                file = PointCloud.from_fileobj(opened)
-            rows = file.pc_data
-            *position, w, x, y, z = file.metadata.viewpoint
-            if len(rows) != file.metadata.points:
-                raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
-        columns = {name: rows[name] for name in rows.dtype.names or ()}
-        pose = SweepPoses(np.array([position]), np.array([[x, y, z, w]])).matrix(0)
-        return _positions(columns), columns, pose
+            (scan,) = read_pcd(path)
+        return scan.positions, scan.columns, scan.pose
 
     return Recording(name, len(files), read, intensity)
+
+
+def _open_ptx(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
+    """Open the scans of a .ptx, each in the frame of its scanner."""
+    with reading(name):
+        scans = read_ptx(path)
+
+    def read(number: int) -> Read:
+        scan = scans[number]
+        return scan.positions, scan.columns, scan.pose
+
+    return Recording(name, len(scans), read, intensity, metres=metres or _METRES)
+
+
+def _open_scans(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
+    """Open a cloud whose file is read at once; `metres` replace the units that its header states.
+
+    Of several clouds in a file, the columns that all have are read.
+    """
+
+    def read(_: int) -> Read:
+        scans = SCAN_READERS[path.suffix.lower()](path)
+        units_m = _METRES if metres is not None else scans[0].units_m or _METRES
+        shared = set.intersection(*(set(scan.columns) for scan in scans))
+        columns = {
+            column: np.concatenate([scan.columns[column] for scan in scans])
+            for column in scans[0].columns
+            if column in shared
+        }
+        return np.concatenate([scan.positions for scan in scans]) * units_m, columns, None
+
+    return Recording(name, 1, read, intensity, is_cloud=True, metres=metres or _METRES)
 
 
 def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
@@ -506,7 +534,7 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
         reader.seek(start)
         points = reader.read_points(length)
         if len(points) != length:
-            raise ValueError(f"{count:,} points announced, and there are fewer")
+            raise CutShortError(f"{count:,} points announced, and there are fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
         return np.stack([points.x, points.y, points.z], axis=1), columns, None
 

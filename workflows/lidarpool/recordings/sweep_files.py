@@ -23,6 +23,7 @@ from lidarsim.base.extras import need
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.words import natural
 from lidarsim.columns.table import TABLE
+from lidarsim.scene.files.float_rows import NUSCENES, columns_by_name, read_float_columns
 from lidarsim.scene.transform import affine
 from lidarsim.sensor.trajectory import matrices
 
@@ -32,8 +33,6 @@ Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
 Read = tuple[AnyArray, Columns, Floats | None]
 
-_KITTI_ROW = 4  # float32: x, y, z, intensity
-_NUSCENES_ROW = 5  # float32: x, y, z, intensity, ring
 _E57_COLUMNS = {
     "colorRed": "red",
     "colorGreen": "green",
@@ -173,23 +172,15 @@ def _square(rows: Floats) -> Floats:
 
 def _kitti_sweep(path: Path, labels: Path, pose: Floats | None) -> Read:
     """Read a sweep, with its classes and objects if there is a file of labels."""
-    rows = _float_rows(path, _KITTI_ROW)
-    columns: dict[str, AnyArray] = {"intensity": rows[:, 3]}
+    columns = read_float_columns(path, columns_by_name(path))
+    positions = _positions(columns)
     if labels.exists():
         numbers = np.frombuffer(read_input(labels), "<u4")
-        if len(numbers) != len(rows):
-            raise ValueError(f"{labels.name} has {len(numbers)} labels for {len(rows)} points")
+        if len(numbers) != len(positions):
+            raise ValueError(f"{labels.name} has {len(numbers)} labels for {len(positions)} points")
         columns["class"] = (numbers & 0xFFFF).astype(np.uint16)
         columns["object"] = (numbers >> 16).astype(np.int32) - 1
-    return rows[:, :3], columns, pose
-
-
-def _float_rows(path: Path, width: int) -> AnyArray:
-    """Read a file of rows of float32 (n, width); ValueError for another size."""
-    data = read_input(path)
-    if len(data) % (4 * width):
-        raise ValueError(f"{path.name} has {len(data)} bytes, no whole rows of {4 * width}")
-    return np.frombuffer(data, "<f4").reshape(-1, width)
+    return positions, columns, pose
 
 
 def nuscenes_tables(folder: Path) -> Path | None:
@@ -230,15 +221,12 @@ def open_nuscenes(folder: Path, tables: Path) -> dict[str, SweepFiles]:
 
         def read(number: int) -> Read:
             row = rows[number]
-            values = _float_rows(folder / row["filename"], _NUSCENES_ROW)
-            columns: dict[str, AnyArray] = {
-                "intensity": values[:, 3],
-                "channel": values[:, 4].astype(np.uint16),
-            }
+            columns = read_float_columns(folder / row["filename"], NUSCENES)
+            positions = _positions(columns)
             if row["token"] in labels:
                 columns["class"] = np.frombuffer(read_input(folder / labels[row["token"]]), "u1")
             calibration = pose_of(calibrated[row["calibrated_sensor_token"]])
-            return values[:, :3], columns, pose_of(poses[row["ego_pose_token"]]) @ calibration
+            return positions, columns, pose_of(poses[row["ego_pose_token"]]) @ calibration
 
         return SweepFiles(len(rows), read, 1e3 * np.array([row["timestamp"] for row in rows]))
 

@@ -67,6 +67,25 @@ def printable(text: str, max_letters: int = 200) -> str:
     return " ".join(cleaned.split())[:max_letters]
 
 
+def distinct(names: Iterable[str]) -> list[str]:
+    """Return distinct names: a name that is there already gets a number.
+
+    Examples
+    --------
+    >>> distinct(["x", "ring", "ring", "ring"])
+    ['x', 'ring', 'ring_2', 'ring_3']
+    """
+    unique: dict[str, None] = {}
+    for name in names:
+        number = 2
+        candidate = name
+        while candidate in unique:
+            candidate = f"{name}_{number}"
+            number += 1
+        unique[candidate] = None
+    return list(unique)
+
+
 def shortened(name: str, max_letters: int = 18) -> str:
     """Shorten a name in its middle to `max_letters`; show control characters."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)

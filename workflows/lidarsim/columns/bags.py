@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ..base.arrays import AnyArray
-from ..base.errors import LidarError
+from ..base.errors import CutShortError, LidarError
 from ..base.extras import need, reading
 from ..base.input_files import input_size
+from ..base.words import distinct, printable
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -101,16 +102,34 @@ def message_types() -> Typestore:
 
 
 def point_columns(data: bytes) -> dict[str, AnyArray]:
-    """Return the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree."""
+    """Return the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree.
+
+    A field of several numbers is the columns `name_0`, `name_1`, …; the second field of a name is
+    `name_2`.
+    """
     message: Any = message_types().deserialize_cdr(data, POINT_CLOUD)
     kinds = {number: kind for kind, number in POINT_FIELDS.items()}
     order = ">" if message.is_bigendian else "<"
-    fields = [field for field in message.fields if field.count == 1]
+    for field in message.fields:
+        if field.offset + field.count > message.point_step:  # each number has a byte or more
+            raise ValueError(
+                f"its field {printable(field.name)!r} has {field.count:,} numbers from byte "
+                f"{field.offset:,} on, and a point {message.point_step:,} bytes"
+            )
+    numbers = [
+        (field.name if field.count == 1 else f"{field.name}_{index}", field, index)
+        for field in message.fields
+        for index in range(field.count)
+    ]
+    formats = [order + kinds[field.datatype] for _, field, _ in numbers]
     row = np.dtype(
         {
-            "names": [field.name for field in fields],
-            "formats": [order + kinds[field.datatype] for field in fields],
-            "offsets": [field.offset for field in fields],
+            "names": distinct(name for name, _, _ in numbers),
+            "formats": formats,
+            "offsets": [
+                field.offset + index * np.dtype(kind).itemsize
+                for (_, field, index), kind in zip(numbers, formats, strict=True)
+            ],
             "itemsize": message.point_step,
         }
     )
@@ -138,6 +157,6 @@ def livox_columns(data: bytes) -> dict[str, AnyArray]:
     row = LIVOX_POINT.newbyteorder(order)
     content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
     if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):
-        raise ValueError(f"{count:,} points announced, and there are fewer")
+        raise CutShortError(f"{count:,} points announced, and there are fewer")
     rows = np.frombuffer(content, row)
     return {name: rows[name] for name in row.names or ()}

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from ...base.arrays import AnyArray, Floats
+from ...base.words import distinct
 
 # Names of columns that programs write in upper case or in short, by their usual names.
 _USUAL_NAMES = {
     **{name: name for name in ("x", "y", "z", "nx", "ny", "nz", "rgb", "rgba")},
     **{name: name for name in ("red", "green", "blue", "intensity", "reflectivity")},
     **{name: name for name in ("class", "classification", "label", "ring", "channel", "time")},
+    "i": "i",
     "r": "red",
     "g": "green",
     "b": "blue",
@@ -43,20 +45,13 @@ def usual_names(names: Iterable[str]) -> list[str]:
     >>> usual_names(["X", "Y", "Z", "R", "Intensity", "intensity", "intensity"])
     ['x', 'y', 'z', 'red', 'Intensity', 'intensity', 'intensity_2']
     """
-    given = list(names)
-    exact = set(given)
-    distinct: dict[str, None] = {}
-    for name in given:
-        usual = _USUAL_NAMES.get(name.lower(), name)
-        if usual != name and (usual in exact or usual in distinct):
-            usual = name
-        number = 2
-        unique = usual
-        while unique in distinct:
-            unique = f"{usual}_{number}"
-            number += 1
-        distinct[unique] = None
-    return list(distinct)
+    exact = list(names)
+    usual: list[str] = []
+    for name in exact:
+        candidate = _USUAL_NAMES.get(name.lower(), name)
+        is_taken = candidate != name and (candidate in exact or candidate in usual)
+        usual.append(name if is_taken else candidate)
+    return distinct(usual)
 
 
 def with_usual_names(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:

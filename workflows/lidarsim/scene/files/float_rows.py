@@ -10,34 +10,38 @@ from ...base.arrays import AnyArray
 from ...base.input_files import read_input
 from .cloud_scan import CloudScan
 
+# Columns of the formats.
+KITTI = ("x", "y", "z", "intensity")
+NUSCENES = (*KITTI, "channel")
 _NUSCENES_ENDING = ".pcd.bin"
-# {format: names of the columns}
-_KITTI = ("x", "y", "z", "intensity")
-_NUSCENES = (*_KITTI, "channel")
 
 
-def read_float_columns(path: Path) -> dict[str, AnyArray]:
-    """Return the columns of a sweep, {name: (n,)}; the name of the file tells the format.
+def columns_by_name(path: Path) -> tuple[str, ...]:
+    """Return the columns of a file by its ending."""
+    return NUSCENES if path.name.lower().endswith(_NUSCENES_ENDING) else KITTI
 
-    ValueError if the size is not that of whole rows; OSError if the file cannot be read.
+
+def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
+    """Return the columns of a sweep, {name: (n,)}, which are `KITTI` or `NUSCENES`.
+
+    ValueError if the size is not that of whole rows, or the rings are no rings; OSError if the file
+    cannot be read.
     """
-    is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
-    names = _NUSCENES if is_nuscenes else _KITTI
     data = read_input(path)
     row_size = 4 * len(names)
     if len(data) % row_size:
-        other_ending = "" if is_nuscenes else f" (five, with {_NUSCENES[-1]}, as {_NUSCENES_ENDING})"
+        other_format = f" ({_NUSCENES_ENDING} has {NUSCENES[-1]} as well)" if names is KITTI else ""
         raise ValueError(
             f"{path.name} has {len(data):,} bytes, and whole rows of {row_size} were expected: "
-            f"{', '.join(names)} as float32{other_ending}"
+            f"{', '.join(names)} as float32{other_format}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, len(names))
-    columns: dict[str, AnyArray] = dict(zip(names, rows.T.astype(np.float32), strict=True))
-    if is_nuscenes:
+    columns: dict[str, AnyArray] = dict(zip(names, rows.T.copy(), strict=True))
+    if names is NUSCENES:
         rings = columns["channel"]
         if not ((rings >= 0) & (rings < 1 << 16) & (rings % 1 == 0)).all():
             raise ValueError(
-                f"{path.name} has numbers other than rings, 0 to 65,535, as the last of each five: "
+                f"{path.name} has other numbers than rings, 0 to 65,535, as the last of each five: "
                 "it is no sweep of nuScenes"
             )
         columns["channel"] = rings.astype(np.uint16)
@@ -45,7 +49,11 @@ def read_float_columns(path: Path) -> dict[str, AnyArray]:
 
 
 def read_float_rows(path: Path) -> list[CloudScan]:
-    """Read the points of a sweep; errors as of `read_float_columns`."""
-    columns = read_float_columns(path)
-    positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
+    """Read the points of a sweep, of the format that its ending tells.
+
+    Errors as of `read_float_columns`.
+    """
+    columns = read_float_columns(path, columns_by_name(path))
+    with np.errstate(invalid="ignore"):  # of NaN of any kind
+        positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [CloudScan(positions, columns)]

@@ -117,11 +117,10 @@ _NOT_READ = (
         (".fbx", ".blend", ".3ds", ".x3d", ".wrl", ".dxf", ".abc"),
         advice="export it as .glb, for example from Blender",
     ),
-    MeshFormat((".las", ".laz", ".pcd", ".xyz", ".e57"), advice=_POINTS),
     MeshFormat(
-        (".pts",),
-        advice=f"it is a point cloud, write it as .xyz, .ply or .las and {_POINTS}",
+        (".las", ".laz", ".pcd", ".xyz", ".e57", ".pts", ".ptx", ".npy", ".bin"), advice=_POINTS
     ),
+    MeshFormat((".csv", ".txt"), advice=f"if it is a point cloud, {_POINTS}"),
     MeshFormat(
         (".pcap", ".mcap", ".bag", ".db3", ".osf"),
         advice="it is a recording, write its points as .ply, .pcd or .las and make a mesh of "

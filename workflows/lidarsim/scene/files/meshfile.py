@@ -29,6 +29,7 @@ from ..colours import colours_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
+from .cloud_formats import SCAN_READERS
 from .mesh_formats import (
     MeshFormat,
     endings,
@@ -48,6 +49,7 @@ from .scene_graph import (
     RigidPart,
     Window,
 )
+from .text_cloud import is_text_raster
 
 # Generator that files written by lidarpool name: .glb is Y-up, others are Z-up.
 GENERATOR = "lidarpool"
@@ -481,6 +483,8 @@ def _other_format(path: Path, data: bytes) -> str:
     """Return a sentence on the format that a refused file starts like, or empty."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It begins like text in UTF-16: save it as UTF-8."
+    if path.suffix.lower() in SCAN_READERS and not is_text_raster(path):
+        return " If it is a point cloud, make a mesh of it by lidarpool scene points."
     likely = endings_for(data)
     if likely and path.suffix.lower() not in likely:
         return f" It begins like a {' or '.join(likely)} file: give it that ending."

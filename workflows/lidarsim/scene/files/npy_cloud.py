@@ -44,7 +44,8 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
         columns = dict(zip(names, rows.T, strict=True))
     else:
         raise ValueError(f"its array has the shape {array.shape}: {_EXPECTED}")
-    positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):  # of NaN of any kind, and of long doubles
+        positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [CloudScan(positions, columns)]
 
 
@@ -66,12 +67,7 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
 
 def _read_array(file: BinaryIO, size: int) -> AnyArray:
     """Return the array of numbers in a file of a size in bytes; ValueError for other files."""
-    layout: Any = np.lib.format
-    readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
-    version = layout.read_magic(file)
-    if version not in readers:
-        raise ValueError(f"it has the version {version} of .npy: 1.0 or 2.0 were expected")
-    shape, is_fortran, kind = readers[version](file)
+    shape, is_fortran, kind = _read_header(file)
     if not _holds_numbers(kind):
         raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}: {_EXPECTED}")
     announced = math.prod(shape) * kind.itemsize
@@ -84,6 +80,25 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
     array: AnyArray = np.frombuffer(file.read(), kind)
     array = array.astype(kind.newbyteorder("="))
     return array.reshape(shape, order="F" if is_fortran else "C")
+
+
+def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return the shape, the order and the type of the array in a file; ValueError if broken."""
+    layout: Any = np.lib.format
+    readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
+    start = file.read(len(layout.MAGIC_PREFIX))
+    if start != layout.MAGIC_PREFIX:
+        raise ValueError("its first bytes are not \\x93NUMPY, with which a .npy begins")
+    version = (*file.read(2),)
+    if version not in readers:
+        raise ValueError(f"it has the version {version} of .npy: 1.0 or 2.0 were expected")
+    try:
+        shape, is_fortran, kind = readers[version](file)
+    except Exception as error:  # NumPy parses the header as Python, with errors of any class
+        if "EOF: reading" in str(error):
+            raise CutShortError("its header ends too early") from error
+        raise ValueError("its header is not that of an array") from error
+    return shape, is_fortran, kind
 
 
 def _holds_numbers(kind: np.dtype[Any]) -> bool:

@@ -108,7 +108,8 @@ def read_pcd(path: Path) -> list[CloudScan]:
             f"its FIELDS are {printable(names)}: x, y and z of a number each are needed, and there "
             f"is no {', '.join(missing)}"
         )
-    positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN of any kind
+        positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
     return [CloudScan(positions, _with_colours(columns), pose, scanner)]
@@ -472,7 +473,8 @@ def _bits(values: AnyArray) -> AnyArray:
     """
     if values.dtype.kind in "iu":
         return values.astype(np.uint32)
-    numbers = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        numbers = values.astype(np.float64)
     finite = numbers[np.isfinite(numbers)]
     if finite.any() and not (finite % 1).any() and finite.min() >= 0 and finite.max() < 1 << 24:
         return np.nan_to_num(numbers).astype(np.uint32)

@@ -47,16 +47,17 @@ def read_pts(path: Path) -> list[CloudScan]:
     """
     check_input(path)
     scans = []
-    with open_input(path) as file:
-        lines = enumerate(io.TextIOWrapper(file, "utf-8-sig", "replace"), 1)
+    with io.TextIOWrapper(open_input(path), "utf-8-sig", "replace") as text:
+        lines = enumerate(text, 1)
         while (entry := next_line(lines)) is not None:
             number, line = entry
             count: int | None = None
+            following = lines
             if line.strip().isdecimal():
                 count = int(line)
             else:
-                lines = chain([entry], lines)
-            scans.append(_read_cloud(lines, number, count))
+                following = chain([entry], lines)
+            scans.append(_read_cloud(following, number, count))
     if not scans:
         raise ValueError("it is empty: the number of points was expected")
     return scans

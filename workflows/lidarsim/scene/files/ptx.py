@@ -59,8 +59,8 @@ def read_ptx(path: Path) -> list[CloudScan]:
     """
     size = check_input(path)
     scans = []
-    with open_input(path) as file:
-        lines = enumerate(io.TextIOWrapper(file, "utf-8-sig", "replace"), 1)
+    with io.TextIOWrapper(open_input(path), "utf-8-sig", "replace") as text:
+        lines = enumerate(text, 1)
         while (entry := next_line(lines)) is not None:
             scans.append(_read_scan(entry, lines, size))
     if not scans:

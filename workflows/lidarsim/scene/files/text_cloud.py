@@ -18,7 +18,7 @@ import numpy as np
 
 from ...base.arrays import AnyArray, Floats
 from ...base.errors import CutShortError
-from ...base.input_files import check_input, open_input
+from ...base.input_files import check_input, open_input, read_input
 from ...base.tables import column_name
 from ...base.vocabulary import UNITS_M
 from ...base.words import plural, printable
@@ -47,7 +47,7 @@ _ROTATIONS = {"qx", "qy", "qz", "qw", "roll", "pitch", "yaw", "heading"}
 _DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
 _TUM_COLUMNS = 8  # time, position and quaternion
 _KITTI_COLUMNS = 12  # three rows of a matrix, in each of them a rotation and an offset
-_RASTER = "ncols"  # first word of an Esri ASCII grid
+_RASTER = b"ncols"  # first word of an Esri ASCII grid
 _MIN_AMBIGUOUS = 6  # cells between commas that may be three numbers with decimal commas
 _MAX_EXACT = 1 << 53  # integers that double precision holds
 _MANY_POINTS = 3  # of a column that counts the points
@@ -81,13 +81,12 @@ def read_text_cloud(path: Path) -> list[CloudScan]:
         If the file cannot be read.
     """
     check_input(path)
-    with open_input(path) as file:
-        _check_text(file.peek(_HEAD_BYTES)[:_HEAD_BYTES])
-        lines = io.TextIOWrapper(file, "utf-8-sig", "replace")
+    _check_text(read_input(path, _HEAD_BYTES))
+    with io.TextIOWrapper(open_input(path), "utf-8-sig", "replace") as lines:
         head = _read_head(lines)
         separator = _separator(head.first)
         first_cells = cells_of(head.first, separator)
-        if len(first_cells) > 1 and not first_cells[-1]:
+        if not first_cells[-1] and len(first_cells) != len(head.names or ()):
             first_cells.pop()  # a separator at the end of the line
         names = _names(head, first_cells, separator)
         axes, units_m = _axes(head, names)
@@ -109,8 +108,12 @@ def read_text_cloud(path: Path) -> list[CloudScan]:
 
 def is_text_raster(path: Path) -> bool:
     """Return True if a text file begins as an Esri ASCII grid, a raster of heights."""
-    with open_input(path) as file:
-        return file.read(_HEAD_BYTES).lstrip()[: len(_RASTER)].lower() == _RASTER.encode()
+    return _begins_as_raster(read_input(path, _HEAD_BYTES))
+
+
+def _begins_as_raster(start: bytes) -> bool:
+    """Return True if a file with a start is a raster."""
+    return start.lstrip()[: len(_RASTER)].lower() == _RASTER
 
 
 def _check_text(start: bytes) -> None:
@@ -119,7 +122,7 @@ def _check_text(start: bytes) -> None:
         raise ValueError("it is text in UTF-16: save it as UTF-8")
     if b"\0" in start:
         raise ValueError("it is binary, and lines of text were expected")
-    if start.lstrip()[: len(_RASTER)].lower() == _RASTER.encode():
+    if _begins_as_raster(start):
         raise ValueError("it is a raster of heights, and no cloud: give it as a scene")
 
 
@@ -202,6 +205,10 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
     """Return the names of all cells of a line; ValueError if the header has other cells."""
     names = head.names or []
     count = len(first_cells)
+    if count < len("xyz"):
+        raise ValueError(
+            f"line {head.first_line} has {plural(count, 'cell')}, and x, y and z were expected"
+        )
     if len(names) == count + 1 and not names[-1]:
         names = names[:-1]
     if len(names) == count:
@@ -257,7 +264,11 @@ def _numeric_cells(
     head: _Head, first_cells: Sequence[str], separator: str | None, axes: Sequence[int]
 ) -> list[int]:
     """Return the indices of the cells that are numbers; ValueError if x, y or z is none."""
-    numeric = [index for index, cell in enumerate(first_cells) if _is_number(cell, separator)]
+    numeric = [
+        index
+        for index, cell in enumerate(first_cells)
+        if _is_number(cell, separator) or not cell and index not in axes
+    ]
     for axis, index in zip("xyz", axes, strict=True):
         if index not in numeric:
             raise ValueError(
@@ -282,7 +293,7 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
     if head.announced is not None and len(values) != head.announced:
         failure = CutShortError if len(values) < head.announced else ValueError
         raise failure(
-            f"{head.announced:,} points announced, and {len(values):,} lines follow"
+            f"{plural(head.announced, 'point')} announced, and {plural(len(values), 'line')} there"
         )
     if head.names is not None:
         return

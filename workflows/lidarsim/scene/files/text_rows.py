@@ -87,16 +87,12 @@ class RowReader:
                 pass  # cell by cell, which names the line
             else:
                 if values.shape == (len(filled), width):
-                    self._note(number, points=has_points, commas=has_commas)
+                    if has_points and not self.point_line:
+                        self.point_line = _line_with(".", lines, number)
+                    if has_commas and not self.comma_line:
+                        self.comma_line = _line_with(",", lines, number)
                     return np.asarray(values, np.float64)
         return self._read_cells(lines, number, width)
-
-    def _note(self, number: int, *, points: bool, commas: bool) -> None:
-        """Note a line with a decimal point or comma, if it is the first."""
-        if points and not self.point_line:
-            self.point_line = number
-        if commas and not self.comma_line:
-            self.comma_line = number
 
     def _read_cells(self, lines: list[str], number: int, width: int) -> Floats:
         """Return the numbers (n, width) of some lines, read cell by cell."""
@@ -117,10 +113,11 @@ class RowReader:
     def _number(self, cell: str, index: int, line_number: int) -> float:
         """Return the number in a cell; ValueError if there is none."""
         text = cell
-        has_comma = self.separator != "," and "," in cell
-        self._note(line_number, points="." in cell, commas=has_comma)
-        if has_comma:
+        if "." in cell and not self.point_line:
+            self.point_line = line_number
+        if "," in cell and self.separator != ",":
             text = cell.replace(",", ".")
+            self.comma_line = self.comma_line or line_number
         if not text and index not in self.required:
             return float("nan")
         try:
@@ -141,3 +138,8 @@ class RowReader:
         if self.separator == "," and len(cells) > len(self.names):
             message += "; decimal commas are read beside another separator, such as a semicolon"
         return message
+
+
+def _line_with(mark: str, lines: Sequence[str], number: int) -> int:
+    """Return the number of the first line with a mark; `number` is the number of the first line."""
+    return number + next(index for index, line in enumerate(lines) if mark in line)
