@@ -17,6 +17,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.errors import message_of
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.files.polygons import check_corners, triangulated, with_holes
@@ -247,7 +248,7 @@ class _CityFile:
                 polygons.corners.append(_integers(corners))
                 check_corners(polygons.corners[-1], len(points))
             except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-                raise ValueError(f"{name[:80]!r}: {error}") from error
+                raise ValueError(f"{name[:80]!r}: {message_of(error).rstrip('.')}") from error
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:

@@ -20,7 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Bytes, Floats, Ints
+from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.base.vectors import length, matmul
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colours import Colours, as_bytes
@@ -67,9 +67,10 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
     if unit is not None:
-        content.unit_m = float(unit.attrib["meter"])
+        meter = unit.attrib["meter"]
+        content.unit_m = float(meter) if _is_number(meter, np.float64) else np.nan
         if not 0 < content.unit_m < np.inf:
-            raise ValueError(f"its unit is {content.unit_m} metres")
+            raise ValueError(f"its unit is {meter[:40]!r} metres, and a positive number was expected")
     axis = (root.findtext("asset/up_axis") or "").strip()
     content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
     return content
@@ -124,7 +125,7 @@ class _Document:
                     "apply it, then export"
                 )
             elif child.tag in _STEPS:
-                matrix = matmul(matrix, _STEPS[child.tag](_numbers(child)))
+                matrix = matmul(matrix, _step(child))
             elif child.tag == "skew":
                 raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
         name = element.get("name", "") if element.tag == "node" else ""
@@ -137,7 +138,10 @@ class _Document:
             raise MeshFileError("moves vertices by a morph, which is not supported: apply it")
         bound = self._bound_materials(instance) if self._paint or self._names_materials else ()
         shape = skin.find("bind_shape_matrix")
-        matrix = np.eye(4) if shape is None else _numbers(shape).reshape(4, 4)
+        matrix = np.eye(4) if shape is None else _numbers(shape)
+        if matrix.size != 16:
+            raise ValueError(f"{_tag(skin)} has a bind_shape_matrix of {matrix.size} numbers, not 16")
+        matrix = matrix.reshape(4, 4)
         return [
             mesh.moved(mesh.name, matrix[:3, :3], matrix[:3, 3])
             for mesh in self._geometry(self._target(skin, "geometry"), bound)
@@ -230,9 +234,9 @@ class _Document:
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")
-        first = min(inputs, key=lambda entry: int(entry.get("set", 0)))
+        first = min(inputs, key=lambda entry: _whole_number(entry, "set"))
         s, t = self._rows(self._target(first, "source"))[:, :2].T
-        return np.column_stack([s, 1 - t]), int(first.get("offset", 0))
+        return np.column_stack([s, 1 - t]), _whole_number(first, "offset")
 
     def _inputs(self, primitive: Element) -> _Inputs:
         """Return the points of a primitive; ValueError without points."""
@@ -240,20 +244,20 @@ class _Document:
         points = None
         offset = 0
         for entry in primitive.findall("input"):
-            entry_offset = int(entry.get("offset", 0))
+            entry_offset = _whole_number(entry, "offset")
             stride = max(stride, entry_offset + 1)
             if entry.get("semantic") == "VERTEX":
                 points = self._points(self._target(entry, "vertices"))
                 offset = entry_offset
         if points is None:
-            raise ValueError(f"<{primitive.tag}> has no vertices")
+            raise ValueError(f"{_tag(primitive)} has no <input> of VERTEX")
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
         """Return the positions (v, 3) of <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
-            raise ValueError("<vertices> without positions")
+            raise ValueError(f"{_tag(vertices)} has no <input> of POSITION")
         source = self._target(entry, "source")
         rows = self._rows(source)
         accessor = source.findall("technique_common/accessor/param")
@@ -269,14 +273,15 @@ class _Document:
         """Return the numbers (count, stride) of a <source>."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
-            raise ValueError("positions without <accessor>")
+            raise ValueError(f"{_tag(source)} has no <accessor>")
         numbers = self._floats(self._target(accessor, "float_array"))
-        count = int(accessor.get("count", 0))
-        stride = int(accessor.get("stride", 1))
-        offset = int(accessor.get("offset", 0))
+        count = _whole_number(accessor, "count")
+        stride = _whole_number(accessor, "stride", 1)
+        offset = _whole_number(accessor, "offset")
         if min(count, offset, stride - 1) < 0 or offset + count * stride > len(numbers):
             raise ValueError(
-                f"{count:,} positions of {stride} numbers announced, {len(numbers):,} numbers there"
+                f"{_tag(source)} announces {count:,} x {stride} numbers, and {len(numbers):,} are "
+                "there"
             )
         return numbers[offset : offset + count * stride].reshape(count, stride)
 
@@ -343,11 +348,13 @@ def _triangles(
     elif primitive.tag == "trifans":
         yield from map(fanned, lists)
     elif primitive.tag == "polylist" and lists:
-        sizes = np.array((primitive.findtext("vcount") or "").split(), np.int64)
+        counts = primitive.find("vcount")
+        sizes = np.zeros(0, np.int64) if counts is None else _integers(counts)
         joined_corners = np.concatenate(lists)
         if (sizes < 0).any() or sizes.sum() != len(joined_corners):
             raise ValueError(
-                f"polygons of {sizes.sum():,} corners, {len(joined_corners):,} are there"
+                f"{_tag(primitive)} announces polygons of {sizes.sum():,} corners, and "
+                f"{len(joined_corners):,} are there"
             )
         yield triangulated(points, joined_corners, sizes)
     elif primitive.tag == "polygons":
@@ -360,12 +367,57 @@ def _triangles(
 
 def _integers(element: Element) -> Ints:
     """Return the integers in the text of an element."""
-    return np.array((element.text or "").split(), np.int64)
+    return _words(element, np.int64, "whole numbers")
 
 
 def _numbers(element: Element) -> Floats:
     """Return the numbers in the text of an element."""
-    return np.array((element.text or "").split(), np.float64)
+    return _words(element, np.float64, "numbers")
+
+
+def _words(element: Element, kind: type, expected: str) -> AnyArray:
+    """Return the numbers of a type in the text of an element; ValueError for other words."""
+    words = (element.text or "").split()
+    try:
+        return np.array(words, kind)
+    except (ValueError, OverflowError) as error:
+        word = next(word for word in words if not _is_number(word, kind))
+        raise ValueError(f"{_tag(element)} has {word[:40]!r}, and {expected} were expected") from error
+
+
+def _is_number(word: str, kind: type) -> bool:
+    """Return True if a word is a number of a type."""
+    try:
+        np.array([word], kind)
+    except (ValueError, OverflowError):
+        return False
+    return True
+
+
+def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
+    """Return an attribute; ValueError if it is no whole number."""
+    text = element.get(attribute, str(default))
+    try:
+        return int(text)
+    except ValueError as error:
+        raise ValueError(
+            f"{_tag(element)} has {attribute}={text[:40]!r}, and a whole number was expected"
+        ) from error
+
+
+def _tag(element: Element) -> str:
+    """Return the start of an element, for messages: «<source id="positions">»."""
+    name = element.get("id") or element.get("sid")
+    return f"<{element.tag} id={name[:40]!r}>" if name else f"<{element.tag}>"
+
+
+def _step(element: Element) -> Floats:
+    """Return the matrix (4, 4) of a step of a placement; ValueError for other numbers."""
+    numbers = _numbers(element)
+    count, matrix_of = _STEPS[element.tag]
+    if len(numbers) != count:
+        raise ValueError(f"{_tag(element)} has {len(numbers)} numbers, and {count} were expected")
+    return matrix_of(numbers)
 
 
 def _rotate(numbers: Floats) -> Floats:
@@ -382,10 +434,10 @@ def _look_at(numbers: Floats) -> Floats:
     return affine(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 
-_STEPS = {
-    "translate": lambda numbers: affine(np.eye(3), numbers),
-    "rotate": _rotate,
-    "scale": lambda numbers: np.diag([*numbers, 1.0]),
-    "matrix": lambda numbers: numbers.reshape(4, 4),
-    "lookat": _look_at,
+_STEPS: dict[str, tuple[int, Callable[[Floats], Floats]]] = {  # {tag: (numbers, their matrix)}
+    "translate": (3, lambda numbers: affine(np.eye(3), numbers)),
+    "rotate": (4, _rotate),
+    "scale": (3, lambda numbers: np.diag([*numbers, 1.0])),
+    "matrix": (16, lambda numbers: numbers.reshape(4, 4)),
+    "lookat": (9, _look_at),
 }

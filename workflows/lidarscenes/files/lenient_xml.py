@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from xml.etree.ElementTree import Element
 
+from lidarsim.base.errors import CutShortError
+
 MAX_ELEMENTS = 1_000_000  # of a file; public worlds of Gazebo have up to 60,000
 _MAX_DEPTH = 200
 
@@ -55,7 +57,7 @@ class _Parser:
             self._add_text(text[position:start])
             position = self._after_markup(start)
         if self._open:
-            raise ValueError(f"<{self._open[-1].tag[:40]}> has no end")
+            raise CutShortError(f"its last element, <{self._open[-1].tag[:40]}>, has no end")
         if self._root is None:
             raise ValueError("it has no elements")
         return self._root
@@ -75,6 +77,8 @@ class _Parser:
             return self._after_declaration(start)
         tag = _TAG.match(text, start)
         if tag is None:
+            if ">" not in text[start:]:
+                raise CutShortError(f"it ends within a tag, in line {self._line(start)}")
             raise ValueError(f"line {self._line(start)} has a tag that is none of XML")
         if tag["end"]:
             self._end_element(tag["name"], start)

@@ -23,6 +23,7 @@ import numpy as np
 from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
 from lidarsim.base.elementary import decade
+from lidarsim.base.errors import CutShortError
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
@@ -171,7 +172,16 @@ def _open_raster(path: Path) -> Iterator[Any]:
             _check_kind(source)
             yield source
         except RasterioError as error:
-            raise ValueError(str(error.__cause__ or error).replace(folder, "")) from error
+            raise _failure(str(error.__cause__ or error).replace(folder, ""), driver) from error
+
+
+def _failure(reason: str, driver: str) -> ValueError:
+    """Return the error of a file that a driver of GDAL refused for a reason."""
+    if "File short" in reason:
+        return CutShortError("it has fewer heights than its header announces")
+    if "not recognized as being in a supported file format" in reason:
+        return ValueError(f"it does not begin as a raster of its ending does, by GDAL's {driver}")
+    return ValueError(reason)
 
 
 def _read_beside(path: Path, suffix: str) -> bytes:

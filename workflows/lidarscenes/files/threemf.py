@@ -161,6 +161,8 @@ class _Package:
 
     def _pieces(self, name: str) -> Iterator[bytes]:
         """Yield the content of an inner file; the content is never longer than announced."""
+        if name not in self._archive.namelist():
+            raise ValueError(f"its archive has no file {name[:80]!r}")
         entry = self._archive.getinfo(name)
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise MeshFileError("is packed by a method other than Deflate: export it again")

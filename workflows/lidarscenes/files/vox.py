@@ -11,9 +11,11 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.base.errors import CutShortError
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import box
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, ReadOptions
+from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, Voxels
 
 DENSITY = "PadBVTotal"
@@ -32,7 +34,7 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
     if data.startswith(b"VOX "):
         raise MeshFileError("is a model of MagicaVoxel: export it as .obj or .ply")
     if not data.lstrip().startswith(b"VOXEL SPACE"):
-        raise MeshFileError("is broken, or not of AMAPVox: it does not begin with VOXEL SPACE")
+        raise MeshFileError("is not of AMAPVox: it does not begin with VOXEL SPACE")
     table = _read_table(data)
     unknown = int(np.isnan(table.densities).sum())
     full = table.densities > 0
@@ -83,12 +85,17 @@ def _read_table(data: bytes) -> _Table:
     columns = heading[0].decode("utf-8", "replace").split()
     rows = data[heading.end() :]
     if len(last := rows[rows.rstrip().rfind(b"\n") :].split()) < len(columns):
-        raise MeshFileError(f"is cut short: its last row has {len(last)} of {len(columns)} numbers")
+        raise CutShortError(f"its last row has {len(last)} of {len(columns)} numbers")
     grid = _grid(header)
     column = _density_column(columns)
-    i, j, k, densities = np.loadtxt(
-        io.BytesIO(rows), usecols=(0, 1, 2, column), unpack=True, ndmin=2
-    )
+    used = (0, 1, 2, column)
+    try:
+        values = np.loadtxt(io.BytesIO(rows), usecols=used, ndmin=2)
+    except ValueError:  # of a line that is named, if it is read cell by cell
+        lines = io.TextIOWrapper(io.BytesIO(rows), "utf-8", "replace")
+        number = data[: heading.end()].count(b"\n") + 1
+        values = RowReader(columns, used, used=used).read(lines, number)
+    i, j, k, densities = values.T
     indices = np.stack([i, j, k], axis=1)
     _check_rows(indices, densities, grid.counts)
     return _Table(header, grid, columns[column], indices, densities)

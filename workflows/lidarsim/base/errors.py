@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from .words import printable
 
 MAX_MISTAKES = 20
+_UNFORESEEN = (IndexError, TypeError, AttributeError, ArithmeticError, AssertionError)
 _MAX_REASON = 400  # letters: libraries may quote a whole file
 
 
@@ -51,6 +52,8 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
     reason = type(error).__name__
     if str(error):
         reason = printable(message_of(error), _MAX_REASON).rstrip(".")
+    if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
+        reason = f"its content is not as its format says, {reason}"
     return f"{subject} {failure} ({reason}): {advice}." if advice else (
         f"{subject} {failure}: {reason}."
     )

@@ -7,7 +7,18 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
+from .errors import CutShortError
+
 _BLOCK_BYTES = 1 << 16
+# Codes of the errors of a text that ends too early.
+_AT_END = tuple(
+    expat.errors.codes[message]
+    for message in (
+        expat.errors.XML_ERROR_NO_ELEMENTS,
+        expat.errors.XML_ERROR_UNCLOSED_TOKEN,
+        expat.errors.XML_ERROR_UNCLOSED_CDATA_SECTION,
+    )
+)
 
 
 def xml_root(data: bytes) -> Element:
@@ -17,6 +28,8 @@ def xml_root(data: bytes) -> Element:
     ------
     ValueError
         If the file declares entities.
+    CutShortError
+        If the file ends before its root element does.
     ElementTree.ParseError
         If the file is not XML.
     """
@@ -31,7 +44,12 @@ def xml_root(data: bytes) -> Element:
                 break
     except expat.ExpatError:
         pass  # ElementTree raises the error below
-    return ElementTree.fromstring(data)
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        if error.code not in _AT_END:
+            raise
+        raise CutShortError(f"its XML ends within an element, in line {error.position[0]}") from error
 
 
 def refuse_entity(name: str, *details: object) -> NoReturn:

@@ -217,9 +217,12 @@ class _Reader:
         return _matrix({**node, **animated})
 
     def _part(self, kind: str, index: Any) -> dict[str, Any]:
-        """Return a part of the file by its index; ValueError for a negative index."""
-        part: dict[str, Any] = self._header[kind][_natural(index)]
-        return part
+        """Return a part of the file by its index; ValueError without such a part."""
+        parts: list[dict[str, Any]] = self._header.get(kind, [])
+        number = _natural(index)
+        if number >= len(parts):
+            raise ValueError(f"it refers to number {number} of its {kind}, of {len(parts)}")
+        return parts[number]
 
     def node(self, index: int) -> Node:
         """Return a node; a node without a name gets the name of its mesh."""
@@ -547,6 +550,11 @@ class _Reader:
         """Return the numbers (count, width) of an accessor, if possible without a copy."""
         accessor = self._part("accessors", index)
         count = _natural(accessor["count"])
+        if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
+            raise ValueError(
+                f"accessor {index} has the type {accessor['type']!r} of "
+                f"{accessor['componentType']!r}, which glTF does not know"
+            )
         width = _WIDTHS[accessor["type"]]
         kind = np.dtype(_TYPES[accessor["componentType"]])
         sparse = accessor.get("sparse")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import codecs
+import json
 import logging
 import re
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -57,6 +59,8 @@ GENERATOR = "lidarpool"
 FORMAT_COMMENT = "lidarpool: metres, Z-up"
 
 _MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
+_ZIP = b"PK\x03\x04"  # first bytes of an archive
+_ZIP_END = b"PK\x05\x06"  # before the end of an archive
 _HEAD_BYTES = 200  # bytes of a file that contain such a comment
 
 OpacityMode = Literal["mask", "ignore"]
@@ -401,9 +405,23 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
             raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
         # Readers raise errors of any class: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
+        failure = _end_missing(error, data) or error
         raise LidarError(
-            f"{unreadable(path, error, _advice(error))}{_other_format(path, data)}"
+            f"{unreadable(path, failure, _advice(failure))}{_other_format(path, data)}"
         ) from error
+
+
+def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
+    """Return an error of a file that ends too early, if a library's error tells that; else None."""
+    if isinstance(error, json.JSONDecodeError):
+        if error.msg.startswith("Unterminated") or error.pos >= len(error.doc.rstrip()):
+            return CutShortError(f"its JSON ends in line {error.lineno}, column {error.colno}")
+    elif isinstance(error, zipfile.BadZipFile):
+        if data.startswith(_ZIP) and _ZIP_END not in data:
+            return CutShortError("it is an archive without its list of files, with which it ends")
+    elif isinstance(error, EOFError):
+        return CutShortError("its packed content ends too early")
+    return None
 
 
 def _advice(error: Exception) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
@@ -118,11 +119,14 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
     libraries = _obj_names(b"mtllib", text) if options.masks or options.colours else []
     materials = MtlMaterials(path, len(data), libraries, options)
     with_materials = materials.has_masks or options.colours or options.materials
-    content = _parse_obj(text, path.stem, options.colours, with_materials)
     meshes = list[SceneMesh]()
-    for (name, _), polygons in content.objects.items():
-        pieces = _obj_pieces(content, polygons, materials, options)
-        meshes += join_pieces(name, pieces)
+    try:
+        content = _parse_obj(text, path.stem, options.colours, with_materials)
+        for (name, _), polygons in content.objects.items():
+            pieces = _obj_pieces(content, polygons, materials, options)
+            meshes += join_pieces(name, pieces)
+    except (ValueError, OverflowError) as error:  # OverflowError: of numbers beyond 64 bits
+        raise ValueError(_obj_mistake(data, options.colours) or str(error)) from error
     return Content(meshes, notes=materials.notes.lines())
 
 
@@ -138,14 +142,13 @@ def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool)
         key, _, value = line.lstrip(b" ").partition(b" ")
         if key == b"v":
             words = value.partition(b"#")[0].split()  # a weight or a colour may follow
-            if len(words) < 3:
-                raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
-            positions.extend(map(float, words[:3]))
+            x, y, z = map(float, words[:3])
+            positions.extend((x, y, z))
             if with_colours and len(words) >= 6:
                 content.tints.extend(map(float, words[-3:]))
         elif key == b"f":
             value = value.partition(b"#")[0]
-            corners = _obj_corners(value, len(positions) // 3, line)
+            corners = _obj_corners(value, len(positions) // 3)
             polygons.corners.extend(corners)
             polygons.sizes.append(len(corners))
             if with_materials:
@@ -214,17 +217,70 @@ def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
     return [number - 1 if number >= 0 else max(-1, count + number) for number in numbers]
 
 
-def _obj_corners(value: bytes, count: int, line: bytes) -> list[int]:
-    """Return the rows of vertices of a face; `count` vertices have been read so far."""
+def _obj_corners(value: bytes, count: int) -> list[int]:
+    """Return the rows of vertices of a face; `count` vertices have been read so far.
+
+    ValueError if a number is none of a vertex before the face.
+    """
     words = value.split()
     if b"/" in value:
         words = [word.partition(b"/")[0] for word in words]
     numbers = list(map(int, words))
     if numbers and min(numbers) <= 0:  # rare, so that this is the only check
         if 0 in numbers or min(numbers) < -count:
-            raise ValueError(f"'{_shown(line)}' refers to a missing vertex")
+            raise ValueError("a face refers to a missing vertex")
         return [number - 1 if number > 0 else count + number for number in numbers]
     return [number - 1 for number in numbers]
+
+
+def _obj_mistake(data: bytes, with_colours: bool) -> str | None:
+    """Return which line of a file is wrong, or None if each line is right by itself."""
+    total = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
+    count = 0  # vertices so far
+    for number, line in _logical_lines(data):
+        key, *words = line.partition(b"#")[0].split() or [b""]
+        if key == b"v":
+            count += 1
+            colours = words[-3:] if with_colours and len(words) >= 6 else []
+            if len(words) < 3 or not all(map(_is_real, [*words[:3], *colours])):
+                return f"line {number} is '{_shown(line)}', and three numbers were expected after v"
+        elif key == b"f":
+            vertices = [word.partition(b"/")[0] for word in words]
+            if not all(re.fullmatch(rb"[-+]?\d+", vertex) for vertex in vertices):
+                return (
+                    f"line {number} is '{_shown(line)}', and numbers of vertices were expected "
+                    "after f"
+                )
+            if not all(1 <= int(vertex) <= total or -count <= int(vertex) < 0 for vertex in vertices):
+                return (
+                    f"line {number} is '{_shown(line)}', which refers to a missing vertex, of "
+                    f"{total:,}"
+                )
+    return None
+
+
+def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the lines of a file, joined where a backslash ends them, and their first numbers."""
+    joined = b""
+    first = 0
+    for number, line in enumerate(re.split(rb"\r\n|\r|\n", data), 1):
+        first = first or number
+        joined += line
+        if joined.endswith(b"\\"):
+            joined = joined[:-1] + b" "
+            continue
+        yield first, joined
+        joined = b""
+        first = 0
+
+
+def _is_real(word: bytes) -> bool:
+    """Return True if a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _shown(line: bytes) -> str:
@@ -241,44 +297,84 @@ _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read an Object File Format file as a single mesh, with the colours of vertices (COFF)."""
-    text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
+    uncommented = re.sub(rb"#[^\r\n]*", b"", data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    text = uncommented.lstrip()
     keyword = _OFF.match(text)
     text = text[keyword.end() if keyword else 0 :]
     if text.lstrip().upper().startswith(b"BINARY"):
         raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
-    lines = [line.split() for line in text.splitlines() if line.strip()]
-    counts = lines.pop(0) if lines else []
+    first_line = 1 + uncommented[: len(uncommented) - len(text)].count(b"\n")
+    lines = [
+        (number, line.split())
+        for number, line in enumerate(text.split(b"\n"), first_line)
+        if line.strip()
+    ]
+    number, counts = lines.pop(0) if lines else (first_line, [])
     if len(counts) < 2 or not all(count.isdigit() for count in counts):
-        raise ValueError("no OFF header with the numbers of vertices and faces")
+        raise ValueError(_off_mistake(number, counts, "the numbers of vertices and faces"))
     points, polygons = map(int, counts[:2])
     if len(lines) != points + polygons:
-        raise ValueError(
+        failure = CutShortError if len(lines) < points + polygons else ValueError
+        raise failure(
             f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
             f"{len(lines):,} lines there"
         )
+    is_coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
+    vertices, tints = _off_vertices(lines[:points], is_coloured=is_coloured)
+    corners, sizes = _off_faces(lines[points:], points)
+    faces = triangulated(vertices, corners, sizes)
+    colours = None
+    if is_coloured and len(tints) == len(vertices):
+        colours = _vertex_colours(_colour_shares(tints), faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+
+
+_NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
+
+
+def _off_vertices(lines: Sequence[_NumberedLine], *, is_coloured: bool) -> tuple[Floats, Floats]:
+    """Return the vertices (v, 3) of lines, and the colours (k, 3) that follow them."""
     numbers = array("d")
     tints = array("d")
+    for number, words in lines:
+        try:
+            x, y, z = map(float, words[:3])
+            if is_coloured and len(words) >= 6:
+                tints.extend(map(float, words[3:6]))
+        except ValueError as error:
+            raise ValueError(_off_mistake(number, words, "x, y and z of a vertex")) from error
+        numbers.extend((x, y, z))
+    return np.frombuffer(numbers).reshape(-1, 3), np.frombuffer(tints).reshape(-1, 3)
+
+
+def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
+    """Return the corners (sum of sizes,) and sizes (p,) of the faces of lines.
+
+    `count` is the number of vertices.
+    """
     corners = array("q")
     sizes = array("q")
-    coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
-    for line in lines[:points]:
-        if len(line) < 3:
-            raise ValueError(f"a vertex has {len(line)} numbers")
-        numbers.extend(map(float, line[:3]))  # a colour may follow
-        if coloured and len(line) >= 6:
-            tints.extend(map(float, line[3:6]))
-    for line in lines[points:]:
-        size = int(line[0])
-        if not 0 <= size < len(line):
-            raise ValueError(f"a face of {size} corners has {len(line) - 1}")
-        corners.extend(map(int, line[1 : size + 1]))
+    for number, words in lines:
+        try:
+            size = int(words[0])
+            rows = list(map(int, words[1 : size + 1]))
+        except ValueError:
+            size = -1
+            rows = []
+        if len(rows) != size or (rows and not 0 <= min(rows) <= max(rows) < count):
+            raise ValueError(
+                _off_mistake(
+                    number, words, f"a number of corners and as many vertices, 0 to {count - 1:,},"
+                )
+            )
+        corners.extend(rows)
         sizes.append(size)
-    vertices = np.frombuffer(numbers).reshape(-1, 3)
-    faces = triangulated(vertices, _ints(corners), _ints(sizes))
-    colours = None
-    if coloured and len(tints) == len(numbers):
-        colours = _vertex_colours(_colour_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
-    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+    return _ints(corners), _ints(sizes)
+
+
+def _off_mistake(number: int, words: Sequence[bytes], expected: str) -> str:
+    """Return the message on a line that is wrong."""
+    return f"line {number} is '{_shown(b' '.join(words))}', and {expected} were expected"
 
 
 def _colour_shares(colours: Floats) -> Floats:
@@ -302,7 +398,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
         rows = np.frombuffer(data, np.uint8, 50 * announced, 84).reshape(-1, 50)
         corners = np.ascontiguousarray(rows[:, 12:48]).view("<f4").astype(np.float64)
         return Content(_stl_mesh(path.stem, corners.reshape(-1, 3)))
-    text = data.replace(b"\r", b"\n")
+    text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     solids = re.split(rb"^[ \t]*solid\b", text, flags=re.MULTILINE | re.IGNORECASE)[1:]
     if not solids:
         raise MeshFileError(
@@ -313,13 +409,36 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
     for solid in solids:
         head, _, body = solid.partition(b"\n")
         if b"endsolid" not in solid.lower():
-            raise MeshFileError("is cut short: it does not end with 'endsolid'")
+            raise CutShortError("it does not end with 'endsolid'")
         words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", body, re.IGNORECASE)
-        vertices = np.array(list(map(float, chain.from_iterable(words)))).reshape(-1, 3)
-        if len(vertices) != 3 * len(re.findall(rb"\bendfacet", body, re.IGNORECASE)):
-            raise ValueError("a facet is not a triangle")
+        try:
+            vertices = np.array(list(map(float, chain.from_iterable(words)))).reshape(-1, 3)
+        except ValueError as error:
+            raise ValueError(_stl_mistake(text) or str(error)) from error
+        facets = len(re.findall(rb"\bendfacet", body, re.IGNORECASE))
+        if len(vertices) != 3 * facets:
+            raise ValueError(
+                _stl_mistake(text)
+                or f"a solid has {len(vertices):,} vertices, and {facets:,} facets of three each"
+            )
         meshes += _stl_mesh(as_text(head.strip()) or path.stem, vertices)
     return Content(meshes)
+
+
+def _stl_mistake(text: bytes) -> str | None:
+    """Return which line of a text file is wrong, or None if each facet has three vertices."""
+    count = 0
+    for number, line in enumerate(text.split(b"\n"), 1):
+        key, *words = line.lower().split() or [b""]
+        if key == b"facet":
+            count = 0
+        elif key == b"vertex":
+            count += 1
+            if len(words) < 3 or not all(map(_is_real, words[:3])):
+                return f"line {number} is '{_shown(line)}', and vertex x y z was expected"
+        elif key == b"endfacet" and count != 3:
+            return f"the facet that ends in line {number} has {count} vertices, and three were expected"
+    return None
 
 
 def _stl_mesh(name: str, corners: Floats) -> list[SceneMesh]:
@@ -335,6 +454,11 @@ _PLY_TYPES = {
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+_PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_PLY_LINE = (
+    "and format, element NAME COUNT, property TYPE NAME, property list TYPE TYPE NAME or comment "
+    "was expected"
+)
 _PLY_LISTS = ("vertex_indices", "vertex_index")
 _PLY_COLOURS = ("red", "green", "blue")
 
@@ -365,6 +489,7 @@ class _PlyHeader(NamedTuple):
     elements: list[_Element]
     order: str  # byte order, '' of text
     body: bytes
+    lines: int  # of the header
 
 
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -442,23 +567,24 @@ def _ply_header(data: bytes) -> _PlyHeader:
         raise ValueError("its first line is not 'ply', with which the header of a .ply begins")
     elements: list[_Element] = []
     order = ""
-    for line in (header_match[1] or b"").decode("latin-1").splitlines():
+    for number, line in enumerate((header_match[1] or b"").decode("latin-1").splitlines(), 2):
         match line.split():
-            case ["format", kind, *_]:
-                order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
-            case ["element", name, count]:
-                if int(count) < 0:
-                    raise ValueError(f"{count} rows of {name[:20]} announced")
+            case ["format", kind, *_] if kind in _PLY_ORDERS:
+                order = _PLY_ORDERS[kind]
+            case ["element", name, count] if count.isdecimal():
                 elements.append(_Element(name, int(count)))
-            case ["property", "list", length, kind, name]:
+            case ["property", "list", length, kind, name] if (
+                elements and {length, kind} <= _PLY_TYPES.keys()
+            ):
                 elements[-1].properties[name] = _PLY_TYPES[kind], _PLY_TYPES[length]
-            case ["property", kind, name]:
+            case ["property", kind, name] if elements and kind in _PLY_TYPES:
                 elements[-1].properties[name] = _PLY_TYPES[kind], ""
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise ValueError(f"'{line[:60]}' is not a line of a PLY header")
-    return _PlyHeader(elements, order, data[header_match.end() :])
+                raise ValueError(f"line {number} is '{line[:60]}', {_PLY_LINE}")
+    lines = len(header_match[0].splitlines())
+    return _PlyHeader(elements, order, data[header_match.end() :], lines)
 
 
 def _ply_rows(header: _PlyHeader) -> _PlyRows:
@@ -467,9 +593,12 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
     Text is read in double precision, whatever type its header states: georeferenced vertices are
     often declared `float` and have more digits.
     """
-    elements, order, body = header
+    elements, order, body, _ = header
     if not order:
-        words = np.array(list(map(float, body.split())))
+        try:
+            words = np.array(list(map(float, body.split())))
+        except ValueError as error:
+            raise ValueError(_text_mistake(header) or str(error)) from error
         body = words.tobytes()
         for element in elements:
             kinds = element.properties.items()
@@ -483,8 +612,18 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
         rows[element.name], start = reader.read(start)
     remaining = body[start:].strip(b"\0\r\n\t ") if order else body[start:]
     if remaining:
-        raise ValueError(f"{len(remaining):,} bytes more than announced")
+        surplus = f"{len(remaining):,} bytes" if order else f"{len(remaining) // 8:,} numbers"
+        raise ValueError(f"{surplus} more than announced")
     return rows
+
+
+def _text_mistake(header: _PlyHeader) -> str | None:
+    """Return which line of a body of text is wrong, or None."""
+    for number, line in enumerate(header.body.splitlines(), header.lines + 1):
+        for word in line.split():
+            if not _is_real(word):
+                return f"line {number} has '{_shown(word)}', and a number was expected"
+    return None
 
 
 class _PlyElementReader:
@@ -563,15 +702,25 @@ class _PlyElementReader:
         for name, (_, length) in element.properties.items():
             size = 1
             if length:
+                if offset + int(length[1]) > len(body):
+                    raise self._cut_short()
                 (size,) = struct.unpack_from(self._order + np.dtype(length).char, body, offset)
-                if size < 0 or size != int(size):
-                    raise ValueError(f"a list has the length {size}")
+                if not (0 <= size < np.inf and size == int(size)):
+                    raise ValueError(
+                        f"a list of {element.name[:20]} has the length {size:g}, and a whole number "
+                        "from 0 on was expected"
+                    )
                 offset += int(length[1])
                 size = int(size)
             spans.append((offset, size))
             offset += size * self._kinds[name].itemsize
         if offset > len(body):
-            raise CutShortError(
-                f"{element.count:,} rows of {element.name[:20]} announced, and there are fewer"
-            )
+            raise self._cut_short()
         return spans, offset
+
+    def _cut_short(self) -> CutShortError:
+        """Return the error of a body that ends within the rows."""
+        count = self._element.count
+        return CutShortError(
+            f"{count:,} rows of {self._element.name[:20]} announced, and there are fewer"
+        )
