@@ -165,7 +165,7 @@ def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypat
     view = growing_view(tmp_path / name)
     (tmp_path / name).write_bytes(content[: len(content) // 2])
     view.answer("points", asked, bool)
-    assert "is broken or cut short" in growth_of(view)["error"]
+    assert "is cut short" in growth_of(view)["error"]
 
 
 def test_files_of_other_programs(tmp_path):

@@ -240,10 +240,10 @@ def test_the_first_version_needs_no_transform(tmp_path):
         (city({"a": thing(geometry("MultiSurface", [[[0, 1, -1]]]))}), "'Building a': .*-1 to 1"),
         (city({"a": thing(geometry("MultiSurface", [[[0, 1, 2**70]]]))}), "'Building a'"),
         (city({"a": thing(geometry("MultiSurface", [[[0, 1, 0.5]]]))}), "'Building a'"),
-        (city({"a": thing(geometry())}, [*CUBE[:7], [1, 2]]), "broken or cut short"),
+        (city({"a": thing(geometry())}, [*CUBE[:7], [1, 2]]), "cannot be read .*vertices"),
         (city({"a": thing(geometry())}, [*CUBE[:7], [1e300, 2, 3]]), "farther than anything"),
-        (json.dumps(city({"a": thing(geometry())}))[:-9], "broken or cut short"),
-        ('{"type": "CityJSON", "version": "2.0", "x": ' + NESTED, "broken or cut short"),
+        (json.dumps(city({"a": thing(geometry())}))[:-9], "is cut short .its JSON ends in line 1"),
+        ('{"type": "CityJSON", "version": "2.0", "x": ' + NESTED, "cannot be read"),
         (city({"a": thing()}), "no triangles"),
     ],
 )

@@ -264,7 +264,7 @@ def test_models_without_usable_rangefinders_make_no_scenario(tmp_path):
         ("<document/>", "a survey of HELIOS.*lidarpool import"),
         ("<fcd-export/>", "floating car data of SUMO"),
         ("<note/>", "is XML, but no model of MuJoCo: it begins with <note>"),
-        ("v 1 2 3", "broken or cut short"),
+        ("v 1 2 3", "cannot be read"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "declares XML entities"),
         (world(BOX, "<geom/>"), "Error"),
         (world(), "nothing that a lidar sees"),
@@ -315,7 +315,7 @@ def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch
     monkeypatch.setattr(child_process, "subprocess", subprocess)
     text = '<asset><hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/></asset>'
     path = write(tmp_path / "m.xml", mjcf(text, f"<worldbody>{BOX}</worldbody>"))
-    with pytest.raises(LidarError, match=r"broken or cut short \(|would unpack to"):
+    with pytest.raises(LidarError, match=r"cannot be read \(|would unpack to"):
         load(path)
     monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 1000)
     monkeypatch.setattr(allowance, "UNPACKED_TIMES", 0.01)

@@ -164,8 +164,8 @@ def test_of_both_the_header_says_which_counts(tmp_path, wkt_bit):
         (keys((1024, 2), (2048, 4326)), r"are angles.*EPSG:4326.*reprojection"),
         (wkt(GEOGCS), r"are angles \(NAD83\)"),
         (wkt('PROJCS["no unit",PROJECTION["x"]]'), r"'no unit' states no unit"),
-        (wkt('PROJCS["cut",UNIT["foot"'), r"is no WKT, or cut short"),
-        (wkt("+proj=utm +zone=33"), r"broken or cut short"),
+        (wkt('PROJCS["cut",UNIT["foot"'), r"is cut short: its coordinate system"),
+        (wkt("+proj=utm +zone=33"), "its coordinate system begins with 'PROJ', and WKT"),
     ],
 )
 def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(

@@ -21,6 +21,7 @@ from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import Transform
 
+TEXT_STL = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 1 0 0\nvertex 0 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
 OBJ = """# two objects
 o Box
 v {x} 0 0
@@ -201,32 +202,44 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     ("name", "content", "message"),
     [
         ("m.obj", "", r"is empty \(0 bytes\)"),
-        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "broken"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4 is 'f 1 2 9', .*missing"),
+        ("m.obj", "o a\nv 0 0 \\\n0\nv 1 0 x\n", "line 4 is 'v 1 0 x', and three numbers"),
+        ("m.obj", "v 0 0 0\nf 1 1 a/1\n", "line 2 is 'f 1 1 a/1', and numbers of vertices"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle with an area"),
-        ("m.obj", "v 1 2\nf 1 1 1\n", "a vertex has 2 numbers, 'v 1 2'"),
-        ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "broken"),
-        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "2 faces announced"),
+        ("m.obj", "v 1 2\nf 1 1 1\n", "line 1 is 'v 1 2', and three numbers"),
+        ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "line 6 is '3 0 1 7', .*0 to 2"),
+        ("m.off", "OFF # a b\n\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 5 is '1 0 z', "),
+        ("m.off", "OFF\n3 one 0\n", "line 2 is '3 one 0', and the numbers of vertices and faces"),
+        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short .*2 faces announced"),
         ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a line of its own"),
         ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces announced"),
         ("m.off", "OFF BINARY\n3 1 0\n", "binary OFF"),
-        ("m.stl", "solid a\nfacet\n", "does not end"),
+        ("m.stl", "solid a\nfacet\n", "is cut short .*does not end"),
+        ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 0"), "line 4 is 'vertex 1 0', and"),
+        ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 a 0"), "line 4 is 'vertex 1 a 0', "),
+        ("m.stl", TEXT_STL.replace("vertex 1 0 0\n", ""), "ends in line 7 has 2 vertices"),
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
         ("m.ply", PLY + "3 0 2 3\n", "more than announced"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "are not whole numbers"),
-        ("m.ply", PLY.replace("double z", "half z"), "half"),
+        ("m.ply", PLY.replace("double z", "half z"), "line .* is 'property half z', and format, "),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 b 3"), "line 15 has 'b', and a number"),
+        ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "a list of face has the length -3"),
+        ("m.ply", PLY.replace("3 0 2 3", ""), "is cut short .2 rows of face announced"),
+        ("m.ply", "plain text\n", "first line is not 'ply'"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
-        ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
+        ("m.ply", PLY.partition("end_header")[0], "is cut short .*no line end_header"),
         ("m.part", "LASF", "has the ending .part"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         *[
             (
                 f"m{suffix}",
                 content,
-                "broken|cut short|no triangles|is not glTF|no valid JSON|pip install",
+                "cannot be read|cut short|no triangles|is not glTF|no valid JSON|pip install|"
+                "is not of AMAPVox",
             )
             for suffix in endings()
             for content in (np.random.default_rng(5).bytes(3000), b"no mesh\n" * 20, bytes(2000))

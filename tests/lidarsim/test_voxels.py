@@ -148,7 +148,7 @@ def test_unknown_voxels_are_empty_and_told_of(tmp_path):
         ("1 0 1 0.4", "1 0 0 0.4", "has 1 row of voxels that it had before"),
         ("1 0 1 0.4", "1 0 1 -0.4", "has -0.4 m²/m³ in voxel 1 0 1; a density is 0 to 10000"),
         ("1 0 1 0.4", "1 0 1 1e9", r"has 1e\+09 m²/m³ in voxel 1 0 1"),
-        ("1 0 1 0.4", "1 0 1 leaf", "is broken or cut short"),
+        ("1 0 1 0.4", "1 0 1 leaf", "line 10 has 'leaf' as PadBVTotal, and a number"),
         ("45.5 12\n1 0 1 0.4", "45.5\n1 0 1", "has 5 of 6 numbers"),
     ],
 )

@@ -343,7 +343,10 @@ class _CityFile:
 
 def _points(rows: Any) -> Floats:
     """Return coordinates (v, 3); ValueError for another shape."""
-    points = np.array(rows or np.zeros((0, 3)), np.float64)
+    try:
+        points = np.array(rows or np.zeros((0, 3)), np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError("its vertices are not rows of three numbers") from error
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"its vertices are of the shape {points.shape}, not (v, 3)")
     return points

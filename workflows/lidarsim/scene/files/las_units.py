@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from ...base.errors import LidarError
+from ...base.errors import CutShortError, LidarError
 from ...base.extras import install_command
 
 # Records of LASF_Projection, by ASPRS LAS 1.4.
@@ -176,7 +176,10 @@ def wkt_units(text: str) -> CoordinateUnits:
     if horizontal is None:
         if any(part.keyword in _ANGULAR for part in parts):
             raise LidarError(f"its coordinates are angles ({name[:80]}): {_PROJECT}.")
-        raise ValueError(f"its coordinate system begins with {node.keyword[:20]}")
+        raise ValueError(
+            f"its coordinate system begins with {node.keyword[:20]!r}, and WKT of a projection was "
+            "expected"
+        )
     unit = _length_unit(horizontal)
     if unit is None:
         raise LidarError(f"its coordinate system {name[:80]!r} states no unit: {_OVERRIDE}.")
@@ -205,8 +208,10 @@ def _parsed(text: str) -> _Node:
             if len(open_nodes) == 1:
                 raise ValueError("its coordinate system is no WKT")
             open_nodes.pop()
-    if len(open_nodes) > 1 or not root.nodes:
-        raise ValueError("its coordinate system is no WKT, or cut short")
+    if not root.nodes:
+        raise ValueError("its coordinate system is no WKT")
+    if len(open_nodes) > 1:
+        raise CutShortError(f"its coordinate system ends within {root.nodes[0].keyword[:20]}")
     return root.nodes[0]
 
 
@@ -249,7 +254,7 @@ def _geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
     doubles = records.get(_GEO_DOUBLES, b"")
     (count,) = struct.unpack_from("<H", data, 6)
     if 8 + 8 * count > len(data):
-        raise ValueError(f"{count} GeoTIFF keys announced, but there are fewer")
+        raise CutShortError(f"{count} GeoTIFF keys announced, and there are fewer")
     return dict(_key_values(data, count, doubles))
 
 
