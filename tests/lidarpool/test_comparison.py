@@ -460,13 +460,13 @@ def test_cut_and_garbled_files_are_a_line(written, tmp_path, name):
 
 def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     folder, made, _ = written
-    (tmp_path / "notes.txt").write_text("none")
+    (tmp_path / "notes.md").write_text("none")
     (tmp_path / "empty").mkdir()
     header = laspy.LasHeader(point_format=6, version="1.4")
     laspy.LasData(header).write(tmp_path / "none.las")
     for path, says in (
         ("nowhere.pcd", "does not exist, or is empty: give the folder of a result"),
-        ("notes.txt", "is not read: give the folder of a result"),
+        ("notes.md", "is not read: give the folder of a result"),
         ("empty", "is not read"),
         ("none.las", "has no points: there is nothing to compare"),
     ):

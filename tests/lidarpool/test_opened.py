@@ -275,6 +275,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     (tmp_path / "cut.parquet").write_bytes(b"123")
     (tmp_path / "cut.e57").write_bytes(b"123")
     (tmp_path / "notes.txt").write_text("none")
+    (tmp_path / "way.tum").write_text("0 1 2 3 0 0 0 1\n")
     (tmp_path / "empty").mkdir()
     for name in ("run.rrd", "gt.osi"):
         (tmp_path / name).write_bytes(b"RRF2")
@@ -291,7 +292,8 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),
         ("cut.e57", "cut.e57"),
-        ("notes.txt", "is not read: name a trajectory in a scenario, as trajectory: FILE, or give"),
+        ("notes.txt", r"line 1 is 'none', .* If it is a trajectory, name it in a scenario, as "),
+        ("way.tum", "is not read: name it in a scenario, as trajectory: FILE, or give"),
         ("empty", "is not read: give a result, data set, cloud, recording, scenario or mesh"),
         ("run.rrd", "is not read: it is a recording of Rerun, open it with the command rerun, or"),
         ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
@@ -305,7 +307,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             open_view(tmp_path / name)
         assert len(str(raised.value).splitlines()) == 1
     monkeypatch.setattr("lidarsim.base.extras.find_spec", lambda name: None)
-    for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet"), ("pcd", "pcd")):
+    for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet")):
         with pytest.raises(LidarError, match=rf"lidarpool\[{extra}\]"):
             open_view(folder / name)
 

@@ -22,10 +22,11 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import read_yaml
+from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.scene.files.meshfile import load_meshes
 
-RECORDINGS = (".ply", ".pcd", ".las", ".laz", ".mcap", ".pcap", ".osf")
+RECORDINGS = (".ply", ".las", ".laz", ".mcap", ".pcap", ".osf", *SCAN_READERS)
 TABLES = (".csv", ".tum", ".txt")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 
@@ -147,7 +148,6 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     ("name", "advice"),
     [
         ("a.bag", "rosbags-convert"),
-        ("a.xyz", "as .ply or .las"),
         ("a.glb", "run a survey of it first"),
     ],
 )

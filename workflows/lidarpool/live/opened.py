@@ -69,7 +69,8 @@ def open_view(path: Path) -> View:
             raise LidarError(f"{path} has no points.")
         return view
     mesh_format = format_of(path)
-    is_cloud = suffix == ".asc" and not is_text_raster(path)
+    with explained(f"{path} cannot be read"):
+        is_cloud = suffix == ".asc" and not is_text_raster(path)
     if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice and not is_cloud):
         return _preview(path)
     return _recorded(path, title)

@@ -24,8 +24,9 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import CutShortError, message_of
 from lidarsim.base.words import plural
-from lidarsim.base.xmlfile import refuse_entity
+from lidarsim.base.xmlfile import AT_END, refuse_entity
 from lidarsim.scene.colours import GREY, Colours
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.scene_graph import (
@@ -215,9 +216,18 @@ class _Model:
         parser = expat.ParserCreate()
         parser.StartElementHandler = self._begin
         parser.EntityDeclHandler = refuse_entity
-        for piece in text:
-            parser.Parse(piece)
-        parser.Parse(b"", True)
+        try:
+            for piece in text:
+                parser.Parse(piece)
+            parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            if error.code not in AT_END:
+                raise
+            raise CutShortError(f"{name[:80]} ends within an element") from error
+        except (KeyError, OverflowError, ValueError) as error:
+            raise ValueError(
+                f"line {parser.CurrentLineNumber} of {name[:80]}: {message_of(error).rstrip('.')}"
+            ) from error
 
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
         """Read the start of an element."""
@@ -288,6 +298,8 @@ class _Model:
         matrix = np.eye(4)
         if "transform" in attributes:
             numbers = np.array(attributes["transform"].split(), np.float64)
+            if numbers.shape != (12,):
+                raise ValueError(f"a transform has {len(numbers)} numbers, and 12 were expected")
             matrix[:3] = numbers.reshape(4, 3).T
         key = path.lstrip("/") or self._name, attributes["objectid"]
         return _Placement(key, attributes.get("partnumber", ""), matrix)

@@ -11,7 +11,7 @@ from .errors import CutShortError
 
 _BLOCK_BYTES = 1 << 16
 # Codes of the errors of a text that ends too early.
-_AT_END = tuple(
+AT_END = tuple(
     expat.errors.codes[message]
     for message in (
         expat.errors.XML_ERROR_NO_ELEMENTS,
@@ -47,7 +47,7 @@ def xml_root(data: bytes) -> Element:
     try:
         return ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
-        if error.code not in _AT_END:
+        if error.code not in AT_END:
             raise
         raise CutShortError(f"its XML ends within an element, in line {error.position[0]}") from error
 

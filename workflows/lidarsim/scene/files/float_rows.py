@@ -39,7 +39,7 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
     columns: dict[str, AnyArray] = dict(zip(names, rows.T.copy(), strict=True))
     if names is NUSCENES:
         rings = columns["channel"]
-        if not ((rings >= 0) & (rings < 1 << 16) & (rings % 1 == 0)).all():
+        if not ((rings >= 0) & (rings < 1 << 16) & (rings == np.floor(rings))).all():
             raise ValueError(
                 f"{path.name} has other numbers than rings, 0 to 65,535, as the last of each five: "
                 "it is no sweep of nuScenes"

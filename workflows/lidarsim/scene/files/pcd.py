@@ -369,11 +369,6 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
     Real numbers are read in double precision, whatever their SIZE: programs write more digits.
     """
     names = [name for field in header.fields for name in _column_names(field)]
-    if 2 * header.points * len(names) > len(body) + 1:  # a digit and a space each, but for the last
-        raise CutShortError(
-            f"{header.points:,} points of {len(names)} numbers announced, and "
-            f"{len(body):,} bytes are there"
-        )
     lines = bytes(body).rstrip().count(b"\n") + 1
     if lines < header.points:
         raise CutShortError(f"{header.points:,} points announced, and {lines:,} lines follow")
@@ -388,23 +383,24 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
     for field in header.fields:
         numbers: AnyArray = values[:, start : start + field.count]
         if field.name != _PADDING and field.kind[1] != "f":
-            numbers = _as_type(numbers, field)
-            if field.kind in ("<i8", "<u8"):
-                numbers = _exact_integers(body, range(start, start + field.count), numbers)
+            exact = _exact_integers(field, body, range(start, start + field.count))
+            numbers = _as_type(numbers, field) if exact is None else exact
         arrays.append(numbers)
         start += field.count
     return arrays
 
 
-def _exact_integers(body: memoryview, cells: Sequence[int], rounded: AnyArray) -> AnyArray:
-    """Return cells of text as integers of 64 bits, which double precision rounds.
+def _exact_integers(field: _Field, body: memoryview, cells: Sequence[int]) -> AnyArray | None:
+    """Return cells of text as the integers of a field of 64 bits, which double precision rounds.
 
-    `rounded` (n, k) are returned if some are not written as integers.
+    None for another field, or if a cell is not written as an integer.
     """
+    if field.kind[2] != "8":
+        return None
     try:
-        return np.loadtxt(io.BytesIO(body), rounded.dtype, usecols=cells, ndmin=2)
+        return np.loadtxt(io.BytesIO(body), np.dtype(field.kind), usecols=cells, ndmin=2)
     except ValueError:
-        return rounded
+        return None
 
 
 def _as_type(values: Floats, field: _Field) -> AnyArray:
@@ -414,9 +410,9 @@ def _as_type(values: Floats, field: _Field) -> AnyArray:
     """
     numbers = np.nan_to_num(values)
     limits = np.iinfo(field.kind)
-    if (numbers % 1).any() or numbers.min(initial=0) < limits.min or numbers.max(
-        initial=0
-    ) > limits.max:
+    lowest = float(limits.min)
+    stop = float(limits.max) + (field.kind[2] != "8")  # of 64 bits, the float is rounded upwards
+    if not ((numbers % 1 == 0) & (numbers >= lowest) & (numbers < stop)).all():
         raise ValueError(
             f"its field {printable(field.name)[:40]!r} has other numbers than whole ones from "
             f"{limits.min} to {limits.max}, which its TYPE and SIZE announce"
