@@ -7,9 +7,12 @@ from click.testing import CliRunner
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
+from lidarpool.live.opened import open_view
+from lidarpool.recordings.recordings import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.files.pcd import pcd_bytes
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
 FAR = (500_000.0, 5_000_000.0, 100.0)
@@ -21,8 +24,25 @@ def plane(at=(0, 0, 0)):
 
 
 def written(path, points):
-    if path.suffix == ".xyz":
-        np.savetxt(path, np.column_stack([points, np.zeros(len(points))]), "%.9f")
+    if path.suffix in (".xyz", ".txt", ".asc", ".csv"):
+        separator = {".csv": ",", ".asc": ";"}.get(path.suffix, " ")
+        rows = np.column_stack([points, np.ones(len(points))])
+        header = "" if path.suffix == ".xyz" else "x y z weight".replace(" ", separator)
+        np.savetxt(path, rows, "%.9f", separator, header=header, comments="")
+    elif path.suffix in (".pts", ".ptx"):
+        pose = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+        start = f"{len(points)}\n"
+        if path.suffix == ".ptx":
+            # A point at zero would be a pulse without a return.
+            points = np.maximum(points, 1e-9)
+            start += f"1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n{pose}"
+        lines = (f"{x:.9f} {y:.9f} {z:.9f} 0.5" for x, y, z in points)
+        path.write_text(start + "\n".join(lines))
+    elif path.suffix == ".npy":
+        np.save(path, points)
+    elif path.suffix == ".bin":
+        columns = [*points.T, np.ones(len(points))] + [np.zeros(len(points))] * ("pcd" in path.name)
+        path.write_bytes(np.column_stack(columns).astype("<f4").tobytes())
     elif path.suffix in (".las", ".laz"):
         laspy = pytest.importorskip("laspy", reason="laspy is an extra")
         las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
@@ -108,7 +128,13 @@ def off_plane(scene, at=(0, 0, 0)):
     return np.abs(z - x / 2).max()
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "text.pcd", "a.XYZ", "a.las", "a.laz"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a.ply", "a.pcd", "text.pcd", "a.XYZ", "a.las", "a.laz", "a.txt", "a.asc", "a.csv", "a.pts",
+        "a.ptx", "a.npy", "a.bin", "a.pcd.bin",
+    ],
+)  # fmt: skip
 def test_all_formats_give_surfels_in_the_plane_of_the_points(tmp_path, name):
     path = written(tmp_path / name.lower(), plane()).rename(tmp_path / name)
     scene = scene_of_points(path, voxel_m=1e-3)
@@ -235,6 +261,113 @@ def test_scans_of_an_e57_are_joined_and_face_their_scanners(tmp_path):
     assert (normals[:, 0] * centres[:, 0] > 0).all(), "fronts face the scanners"
 
 
+def facing(scene, at):
+    """Return whether the front of each surfel faces a position."""
+    quads = scene.vertices.reshape(-1, 4, 3) + scene.origin
+    normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
+    return (normals * (at - quads.mean(axis=1))).sum(axis=1) > 0
+
+
+QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # by 90 degrees about z
+STATION = np.array([100.0, 200, 5])
+
+
+def pcd_with_viewpoint(path, columns=()):
+    """Write a plane as seen by a scanner at `STATION` that is turned by `QUARTER`."""
+    half = np.sqrt(0.5)
+    local = plane((2, 1, -1))
+    fields = [(name, values.astype("f4")) for name, values in zip("xyz", local.T, strict=True)]
+    path.write_bytes(pcd_bytes([*fields, *columns], STATION, (half, 0, 0, half), "a station"))
+    return path, local @ QUARTER.T + STATION
+
+
+def test_the_viewpoint_of_a_pcd_places_and_orients_surfels(tmp_path):
+    path, points = pcd_with_viewpoint(tmp_path / "a.pcd")
+    scene = scene_of_points(path, voxel_m=1e-3)
+    centres = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
+    order = np.lexsort(np.round(centres, 3).T)
+    expected = points[np.lexsort(np.round(points, 3).T)]
+    np.testing.assert_allclose(centres[order], expected, atol=1e-4)
+    assert facing(scene, STATION).all()
+
+
+def test_vectors_of_a_pcd_are_turned_by_its_viewpoint(tmp_path):
+    """The origins of rays orient surfels, rather than the position of the scanner."""
+    origin = np.tile([0.0, 0, 50], (len(GRID), 1))  # in the scanner's axes
+    names = ("origin_x", "origin_y", "origin_z")
+    columns = [(name, values.astype("f4")) for name, values in zip(names, origin.T, strict=True)]
+    path, _ = pcd_with_viewpoint(tmp_path / "a.pcd", columns)
+    assert facing(scene_of_points(path, voxel_m=1e-3), [*STATION, 0, 0, 50]).all()
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "a.ptx", "a.npy", "a.csv"])
+def test_scenes_comparisons_and_views_have_the_same_points(tmp_path, name):
+    path = tmp_path / name
+    if name == "a.pcd":
+        path, points = pcd_with_viewpoint(path)
+    else:
+        path = written(path, plane())
+        points = plane()
+    if name == "a.ptx":
+        text = path.read_text().replace("0 0 0 1\n0.0", "100 200 5 1\n0.0")
+        path.write_text(text.replace("1 0 0 0\n0 1 0 0\n", "0 1 0 0\n-1 0 0 0\n"))
+        points = plane() @ QUARTER.T + STATION
+    bounds = [points.min(axis=0), points.max(axis=0)]
+    scene = scene_of_points(path, voxel_m=1e-3)
+    np.testing.assert_allclose(scene.bounds, bounds, atol=0.2)
+    recording = open_recording(path)
+    compared = recording.read_points(0, in_world=True).points
+    np.testing.assert_allclose([compared.min(axis=0), compared.max(axis=0)], bounds, atol=1e-4)
+    viewed = open_view(path).points
+    for axis, coordinate in enumerate("xyz"):
+        values = np.asarray(viewed.values(coordinate, slice(None)))
+        np.testing.assert_allclose(
+            [values.min(), values.max()], [bounds[0][axis], bounds[1][axis]], atol=1e-3
+        )
+
+
+def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
+    wall = np.column_stack([np.zeros(len(GRID)), GRID[:, 0], GRID[:, 1]])
+    text = ""
+    for side in (-3.0, 3.0):  # a wall seen from both sides, 2 m thick
+        scanner = np.array([side, 2, 1.5])
+        local = ([*wall, side / 3, 0, 0] - scanner) @ QUARTER
+        axes = "0 1 0\n-1 0 0\n0 0 1\n"
+        position = " ".join(map(str, scanner))
+        transformation = "".join(f"{line} 0\n" for line in axes.split("\n")[:3])
+        text += f"40\n30\n{position}\n{axes}{transformation}{position} 1\n"
+        text += "".join(f"{x:.9f} {y:.9f} {z:.9f} 0.5\n" for x, y, z in local)
+    (tmp_path / "a.ptx").write_text(text)
+    scene = scene_of_points(tmp_path / "a.ptx", voxel_m=1e-3)
+    centres = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
+    assert len(centres) == 2 * len(GRID) and np.abs(np.abs(centres[:, 0]) - 1).max() < 1e-4
+    sides = np.where(centres[:, :1] < 0, [[-3.0, 2, 1.5]], [[3.0, 2, 1.5]])
+    assert facing(scene, sides).all()
+
+
+def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
+    points = np.concatenate([plane((1, 0, 0)), np.zeros((20, 3))])
+    notes = []
+    path = written(tmp_path / "a.npy", points)
+    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    assert scene.triangles == 2 * len(GRID)
+    assert notes == [f"{path}: 20 points at zero are left out, as pulses without a return"]
+
+
+def test_units_of_a_header_are_converted_with_a_note(tmp_path):
+    path = written(tmp_path / "a.csv", plane() * 1000)
+    path.write_text(path.read_text().replace("x,y,z", "x_mm,y_mm,z_mm"))
+    notes = []
+    scene = scene_of_points(path, tell=notes.append)
+    np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
+    assert "is converted: its header states units of 0.001, 0.001, 0.001 m" in notes[0]
+    metres = scene_of_points(path, unit="cm", tell=notes.append)
+    np.testing.assert_allclose(metres.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
+    np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
+    points = open_recording(path, unit="m").read_points(0).points
+    np.testing.assert_allclose(points.max(axis=0), [4000, 3000, 2000])
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [("a.ply", "has no intensities: leave out colour intensity"), ("a.xyz", "has no intensities")],
@@ -247,7 +380,11 @@ def test_missing_intensities_are_an_error(tmp_path, name, words):
 def test_columns_without_names_are_noted(tmp_path):
     notes = []
     scene_of_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
-    assert len(notes) == 1 and notes[0].endswith("no room for them: 1 column after x, y and z")
+    assert len(notes) == 1 and notes[0].endswith("no room for them: column_4")
+    rows = "\n".join(f"wall {x} {y} {z} 7" for x, y, z in plane())
+    (tmp_path / "b.csv").write_text("kind,x,y,z,gps\n" + rows.replace(" ", ","))
+    scene_of_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
+    assert len(notes) == 2 and notes[1].endswith("no room for them: gps, kind")
 
 
 @pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.pcd", "text.pcd", "a.las", "a.laz"])
@@ -256,18 +393,22 @@ def test_cut_files_are_refused(tmp_path, name):
     data = path.read_bytes()
     for share in (0, 0.01, 0.5, 0.98):
         path.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(LidarError, match=r"cut short"):
+        expected = f"is cut short: |{path}: it is empty" if share < 0.001 else "is cut short: "
+        with pytest.raises(LidarError, match=expected):
             scene_of_points(path)
 
 
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("a.xyz", "", "broken or cut short"),
-        ("a.xyz", "1 2 3\n" * 11, "11 points"),
+        ("a.xyz", "", "a.xyz: it is empty"),
+        ("a.xyz", "1 2 3\n" * 11, "has 11 points, and at least 12 are needed.$"),
         ("a.xyz", "1 2 3\n" * 50, "most of its points in the same places"),
         ("a.xyz", "nan 2 3\n" * 50, "0 points"),
-        ("a.xyz", "x y z\n" * 50, "broken or cut short"),
+        ("a.xyz", "x y z\n" * 50, "cannot be read: line 2 has 'x' as x, and a number"),
+        ("a.asc", "ncols 3\n" * 50, "cannot be read: it is a raster of heights"),
+        ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, and 1 follow"),
+        ("a.bin", "no floats", "cannot be read: a.bin has 9 bytes, and whole rows of 16"),
         ("a.xyz", "1 2 1e30\n" * 50, "farther than anything"),
         ("a.glb", "glTF", "point clouds are read from"),
         ("b.ply", None, "cannot be read"),
@@ -305,7 +446,7 @@ def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
     data = bytearray(path.read_bytes())
     data[100:104] = b"\xff\xff\xff\x7f"
     path.write_bytes(data)
-    with pytest.raises(LidarError, match="its header is wrong"):
+    with pytest.raises(LidarError, match="announces 2,147,483,647 variable-length records"):
         scene_of_points(path)
 
 

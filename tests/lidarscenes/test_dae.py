@@ -153,7 +153,7 @@ CONTROLLER = (
         ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "by <skew>"),
         ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is none"),
         ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "refer to vertices 0 to 9"),
-        ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "of 5 corners, and 4"),
+        ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "of 5 corners, and"),
         ({"accessor": 'count="9" stride="3"'}, "id='p'> announces 9 x 3 numbers, and 24 are there"),
         ({"numbers": "nan " + SQUARES[2:]}, "1 of the 4 vertices .* NaN"),
         *[
@@ -178,5 +178,5 @@ def test_a_cut_file_never_loses_triangles_in_silence(tmp_path):
     whole = DAE.format(**PARTS).strip()
     for cut in range(1, len(whole), 40):
         path.write_text(whole[:-cut])
-        with pytest.raises(LidarError, match="cut short|cannot be read"):
+        with pytest.raises(LidarError, match=r"cut short|cannot be read"):
             load_meshes(path)

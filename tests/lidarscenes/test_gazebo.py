@@ -419,7 +419,9 @@ BROKEN = {
     ),
     "it declares XML entities": "<!DOCTYPE s [<!ENTITY a 'b'>]>" + world(model("a", link())),
     "names an XML entity, 'a'": world(model("&a;", link())),
-    "is cut short (its last element, <world>, has no end)": sdf("<world name='w'>").replace("</sdf>", ""),
+    "is cut short (its last element, <world>, has no end)": sdf("<world name='w'>").replace(
+        "</sdf>", ""
+    ),
     "line 1 has an end </sdf> without its start": sdf("<world name='w'>"),
     "line 2 has a tag that is none of XML": "<sdf>\n<world name=w></world></sdf>",
     "nested deeper than 200": "<sdf>" + "<a>" * 300,

@@ -290,7 +290,9 @@ def test_nothing_that_a_file_names_is_opened(tmp_path):
         "</VRTRasterBand></VRTDataset>"
     )
     (tmp_path / "m.tif").write_text(vrt)
-    with pytest.raises(LidarError, match="does not begin as a raster of its ending does, by GDAL's GTiff"):
+    with pytest.raises(
+        LidarError, match="does not begin as a raster of its ending does, by GDAL's GTiff"
+    ):
         read(tmp_path / "m.tif")
     path = write(tmp_path / "plain.tif")
     (tmp_path / "plain.tif.msk").write_text(vrt)

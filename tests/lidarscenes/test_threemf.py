@@ -162,7 +162,10 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
             },
             "archive has no file '../../etc/passwd'",
         ),
-        ({"doctype": f'<!DOCTYPE model [<!ENTITY a "0000000000">{NESTED}]>', "x": "&i;"}, "declares an XML entity"),
+        (
+            {"doctype": f'<!DOCTYPE model [<!ENTITY a "0000000000">{NESTED}]>', "x": "&i;"},
+            "declares an XML entity",
+        ),
     ],
     ids=str,
 )

@@ -1,4 +1,4 @@
-"""Clouds as text (.xyz, .txt, .asc, .csv), of Leica (.pts, .ptx), of NumPy and in rows of floats."""
+"""Clouds as text (.xyz, .txt, .asc, .csv), of Leica (.pts, .ptx), of NumPy, in rows of floats."""
 
 import io
 
@@ -200,7 +200,7 @@ def test_what_is_wrong_in_pts(tmp_path, content, message):
 
 def test_pts_with_fewer_points_is_cut_short(tmp_path):
     for content in ("3\n1 2 3\n4 5 6\n", "1\n1 2 3\n4\n"):
-        with pytest.raises(CutShortError, match="line . announces . points, and (2|none) follow"):
+        with pytest.raises(CutShortError, match=r"line . announces . points, and (2|none) follow"):
             read_all(tmp_path, "a.pts", content)
 
 
@@ -229,9 +229,7 @@ def test_ptx_has_poses_and_intensities(tmp_path):
     assert world.tolist() == [[10, 21, 5], [10, 22, 5], [7, 20, 6]]
     assert columns_of(first) == {"intensity": [0.5, 0.25, 1]}
     assert first.scanner.tolist() == [10, 20, 5] and second.scanner.tolist() == [0, 0, 1]
-    colours = "\n".join(
-        line + " 1 2 3" * (k >= 10) for k, line in enumerate(PTX.splitlines())
-    )
+    colours = "\n".join(line + " 1 2 3" * (k >= 10) for k, line in enumerate(PTX.splitlines()))
     (scan,) = read_all(tmp_path, "b.ptx", colours)
     assert scan.columns["blue"].tolist() == [3, 3, 3] and scan.columns["blue"].dtype == np.uint8
 
@@ -305,7 +303,10 @@ def test_npy_with_fields(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (npy(np.zeros((3, 2))), r"its array has the shape \(3, 2\): an array \(points, 3 or more\)"),
+        (
+            npy(np.zeros((3, 2))),
+            r"its array has the shape \(3, 2\): an array \(points, 3 or more\)",
+        ),
         (npy(np.zeros(12)), r"its array has the shape \(12,\)"),
         (npy(np.zeros((9, 3), "c8")), "its array has the type 'complex64': an array"),
         (npy(np.array([[{}, 1, 2]], object), allow_pickle=True), "its array has the type 'object'"),
@@ -340,7 +341,7 @@ def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
     assert columns_of(scan) == {"intensity": [0.5, 0.25], "channel": [4, 31]}
     with pytest.raises(ValueError, match=r"a\.bin has 40 bytes, and whole rows of 16 .*intensity"):
         read(tmp_path, "a.bin", rows.tobytes())
-    with pytest.raises(ValueError, match="a.pcd.bin has 32 bytes, and whole rows of 20"):
+    with pytest.raises(ValueError, match=r"a\.pcd\.bin has 32 bytes, and whole rows of 20"):
         read(tmp_path, "a.pcd.bin", rows[:, :4].tobytes())
     with pytest.raises(ValueError, match="has other numbers than rings"):
         read(tmp_path, "a.pcd.bin", np.resize(rows[:, :4], (4, 5)).tobytes())

@@ -21,7 +21,16 @@ from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import Transform
 
-TEXT_STL = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 1 0 0\nvertex 0 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
+TEXT_STL = """solid a
+facet normal 0 0 1
+outer loop
+vertex 1 0 0
+vertex 0 0 0
+vertex 0 1 0
+endloop
+endfacet
+endsolid a
+"""
 OBJ = """# two objects
 o Box
 v {x} 0 0

@@ -135,7 +135,9 @@ def test_colours_are_the_bits_of_rgb(tmp_path, encoding, kind):
     colours = RNG.integers(0, 256, (COUNT, 3))
     packed = (colours @ [1 << 16, 1 << 8, 1]).astype("u4")
     values = packed if kind == "u4" else packed.view("f4")
-    scan = read(tmp_path, encoded(encoding, [*"xyz", "rgb"], ["f4"] * 3 + [kind], [X, Y, Z, values]))
+    scan = read(
+        tmp_path, encoded(encoding, [*"xyz", "rgb"], ["f4"] * 3 + [kind], [X, Y, Z, values])
+    )
     found = np.stack([scan.columns[name] for name in ("red", "green", "blue")], axis=1)
     np.testing.assert_array_equal(found, colours)
     assert "rgb" not in scan.columns and "alpha" not in scan.columns
@@ -161,7 +163,9 @@ def test_the_viewpoint_is_the_pose_and_the_scanner(tmp_path):
     scan = read(tmp_path, encoded("binary", names, kinds, [X, Y, Z], viewpoint=viewpoint))
     np.testing.assert_allclose(scan.pose[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
     assert scan.pose[:3, 3].tolist() == [10, 20, 5] == scan.scanner.tolist()
-    rounded = read(tmp_path, encoded("binary", names, kinds, [X, Y, Z], viewpoint="0 0 1 .999 0 0 0"))
+    rounded = read(
+        tmp_path, encoded("binary", names, kinds, [X, Y, Z], viewpoint="0 0 1 .999 0 0 0")
+    )
     np.testing.assert_allclose(rounded.pose[:3, :3], np.eye(3), atol=1e-12)
     for unstated in ("0 0 0 1 0 0 0", "0 0 0 0 0 0 0"):
         scan = read(tmp_path, encoded("binary", names, kinds, [X, Y, Z], viewpoint=unstated))

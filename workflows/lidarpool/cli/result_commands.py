@@ -229,9 +229,9 @@ def view(
     """Show a file or folder in the browser, or write a file to share.
 
     RESULT: a result; a data set of a campaign; a cloud or recording (.ply, .las, .laz, .pcd, .e57,
-    .parquet, .mcap, .pcap, .osf, .bin, or a folder of rosbag2, KITTI, nuScenes, WebDataset, PCD or
-    range images); or a scenario or mesh, before its run. Several are shown in one view, with a
-    colour each.
+    .parquet, text such as .csv, .pts, .ptx, .npy, .bin, .mcap, .pcap, .osf, or a folder of rosbag2,
+    KITTI, nuScenes, WebDataset, PCD or range images); or a scenario or mesh, before its run.
+    Several are shown in one view, with a colour each.
 
     \b
     Examples:
@@ -324,8 +324,9 @@ def view(
 def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
     """Compare two clouds or recordings of the same place; B is the reference.
 
-    A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, bags of ROS 2, .pcap and
-    .osf. Sweeps of one sensor are compared by range images; clouds without rings by distances.
+    A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, .e57, text such as .csv,
+    .pts, .ptx, .npy, .bin, bags of ROS 2, .pcap and .osf. Sweeps of one sensor are compared by
+    range images; clouds without rings by distances.
 
     \b
     Examples:

@@ -357,9 +357,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     help="What colours the surfels; by default rgb, else intensity, as the cloud has them.",
 )
 @overwrite
-@click.argument(
-    "cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz|.e57"
-)
+@click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD")
 @_out
 def points(
     cloud: Path,
@@ -371,6 +369,9 @@ def points(
     overwrite: bool,
 ) -> None:
     """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
+
+    CLOUD: .ply, .pcd, .las, .laz, .e57, text (.xyz, .txt, .asc, .csv), .pts or .ptx of Leica, .npy,
+    or .bin of KITTI or nuScenes.
 
     \b
     Examples:

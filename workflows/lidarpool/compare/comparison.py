@@ -134,8 +134,9 @@ def compare(
     Parameters
     ----------
     a, b
-        A result's folder or .ply, a data set, .pcd or a folder of them, .las, .laz, a bag of ROS 2
-        (.mcap or a folder), or a cloud in memory.
+        A result's folder or .ply, a data set, .pcd or a folder of them, .las, .laz, .e57, text
+        (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin, a bag of ROS 2 (.mcap or a folder), or a
+        cloud in memory.
     sweeps
         Only these pairs of sweeps, from 0.
     match
@@ -145,8 +146,8 @@ def compare(
     intensity_a, intensity_b
         Columns to compare as intensity, if not ``intensity``.
     unit_a, unit_b
-        Unit of a .las, .laz, .ply or .pcd (um, mm, cm, dm, m, km, in, ft, yd or mi), in place of
-        metres or of the units of the coordinate system that a .las or .laz states.
+        Unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text (um, mm, cm, dm, m, km, in, ft,
+        yd or mi), in place of metres or of the units that a .las, a .laz or a header states.
     azimuth_deg
         Width of a cell; by default the step from pulse to pulse, the coarser one.
     distances_m

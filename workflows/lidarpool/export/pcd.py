@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from lidarsim.base.arrays import AnyArray
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLOURS, NORMAL

@@ -62,8 +62,8 @@ if TYPE_CHECKING:
 
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .xyz, .txt, "
-    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap of Velodyne or Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, "
-    "WebDataset or range images"
+    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap of Velodyne or Ouster, .osf, a "
+    "bag of ROS 2, or a folder of KITTI, nuScenes, WebDataset or range images"
 )
 # Names of the columns of rings and of intensities in other programs; the first column present is
 # read.

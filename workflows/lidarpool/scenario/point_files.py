@@ -125,6 +125,8 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
             content = _READERS[suffix](path)
             if content.units_m is not None and unit is None:
                 metres = np.array(content.units_m)
+                lengths = ", ".join(f"{length:g}" for length in content.units_m)
+                tell(f"{path} is converted: its header states units of {lengths} m for x, y and z")
             points = _scanned_points(content, metres)
     except LidarError:
         raise

@@ -61,9 +61,10 @@ def scene_of_points(
     Parameters
     ----------
     path
-        .ply, .pcd, .xyz (x, y and z are the first numbers of a line), .las or .laz, which need
-        laspy, or .e57, which needs pye57 and whose scans are joined by their poses. Z-up; .las and
-        .laz in the units of their coordinate system, others in metres.
+        .ply, .pcd, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin of KITTI or nuScenes, .las
+        or .laz, which need laspy, or .e57, which needs pye57. Scans are joined by their poses.
+        Z-up; .las and .laz in the units of their coordinate system, text in the units of its
+        header, others in metres.
     voxel_m
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.

@@ -70,7 +70,9 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
         meter = unit.attrib["meter"]
         content.unit_m = float(meter) if _is_number(meter, np.float64) else np.nan
         if not 0 < content.unit_m < np.inf:
-            raise ValueError(f"its unit is {meter[:40]!r} metres, and a positive number was expected")
+            raise ValueError(
+                f"its unit is {meter[:40]!r} metres, and a positive number was expected"
+            )
     axis = (root.findtext("asset/up_axis") or "").strip()
     content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
     return content
@@ -140,7 +142,9 @@ class _Document:
         shape = skin.find("bind_shape_matrix")
         matrix = np.eye(4) if shape is None else _numbers(shape)
         if matrix.size != 16:
-            raise ValueError(f"{_tag(skin)} has a bind_shape_matrix of {matrix.size} numbers, not 16")
+            raise ValueError(
+                f"{_tag(skin)} has a bind_shape_matrix of {matrix.size} numbers, not 16"
+            )
         matrix = matrix.reshape(4, 4)
         return [
             mesh.moved(mesh.name, matrix[:3, :3], matrix[:3, 3])
@@ -382,7 +386,9 @@ def _words(element: Element, kind: type, expected: str) -> AnyArray:
         return np.array(words, kind)
     except (ValueError, OverflowError) as error:
         word = next(word for word in words if not _is_number(word, kind))
-        raise ValueError(f"{_tag(element)} has {word[:40]!r}, and {expected} were expected") from error
+        raise ValueError(
+            f"{_tag(element)} has {word[:40]!r}, and {expected} were expected"
+        ) from error
 
 
 def _is_number(word: str, kind: type) -> bool:

@@ -88,17 +88,20 @@ def _read_table(data: bytes) -> _Table:
         raise CutShortError(f"its last row has {len(last)} of {len(columns)} numbers")
     grid = _grid(header)
     column = _density_column(columns)
-    used = (0, 1, 2, column)
-    try:
-        values = np.loadtxt(io.BytesIO(rows), usecols=used, ndmin=2)
-    except ValueError:  # of a line that is named, if it is read cell by cell
-        lines = io.TextIOWrapper(io.BytesIO(rows), "utf-8", "replace")
-        number = data[: heading.end()].count(b"\n") + 1
-        values = RowReader(columns, used, used=used).read(lines, number)
-    i, j, k, densities = values.T
+    first_line = data[: heading.end()].count(b"\n") + 1
+    i, j, k, densities = _numbers(rows, columns, (0, 1, 2, column), first_line).T
     indices = np.stack([i, j, k], axis=1)
     _check_rows(indices, densities, grid.counts)
     return _Table(header, grid, columns[column], indices, densities)
+
+
+def _numbers(rows: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
+    """Return the numbers (n, k) of the used columns; ValueError names a line that is wrong."""
+    try:
+        return np.asarray(np.loadtxt(io.BytesIO(rows), usecols=used, ndmin=2), np.float64)
+    except ValueError:  # read cell by cell, which names the line
+        lines = io.TextIOWrapper(io.BytesIO(rows), "utf-8", "replace")
+        return RowReader(columns, used, used=used).read(lines, first_line)
 
 
 def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:

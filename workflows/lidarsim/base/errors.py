@@ -54,8 +54,10 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
         reason = printable(message_of(error), _MAX_REASON).rstrip(".")
     if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
         reason = f"its content is not as its format says, {reason}"
-    return f"{subject} {failure} ({reason}): {advice}." if advice else (
-        f"{subject} {failure}: {reason}."
+    return (
+        f"{subject} {failure} ({reason}): {advice}."
+        if advice
+        else (f"{subject} {failure}: {reason}.")
     )
 
 

@@ -49,7 +49,9 @@ def xml_root(data: bytes) -> Element:
     except ElementTree.ParseError as error:
         if error.code not in AT_END:
             raise
-        raise CutShortError(f"its XML ends within an element, in line {error.position[0]}") from error
+        raise CutShortError(
+            f"its XML ends within an element, in line {error.position[0]}"
+        ) from error
 
 
 def refuse_entity(name: str, *details: object) -> NoReturn:

@@ -58,9 +58,7 @@ def open_las(path: Path) -> Iterator[Any]:
             header = reader.header
             announced = header.point_count * header.point_format.size
             if not header.are_points_compressed and points_start + announced > size:
-                raise CutShortError(
-                    f"{header.point_count:,} points announced, and there are fewer"
-                )
+                raise CutShortError(f"{header.point_count:,} points announced, and there are fewer")
             Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
             try:
                 yield reader
@@ -124,9 +122,7 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
         raise ValueError("its first bytes are not LASF, with which a .las or .laz begins")
     size = os.fstat(file.fileno()).st_size
     if points_start > size:
-        raise CutShortError(
-            f"its points begin at byte {points_start:,}, and it has {size:,}"
-        )
+        raise CutShortError(f"its points begin at byte {points_start:,}, and it has {size:,}")
     if header_size + _VLR.size * records > points_start:
         raise ValueError(
             f"its header announces {records:,} variable-length records, which do not fit between "

@@ -74,9 +74,7 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
     there = size - file.tell()
     if announced != there:
         failure = CutShortError if there < announced else ValueError
-        raise failure(
-            f"its array {shape} has {announced:,} bytes, and {there:,} are there"
-        )
+        raise failure(f"its array {shape} has {announced:,} bytes, and {there:,} are there")
     array: AnyArray = np.frombuffer(file.read(), kind)
     array = array.astype(kind.newbyteorder("="))
     return array.reshape(shape, order="F" if is_fortran else "C")

@@ -11,6 +11,7 @@ import io
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +48,8 @@ _COLOURS = ("red", "green", "blue")
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
-class _Field(NamedTuple):
+@dataclass(frozen=True)
+class _Field:
     """A field of the header."""
 
     name: str
@@ -332,8 +334,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
         )
     if 8 + packed_size > len(body):
         raise CutShortError(
-            f"{packed_size:,} bytes of packed points announced, and "
-            f"{len(body) - 8:,} are there"
+            f"{packed_size:,} bytes of packed points announced, and {len(body) - 8:,} are there"
         )
     Allowance(file_size, _SMALLER).take(size)
     content = _unpacked(body[8 : 8 + packed_size], size)
@@ -375,9 +376,7 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
     reader = RowReader(names, range(len(names)))
     values = reader.read(io.TextIOWrapper(io.BytesIO(body), "utf-8", "replace"), header.lines + 1)
     if len(values) != header.points:
-        raise ValueError(
-            f"{header.points:,} points announced, and {len(values):,} lines follow"
-        )
+        raise ValueError(f"{header.points:,} points announced, and {len(values):,} lines follow")
     arrays = []
     start = 0
     for field in header.fields:
@@ -430,9 +429,7 @@ def _column_names(field: _Field) -> list[str]:
     return [f"{field.name}_{index}" for index in range(field.count)]
 
 
-def _named_columns(
-    fields: Sequence[_Field], arrays: Sequence[AnyArray]
-) -> dict[str, AnyArray]:
+def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict[str, AnyArray]:
     """Return the columns of all fields but padding."""
     columns = [
         (name, array[:, index])

@@ -142,8 +142,9 @@ def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool)
         key, _, value = line.lstrip(b" ").partition(b" ")
         if key == b"v":
             words = value.partition(b"#")[0].split()  # a weight or a colour may follow
-            x, y, z = map(float, words[:3])
-            positions.extend((x, y, z))
+            if len(words) < 3:
+                raise ValueError("a vertex has fewer than three numbers")
+            positions.extend(map(float, words[:3]))
             if with_colours and len(words) >= 6:
                 content.tints.extend(map(float, words[-3:]))
         elif key == b"f":
@@ -251,7 +252,9 @@ def _obj_mistake(data: bytes, with_colours: bool) -> str | None:
                     f"line {number} is '{_shown(line)}', and numbers of vertices were expected "
                     "after f"
                 )
-            if not all(1 <= int(vertex) <= total or -count <= int(vertex) < 0 for vertex in vertices):
+            if not all(
+                1 <= int(vertex) <= total or -count <= int(vertex) < 0 for vertex in vertices
+            ):
                 return (
                     f"line {number} is '{_shown(line)}', which refers to a missing vertex, of "
                     f"{total:,}"
@@ -304,6 +307,25 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
     if text.lstrip().upper().startswith(b"BINARY"):
         raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
     first_line = 1 + uncommented[: len(uncommented) - len(text)].count(b"\n")
+    vertex_lines, face_lines = _off_lines(text, first_line)
+    is_coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
+    vertices, tints = _off_vertices(vertex_lines, is_coloured=is_coloured)
+    corners, sizes = _off_faces(face_lines, len(vertices))
+    faces = triangulated(vertices, corners, sizes)
+    colours = None
+    if is_coloured and len(tints) == len(vertices):
+        colours = _vertex_colours(_colour_shares(tints), faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+
+
+_NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
+
+
+def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[_NumberedLine]]:
+    """Return the lines of vertices and of faces after the counts; ValueError for other counts.
+
+    `first_line` is the number of the first line in the file.
+    """
     lines = [
         (number, line.split())
         for number, line in enumerate(text.split(b"\n"), first_line)
@@ -319,17 +341,7 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
             f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
             f"{len(lines):,} lines there"
         )
-    is_coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
-    vertices, tints = _off_vertices(lines[:points], is_coloured=is_coloured)
-    corners, sizes = _off_faces(lines[points:], points)
-    faces = triangulated(vertices, corners, sizes)
-    colours = None
-    if is_coloured and len(tints) == len(vertices):
-        colours = _vertex_colours(_colour_shares(tints), faces)
-    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
-
-
-_NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
+    return lines[:points], lines[points:]
 
 
 def _off_vertices(lines: Sequence[_NumberedLine], *, is_coloured: bool) -> tuple[Floats, Floats]:
@@ -437,7 +449,7 @@ def _stl_mistake(text: bytes) -> str | None:
             if len(words) < 3 or not all(map(_is_real, words[:3])):
                 return f"line {number} is '{_shown(line)}', and vertex x y z was expected"
         elif key == b"endfacet" and count != 3:
-            return f"the facet that ends in line {number} has {count} vertices, and three were expected"
+            return f"the facet that ends in line {number} has {count} vertices, and not three"
     return None
 
 
@@ -707,8 +719,8 @@ class _PlyElementReader:
                 (size,) = struct.unpack_from(self._order + np.dtype(length).char, body, offset)
                 if not (0 <= size < np.inf and size == int(size)):
                     raise ValueError(
-                        f"a list of {element.name[:20]} has the length {size:g}, and a whole number "
-                        "from 0 on was expected"
+                        f"a list of {element.name[:20]} has the length {size:g}, and a whole "
+                        "number from 0 on was expected"
                     )
                 offset += int(length[1])
                 size = int(size)

@@ -48,7 +48,7 @@ def read_pts(path: Path) -> list[CloudScan]:
     check_input(path)
     scans = []
     with io.TextIOWrapper(open_input(path), "utf-8-sig", "replace") as text:
-        lines = enumerate(text, 1)
+        lines: Iterator[tuple[int, str]] = enumerate(text, 1)
         while (entry := next_line(lines)) is not None:
             number, line = entry
             count: int | None = None
@@ -74,16 +74,12 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
         return CloudScan(np.zeros((0, 3)), {})
     first = next_line(lines)
     if first is None:
-        raise CutShortError(
-            f"line {number} announces {count:,} points, and none follow"
-        )
+        raise CutShortError(f"line {number} announces {count:,} points, and none follow")
     names = names_of_cells(first, _NAMES)
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
-        raise CutShortError(
-            f"line {number} announces {count:,} points, and {len(values):,} follow"
-        )
+        raise CutShortError(f"line {number} announces {count:,} points, and {len(values):,} follow")
     columns = point_columns(values, names)
     intensities = columns.get("intensity")
     if intensities is not None and intensities.min() < 0:
@@ -91,9 +87,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     return CloudScan(values[:, :3], columns)
 
 
-def names_of_cells(
-    entry: tuple[int, str], names: dict[int, tuple[str, ...]]
-) -> tuple[str, ...]:
+def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
     """Return the names of the cells of a line, by their number; ValueError for another number."""
     number, line = entry
     count = len(line.split())

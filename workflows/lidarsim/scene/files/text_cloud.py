@@ -221,7 +221,8 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
         hint = "; decimal commas are read beside another separator, such as a semicolon"
     raise ValueError(
         f"line {head.names_line} names {plural(len(names), 'column')} "
-        f"({printable(', '.join(names))}), and line {head.first_line} has {plural(count, 'cell')}{hint}"
+        f"({printable(', '.join(names))}), and line {head.first_line} has "
+        f"{plural(count, 'cell')}{hint}"
     )
 
 
@@ -267,7 +268,7 @@ def _numeric_cells(
     numeric = [
         index
         for index, cell in enumerate(first_cells)
-        if _is_number(cell, separator) or not cell and index not in axes
+        if _is_number(cell, separator) or (not cell and index not in axes)
     ]
     for axis, index in zip("xyz", axes, strict=True):
         if index not in numeric:

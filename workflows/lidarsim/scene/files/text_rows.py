@@ -124,8 +124,8 @@ class RowReader:
             return float(text.replace("_", "no"))  # Python allows underscores in numbers
         except ValueError as error:
             raise ValueError(
-                f"line {line_number} has {printable(cell)[:_SHOWN]!r} as {self.names[index]}, and a "
-                "number was expected"
+                f"line {line_number} has {printable(cell)[:_SHOWN]!r} as {self.names[index]}, and "
+                "a number was expected"
             ) from error
 
     def _wrong_width(self, line_number: int, cells: Sequence[str]) -> str:
