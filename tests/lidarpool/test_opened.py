@@ -26,6 +26,7 @@ from lidarpool.live import recorded
 from lidarpool.live.job_list import JobList
 from lidarpool.live.opened import growing_view, is_data_set, open_view, open_views
 from lidarpool.recordings import bag_poses
+from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box
@@ -231,6 +232,35 @@ def test_a_mesh_in_a_ply_is_no_cloud(tmp_path, exported):
     assert open_view(tmp_path / "mesh.ply").preview
     save_cloud(exported[1], tmp_path / "cloud.ply")
     assert not open_view(tmp_path / "cloud.ply").preview
+
+
+def test_text_of_points_is_a_cloud_and_a_raster_of_heights_is_a_scene(tmp_path):
+    points = "\n".join(f"{x};{y};0;{x * y}" for x in range(4) for y in range(3))
+    (tmp_path / "scan.asc").write_text("X;Y;Z;Intensity\n" + points)
+    view = open_view(tmp_path / "scan.asc")
+    assert len(view.points) == 12 and not view.preview
+    assert view.points.values("intensity", slice(None)).max() == 6
+    with pytest.raises(
+        LidarError, match=r"If it is a point cloud, make a mesh of it by lidarpool "
+    ):
+        Scene.load(tmp_path / "scan.asc")
+    pytest.importorskip("rasterio", reason="rasterio is an extra")
+    heights = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n4 5 6\n"
+    (tmp_path / "heights.asc").write_text(heights)
+    assert open_view(tmp_path / "heights.asc").preview
+
+
+def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):
+    rows = np.array([[1, 2, 3, 0.5, 4], [5, 6, 7, 0.25, 31]], "f4")
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "a.bin").write_bytes(rows[:, :4].tobytes())
+    (tmp_path / "sweeps" / "a.pcd.bin").write_bytes(rows.tobytes())
+    for path in (tmp_path / "a.bin", tmp_path / "sweeps" / "a.pcd.bin", tmp_path / "sweeps"):
+        recording = open_recording(path)
+        points = recording.read_points(0)
+        assert recording.count == 1 and points.points.tolist() == [[1, 2, 3], [5, 6, 7]]
+        assert points.intensities.tolist() == [0.5, 0.25]
+        assert points.rings is None if path.name == "a.bin" else points.rings.tolist() == [4, 31]
 
 
 @pytest.mark.parametrize("name", BAGS)

@@ -33,7 +33,7 @@ from lidarpool.export.formats import Format
 from lidarpool.export.ros import layouts
 from lidarpool.export.ros.livox import CUSTOM_DEFINITION
 from lidarpool.recordings.recordings import open_recording
-from lidarsim.columns.bags import livox_columns
+from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
@@ -163,6 +163,33 @@ def test_a_custom_message_without_points_or_in_pieces(tmp_path):
     assert not len(livox_columns(data)["x"])
     with pytest.raises(ValueError, match=r"5 points announced"):
         livox_columns(data[:-4] + b"\5\0\0\0")
+
+
+def point_cloud(rows, fields):
+    """Return a PointCloud2 of rows, with fields (name, offset, datatype, count)."""
+    types = message_types().types
+    stamp = types["builtin_interfaces/msg/Time"](0, 0)
+    field = types["sensor_msgs/msg/PointField"]
+    message = types[POINT_CLOUD](
+        types["std_msgs/msg/Header"](stamp, "lidar"), 1, len(rows), [field(*f) for f in fields],
+        False, rows.itemsize, rows.nbytes, rows.view(np.uint8).reshape(-1), True,
+    )  # fmt: skip
+    return bytes(message_types().serialize_cdr(message, POINT_CLOUD))
+
+
+def test_fields_of_several_numbers_and_of_the_same_name():
+    rows = np.zeros(2, [("xyz", "<f4", 3), ("n", "<f4", 3), ("a", "<u2"), ("b", "<u2")])
+    rows["xyz"] = [[1, 2, 3], [4, 5, 6]]
+    rows["n"] = [[7, 8, 9], [10, 11, 12]]
+    rows["b"] = 5
+    axes = [(axis, 4 * k, 7, 1) for k, axis in enumerate("xyz")]
+    fields = [*axes, ("n", 12, 7, 3), ("ring", 24, 4, 1), ("ring", 26, 4, 1)]
+    columns = point_columns(point_cloud(rows, fields))
+    assert [*columns] == ["x", "y", "z", "n_0", "n_1", "n_2", "ring", "ring_2"]
+    assert columns["z"].tolist() == [3, 6] and columns["n_1"].tolist() == [8, 11]
+    assert columns["ring"].tolist() == [0, 0] and columns["ring_2"].tolist() == [5, 5]
+    with pytest.raises(ValueError, match="its field 'n' has 4,000,000,000 numbers from byte 12 on"):
+        point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
 
 
 @pytest.mark.parametrize(

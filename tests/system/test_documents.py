@@ -246,7 +246,6 @@ def test_yaml_is_what_it_is_for(block):
 EXTRAS = {
     "las": r"\bla[sz]\b",
     "parquet": r"\bparquet\b",
-    "pcd": r"\bpcd\b",
     "e57": r"\be57\b",
     "osi": r"\bosi\b|\bbetterosi\b",
     "ros": r"\bmcap\b|\brosbag2\b",
