@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
-from tests.rows import quick
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.fit import Estimate, _with_performance
@@ -356,7 +355,8 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.parametrize("where", quick(("street", "forest"), PLACES))
+@pytest.mark.slow(keep=("street", "forest"))
+@pytest.mark.parametrize("where", PLACES)
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
     """Two recordings of a place each; fidelity.md has 40."""
     for number in (PLACES.index(where), PLACES.index(where) + 4):

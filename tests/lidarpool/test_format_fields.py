@@ -125,7 +125,7 @@ def xyz_of(rows):
     return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("model", SPINNING)
 @pytest.mark.parametrize("layout", ["velodyne", "images", "autoware", "ouster"])
 def test_bags_hold_what_a_driver_publishes(tmp_path, layout, model):
@@ -431,7 +431,7 @@ def vectors_of(fields, prefix=""):
     return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("format_name", ["pcd", "mcap"])

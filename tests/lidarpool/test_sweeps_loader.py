@@ -20,7 +20,6 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from tests.daemons import wait_until
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
-from tests.rows import quick
 
 import lidarpool
 from lidarpool import LidarError, Scene, Sweep
@@ -250,7 +249,8 @@ def _read(data: Any, queue: Any) -> None:
     queue.put([(identity(sweep), float(sweep.points.sum())) for sweep in data])
 
 
-@pytest.mark.parametrize("name", quick(("kitti", "mcap"), DATA_SETS))
+@pytest.mark.slow(keep=("kitti", "mcap"))
+@pytest.mark.parametrize("name", DATA_SETS)
 def test_threads_and_forks_read_beside_each_other(written, name):
     data = lidarpool.sweeps(written(name), shuffle=2)
     alone = [(identity(sweep), float(sweep.points.sum())) for sweep in data]

@@ -69,7 +69,7 @@ def beyond(offset):
     return (math.acos(offset) - offset * math.sqrt(1 - offset**2)) / math.pi
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 133])
 @pytest.mark.parametrize("offset", [-0.8, -0.3, 0.0, 0.5])
 def test_surfaces_on_both_sides_of_an_edge_get_their_shares(angle_deg, offset):
@@ -294,7 +294,7 @@ SENSORS = {
 }
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize(("roll_deg", "width"), [(0, 4e-3), (90, 12e-3), (-90, 12e-3), (180, 4e-3)])
 @pytest.mark.parametrize("mounted", [False, True])

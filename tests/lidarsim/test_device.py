@@ -201,7 +201,7 @@ MORE = {
 }
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     "actors",
     [pytest.param((), id=""), pytest.param(ACTORS, id="actors", marks=NEEDS_NUMBA)],
@@ -262,7 +262,7 @@ def test_images_of_ranges(actors, scenes, backend):
     assert np.isinf(images[0][2]).all()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
 def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):

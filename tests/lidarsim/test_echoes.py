@@ -172,7 +172,7 @@ def test_light_passes_glass(backend):
     assert not len(cast(meshes, beam_along_x(max_range_m=8), materials=materials)["range"])
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("away_m", [0, 2000])
 @pytest.mark.parametrize("angle_deg", [0, 60, 85])
@@ -283,7 +283,7 @@ BEAMS = Beams(
 TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("options", [ALL_ON, NOISE_ONLY], ids=["all on", "noise"])
 @pytest.mark.parametrize("path", [TURNED, {"trajectory": Cart()}], ids=["standing", "moving"])
 @pytest.mark.parametrize("per_turn", [360, 360.449])

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.rows import quick
 from tests.shapes import level, made, quad
 
 from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
@@ -95,8 +94,9 @@ SURVEYS = {
 }
 
 
+@pytest.mark.slow(keep=("standing-*", "driving-*"))
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
-@pytest.mark.parametrize("name", quick(("standing", "driving"), SURVEYS))
+@pytest.mark.parametrize("name", SURVEYS)
 def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     sensor = load_sensor("velodyne/vlp16")
     options = {"keep_every": 1, "columns": COLUMNS, "precision_m": 1e-3, **SURVEYS[name]}
@@ -162,10 +162,9 @@ TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)],
 MIRROR = quad("Mirror", (-9, -3, 0), (9, -3, 0), (9, -3, 9), (-9, -3, 9))
 
 
+@pytest.mark.slow(keep=("driving-*", "turned-*", "mirror-*"))
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
-@pytest.mark.parametrize(
-    "name", quick(("driving", "turned", "mirror"), [*SURVEYS, "turned", "noise", "mirror"])
-)
+@pytest.mark.parametrize("name", [*SURVEYS, "turned", "noise", "mirror"])
 def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, name, model):
     options = SURVEYS | {
         "turned": TURNED,

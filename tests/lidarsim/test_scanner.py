@@ -104,7 +104,7 @@ def same(one: Cloud, other: Cloud):
     return True
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["", "physics"])
 @pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
 @pytest.mark.parametrize("name", SENSORS)

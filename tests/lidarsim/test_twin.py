@@ -131,7 +131,7 @@ def test_random_bits_are_those_of_splitmix64():
         assert raw(seed[0], purpose, scan, ray, number).tolist() == [mine]
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("planes", [False, True])
 @pytest.mark.parametrize("airy", [False, True])
 @pytest.mark.parametrize("each", [1, 7, 19])
@@ -182,7 +182,7 @@ def test_saturation_is_that_of_the_twin(full, waves):
     assert (found.amplitude == full).mean() > 0.1
 
 
-@pytest.mark.every_nth(4)
+@pytest.mark.slow(every=4)
 @pytest.mark.parametrize("mode", ["all", "first", "last", "strongest", "dual", "two_strongest"])
 @pytest.mark.parametrize("losses", [{}, {"dropout": 0.2}, {"detection_range_m": 4.0}])
 def test_reported_returns_are_those_of_the_twin(mode, losses):

@@ -91,7 +91,7 @@ def test_projections_of_known_leaves():
 # -- Beer and Lambert ----------------------------------------------------------------------------
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("leaf_angle", ["spherical", "planophile", "erectophile", 2.0])
 @pytest.mark.parametrize("nadir_deg", [0.0, 50.0])
 def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg):

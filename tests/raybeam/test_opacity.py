@@ -42,7 +42,7 @@ def rays(count):
     return origins, rng.uniform(-20, 20, (count, 3)) - origins
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("place", [None, np.diag([2.0, -3, 1, 1])])
 @pytest.mark.parametrize("repeats", [1, 3])
 def test_a_ray_passes_where_the_mask_is_false(backend, place, repeats):

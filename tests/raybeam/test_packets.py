@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from benchmarks.gpu_scenes import grid_faces
-from tests.rows import quick
 
 from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
 
@@ -123,7 +122,8 @@ def ties(backend):
     return found.hexdigest()
 
 
-@pytest.mark.parametrize("isa", quick(("AVX2",), ("SSE4.2", "AVX", "AVX2", "AVX512")))
+@pytest.mark.slow(keep=("AVX2",))
+@pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
 def test_the_lowest_of_equals_wins_with_every_instruction_set(isa):
     """Packets of 4, 8 and 16 rays, with and without fused multiply-adds."""
     flag = {"SSE4.2": "SSE42", "AVX512": "AVX512_SKX"}.get(isa, isa)

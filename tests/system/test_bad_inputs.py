@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import trimesh
 from tests.clusters import cluster_of, import_jobqueue, thread_cluster
-from tests.rows import quick
 
 import lidarpool.run.cluster.connection
 import lidarpool.run.cluster.watch as lidarpool_watch
@@ -215,7 +214,8 @@ TOO_LARGE: dict[str, str] = {
 }
 
 
-@pytest.mark.parametrize("scenario", quick([*TOO_LARGE][:1], TOO_LARGE))
+@pytest.mark.slow(keep=("steps: 100000*",))
+@pytest.mark.parametrize("scenario", TOO_LARGE)
 def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):
     (place / "s.yaml").write_text(scenario)
     workers = {

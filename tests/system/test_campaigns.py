@@ -18,7 +18,6 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 from tests.killed_drivers import drive
-from tests.rows import quick
 
 import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
@@ -109,7 +108,8 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     return Job(Scene.seed(), what, values={"x": number})
 
 
-@pytest.mark.parametrize("keep", quick(("kitti",), ["kitti", "nuscenes"]))
+@pytest.mark.slow(keep=("kitti",))
+@pytest.mark.parametrize("keep", ["kitti", "nuscenes"])
 def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
     names = {40: "road", 10: "car"}
     sensor = Sensor.grid(360, 20, step_deg=4)
@@ -159,7 +159,8 @@ def failing(*numbers: int) -> Callable[[int, np.random.Generator], Job]:
     return make_or_fail
 
 
-@pytest.mark.parametrize("numbers", quick([(0,)], [(0,), (2,), (0, 1, 2)]), ids=str)
+@pytest.mark.slow(keep=("(0,)",))
+@pytest.mark.parametrize("numbers", [(0,), (2,), (0, 1, 2)], ids=str)
 def test_jobs_that_cannot_be_made(client, tmp_path, numbers):
     campaign = Campaign(failing(*numbers), 3, keep="folder")
     run = campaign.run(tmp_path / "ds", client=client)
@@ -201,7 +202,8 @@ def breaking(where: str) -> Callable[[int, np.random.Generator], Job]:
 WORDS = {"cast": "no direction", "describe": "ZeroDivisionError: no such step"}
 
 
-@pytest.mark.parametrize("where", quick(("cast",), WORDS))
+@pytest.mark.slow(keep=("cast",))
+@pytest.mark.parametrize("where", WORDS)
 def test_a_sensor_that_raises_in_a_worker_fails_its_job_only(client, tmp_path, where, left_over):
     run = Campaign(breaking(where), 4, keep="folder").run(tmp_path / "ds", client=client)
     assert [row.name for row in run.failed] == ["0001"] and run.done == 3
@@ -334,7 +336,8 @@ HARM = {
 }
 
 
-@pytest.mark.parametrize("harm", quick(("manifest flipped",), HARM))
+@pytest.mark.slow(keep=("manifest flipped",))
+@pytest.mark.parametrize("harm", HARM)
 def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool, slots, harm):
     change, name = HARM[harm]
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
@@ -530,9 +533,8 @@ def three(slots, full_disk, tmp_path_factory):
     return bytes_of(folder)
 
 
-@pytest.mark.parametrize(
-    "where", quick(("run", "jobs/0001"), ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
-)
+@pytest.mark.slow(keep=("run", "jobs/0001"))
+@pytest.mark.parametrize("where", ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
 def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
     link = here / "ds" / where
     stranger = here / "stranger"
@@ -551,7 +553,8 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     assert bytes_of(here / "ds") == three
 
 
-@pytest.mark.parametrize("harm", quick((".jobs/*.json",), ["jobs/*/cloud.ply", ".jobs/*.json"]))
+@pytest.mark.slow(keep=(".jobs/*.json",))
+@pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
 def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, monkeypatch, harm):
     for path in (here / "ds").glob(harm):
         path.unlink()
@@ -576,7 +579,8 @@ LOST = {
 }
 
 
-@pytest.mark.parametrize("lost", quick(("half of it",), LOST))
+@pytest.mark.slow(keep=("half of it",))
+@pytest.mark.parametrize("lost", LOST)
 def test_finished_jobs_are_known_without_the_database(client, here, unwritten, lost):
     ds = here / "ds"
     before = bytes_of(ds)
@@ -614,8 +618,9 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
+@pytest.mark.slow(keep=("kitti",))
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.parametrize("kept", quick(("kitti",), DATA_SETS))
+@pytest.mark.parametrize("kept", DATA_SETS)
 def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept):
     ds = tmp_path / "ds"
     Campaign(make, 2, keep=kept, splits={"a": 0.5, "b": 0.5}).run(ds, client=client)

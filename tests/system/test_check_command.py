@@ -16,7 +16,6 @@ import yaml
 from distributed import Client
 from tests.clusters import thread_cluster
 from tests.meshes import PLY
-from tests.rows import quick
 
 import lidarpool.run.forecast
 from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
@@ -93,7 +92,8 @@ SURVEYS = {
 }
 
 
-@pytest.mark.parametrize("name", quick(("dense", "two sensors", "of channels"), SURVEYS))
+@pytest.mark.slow(keep=("dense", "two sensors", "of channels"))
+@pytest.mark.parametrize("name", SURVEYS)
 def test_an_estimate_is_near_what_a_run_gives(name):
     """Of a thing that fills some scans and is in few of them."""
     survey = SURVEYS[name]

@@ -74,7 +74,7 @@ def test_json_has_the_warning_as_a_note(run):
     assert warning in json.loads(outcome.out)["notes"]
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [

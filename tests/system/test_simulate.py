@@ -161,7 +161,7 @@ def test_another_client_watches_the_queues_and_variables_of_the_default_survey(c
     assert not Pool.from_client(plain).pipes()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("kind", ["scans", "news", "generate-0", "sort-1", "collect-0-2"])
 def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, plain, kind):
     closed = []

@@ -18,7 +18,6 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 from tests.drives import SCANS, TURNS, the_scene
-from tests.rows import quick
 
 import lidarpool as lp
 from lidarpool import Campaign, Job, LidarError, Mounted, Noise, Pose, Sensor, Survey, Sweep
@@ -63,7 +62,8 @@ def expected(local_client: Client) -> list[Sweep]:
     return list(campaign().stream(client=local_client))
 
 
-@pytest.mark.parametrize("keep", quick(("kitti",), ["parquet", "kitti", "webdataset"]))
+@pytest.mark.slow(keep=("kitti",))
+@pytest.mark.parametrize("keep", ["parquet", "kitti", "webdataset"])
 def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, torch, keep):
     splits = {"train": 0.5, "test": 0.5}
     varied = campaign(keep=keep, splits=splits)
