@@ -38,6 +38,7 @@ def site(tmp_path):
     return tmp_path / "site"
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("deep/sweeps.html",))
 @pytest.mark.parametrize("page", ("index.html", "deep/sweeps.html"))
 def test_search_works_from_disk_and_asks_no_network(site, new_tab, page):

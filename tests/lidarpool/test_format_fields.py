@@ -431,6 +431,7 @@ def vectors_of(fields, prefix=""):
     return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
 
 
+@pytest.mark.extended(every=18)
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("compensated", [False, True])
@@ -542,6 +543,7 @@ def across_deg(survey, positions, time_ns):
     return np.degrees(np.arctan2((rays * right).sum(axis=1), -rays[:, 2]))
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("head", AIRBORNE)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, coordinates):
@@ -560,6 +562,7 @@ def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, 
     assert ("world" if coordinates == "world" else "firing of each") in str(frame.record_data)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("chunk", [700, 1_000_000])
 @pytest.mark.parametrize(("head", "lines_s"), [("sine", 80), ("polygon", 50)])
 def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, lines_s, chunk):

@@ -629,6 +629,7 @@ def in_camera(folder, sweep, instance):
     return points[instances == instance] @ back.T, centre, turn, (length, height, width)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("name", ["ply", *OF_ANY_SENSOR])
 def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, name):
     known = replace(cloud, sweeps=lambda: sweeps)
@@ -800,6 +801,7 @@ def drive(cluster_client):
     return simulate(Scene.seed(), survey, client=cluster_client).cloud
 
 
+@pytest.mark.extended
 def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_path):
     normals, origins = (
         np.stack([drive[f"{name}_{axis}"] for axis in "xyz"], axis=1).astype(float)

@@ -183,6 +183,7 @@ CIRCLE = (
 TURNING = np.tile([0.0, 5, 2], (len(TIMES), 1)), TIMES / 3
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("path", [STRAIGHT, CIRCLE, TURNING], ids=["line", "circle", "standing"])
 def test_quaternions_in_another_order(tmp_path, path):
     positions, yaw = path
@@ -225,6 +226,7 @@ def with_city(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     "name",
     [

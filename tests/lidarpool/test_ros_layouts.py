@@ -165,6 +165,7 @@ def test_a_custom_message_without_points_or_in_pieces(tmp_path):
         livox_columns(data[:-4] + b"\5\0\0\0")
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("layout", "model", "mode"),
     [
@@ -221,6 +222,7 @@ def test_a_column_of_an_organized_ouster_looks_in_one_direction(tmp_path):
     assert (column[returned] == np.broadcast_to(np.arange(1024), column.shape)[returned]).all()
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     ("layout", "organized"),
     [

@@ -62,6 +62,7 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
     return sweep.job_number, sweep.sensor, sweep.number
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     "name", [*DATA_SETS, *(f"mcap-{layout}" for layout in LAYOUTS if layout != "velodyne")]
 )
@@ -116,6 +117,7 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         data[len(data)]
 
 
+@pytest.mark.extended(every=7)
 @pytest.mark.parametrize("name", DATA_SETS)
 def test_the_order_follows_from_the_seed(written, name):
     place = written(name)

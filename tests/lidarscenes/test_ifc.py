@@ -373,6 +373,7 @@ def test_unknown_entities_are_noted(house, forked, tmp_path):
     assert any("without which ifcopenshell reads it" in n and "IFCSLEB" in n for n in notes)
 
 
+@pytest.mark.extended
 def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
     random = np.random.default_rng(7)
     data = np.frombuffer(house.read_bytes(), np.uint8)
@@ -390,6 +391,7 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
         assert not any("\n" in note for note in notes)
 
 
+@pytest.mark.extended
 @needs_ifcopenshell
 def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
     monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)

@@ -311,6 +311,7 @@ def test_mujoco_is_asked_for(room, monkeypatch):
         load(room)
 
 
+@pytest.mark.extended
 def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch):
     monkeypatch.setattr(child_process, "subprocess", subprocess)
     text = '<asset><hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/></asset>'
@@ -323,6 +324,7 @@ def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch
         load(write(path, world(BOX * 50)))
 
 
+@pytest.mark.extended
 def test_garbled_models_give_objects_or_a_line(room):
     peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     whole = ROOM.encode()

@@ -299,6 +299,7 @@ def test_nothing_that_a_file_names_is_opened(tmp_path):
     assert mesh.bounds[1, 2] == 47 and notes[0].startswith("is read without plain.tif.msk")
 
 
+@pytest.mark.extended
 @settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -257,6 +257,7 @@ def test_broken_robots_are_refused_in_a_line(tmp_path, words):
     assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 500
 
 
+@pytest.mark.extended
 def test_xacro_other_files_and_garbled_copies(tmp_path):
     path = tmp_path / "arm.urdf"
     for text, words in (
@@ -389,6 +390,7 @@ def rover_at(name, time_ns):
     return at
 
 
+@pytest.mark.extended
 def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground):
     robot = load_robot(EXAMPLES / "rover.urdf")
     actors = robot.actors(DRIVE, MOTION, without=["lidar"])

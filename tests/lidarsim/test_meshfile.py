@@ -170,6 +170,7 @@ def damaged(content, rng):
     ][int(rng.integers(4))]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply", ".off", ".3mf", "ascii"])
 def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffix, capfd):
     source = two_objects if suffix in (".glb", ".obj", ".3mf") else two_objects.to_mesh()
@@ -197,6 +198,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

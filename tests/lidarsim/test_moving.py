@@ -42,6 +42,7 @@ def wall():
     return Scene.from_meshes([quad("Wall", *corners)])
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "velodyne/hdl64e-s2", "ouster/os0-32"])
 def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model):
     sensor = load_sensor(model, max_range_m=30)
@@ -94,6 +95,7 @@ SURVEYS = {
 }
 
 
+@pytest.mark.extended(keep=("standing-*",))
 @pytest.mark.slow(keep=("standing-*", "driving-*"))
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("name", SURVEYS)
@@ -162,6 +164,7 @@ TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)],
 MIRROR = quad("Mirror", (-9, -3, 0), (9, -3, 0), (9, -3, 9), (-9, -3, 9))
 
 
+@pytest.mark.extended(keep=("driving-*",))
 @pytest.mark.slow(keep=("driving-*", "turned-*", "mirror-*"))
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
 @pytest.mark.parametrize("name", [*SURVEYS, "turned", "noise", "mirror"])

@@ -60,6 +60,7 @@ def check(hits, mesh, rays, graze, t_min=0.0, t_max=np.inf):
     return surely_hit
 
 
+@pytest.mark.extended(every=15)
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
 @pytest.mark.parametrize("offset", [0.0, 5e5, 4e6])

@@ -135,6 +135,7 @@ def check(caster, case, windows, limits):
         np.testing.assert_array_equal(to, directions[some])
 
 
+@pytest.mark.extended(every=12)
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CASES)
 def test_rays_are_those_of_the_interface(caster, shapes, name):
@@ -154,6 +155,7 @@ def test_rays_are_those_of_the_interface(caster, shapes, name):
 CUT = ["one pose", "a pose each ray", "firings, lever arms", "on the move, lever arms"]
 
 
+@pytest.mark.extended(every=12)
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CUT)
 def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
@@ -205,6 +207,7 @@ def thinned(want, groups, every, rays):
     return hits, keep
 
 
+@pytest.mark.extended(every=12)
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     ("name", "limits"),

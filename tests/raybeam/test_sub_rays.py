@@ -52,6 +52,7 @@ def poses(rng, kind, rays):
     return {**many, "rays_per_pose": 49, "motion": motion if kind == "moves" else None}
 
 
+@pytest.mark.extended(every=20)
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])

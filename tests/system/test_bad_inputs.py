@@ -158,6 +158,7 @@ def test_a_bad_file(case, place, refused):
     refused(["run", name], says)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_bad_arguments(case, refused, impatient):
     refused(*OPTIONS[case])
@@ -179,6 +180,7 @@ def test_out_is_in_use_by_another_run(place, refused):
     os.close(handle)
 
 
+@pytest.mark.extended
 def test_a_listener_that_is_no_scheduler(refused, impatient):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -214,6 +216,7 @@ TOO_LARGE: dict[str, str] = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("steps: 100000*",))
 @pytest.mark.parametrize("scenario", TOO_LARGE)
 def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):

@@ -108,6 +108,7 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     return Job(Scene.seed(), what, values={"x": number})
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("kitti",))
 @pytest.mark.parametrize("keep", ["kitti", "nuscenes"])
 def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
@@ -128,6 +129,7 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
 # -- each job alone -------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
     out = files / "job-5"
@@ -136,6 +138,7 @@ def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, s
     assert (out / "cloud.ply").read_bytes() == whole["jobs/0005/cloud.ply"]
 
 
+@pytest.mark.extended
 def test_any_number_of_workers_gives_the_same_bytes(files, whole):
     many = ({"GPU": 1}, {"GPU": 2, "A": 1}, {"LIDAR": 6}, {"LIDAR": 2, "A": 1})
     with thread_cluster(*many) as cluster, Client(cluster, set_as_default=False) as client:
@@ -222,6 +225,7 @@ class Unpicklable(Sensor):
         raise TypeError("cannot pickle a laser")
 
 
+@pytest.mark.extended
 def test_jobs_that_cannot_be_sent_to_workers_fail_alone(client, tmp_path, left_over):
     kinds = (Unpicklable, Sensor, Unpicklable, Unpicklable, Sensor)
 
@@ -383,6 +387,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
 
 
+@pytest.mark.extended
 def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
@@ -410,6 +415,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     assert "bit for bit" in lidarpool(*run, "--job", 1).out
 
 
+@pytest.mark.extended
 def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds", "--resume"]
     for count in (2, 6):
@@ -533,6 +539,7 @@ def three(slots, full_disk, tmp_path_factory):
     return bytes_of(folder)
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("run", "jobs/0001"))
 @pytest.mark.parametrize("where", ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
 def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
@@ -553,6 +560,7 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     assert bytes_of(here / "ds") == three
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=(".jobs/*.json",))
 @pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
 def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, monkeypatch, harm):
@@ -665,6 +673,7 @@ def test_options_that_do_not_go_together(files, lidarpool, options, words, slots
     assert not (files / "ds").exists()
 
 
+@pytest.mark.extended
 def test_several_scenarios_are_a_campaign(files, lidarpool, slots):
     (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
     two = [files / "base.yaml", files / "other.yaml"]
@@ -716,6 +725,7 @@ def test_killed_drivers_leave_the_same_bytes_and_no_remains(
     assert left_over(client) == ([], [], [])
 
 
+@pytest.mark.extended
 def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
     (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 100"))
     command = ["run", "c.yaml", "-q", "--scheduler", slots, "--out", "ds"]
@@ -804,6 +814,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
     assert run.done == 6 and bytes_of(files / "ds") == whole
 
 
+@pytest.mark.extended
 def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client):
     monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
     run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)

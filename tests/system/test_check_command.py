@@ -92,6 +92,7 @@ SURVEYS = {
 }
 
 
+@pytest.mark.extended(keep=("dense",))
 @pytest.mark.slow(keep=("dense", "two sensors", "of channels"))
 @pytest.mark.parametrize("name", SURVEYS)
 def test_an_estimate_is_near_what_a_run_gives(name):
@@ -255,6 +256,7 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     )
 
 
+@pytest.mark.extended
 def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     mesh = trimesh.creation.box((8000, 3000, 6000))
     (tmp_path / "there").mkdir()
@@ -298,6 +300,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     assert "holds an unfinished run: --resume continues it" in outcome.out
 
 
+@pytest.mark.extended
 def test_the_command_that_is_named_runs_where_another_result_is(
     check, cluster, tmp_path, lidarpool
 ):

@@ -192,6 +192,7 @@ DAMAGE = {
 NAMED = {"manifest": ".jobs/0001.json"}
 
 
+@pytest.mark.extended(keep=("changed",))
 @pytest.mark.slow(keep=("changed", "manifest"))
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_files_are_named_and_the_next_merge_takes_them(
@@ -433,6 +434,7 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
     assert content(out) == whole
 
 
+@pytest.mark.extended
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
     out = tmp_path / "ds"
     file = parts[0].parent / "c.yaml"
@@ -558,6 +560,7 @@ def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED, *arguments], check=True)
 
 
+@pytest.mark.extended
 def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     out = tmp_path / "ds"
     killed(out, parts, ("take", 5), ("take", 5), ("write_table", 1), ("finish", 1))
@@ -569,6 +572,7 @@ def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("finish",))
 @pytest.mark.parametrize("moment", ("write_table", "finish"))
 def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path, moment):
@@ -593,6 +597,7 @@ def survey(slots, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.extended
 def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, small_batches):
     run = ["run", survey / "s.yaml", "-q", "--scheduler", slots, "--out"]
     assert lidarpool(*run, survey / "one").code == 0

@@ -48,6 +48,7 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     assert np.array_equal(cloud.channel, rays)
 
 
+@pytest.mark.extended
 def test_a_scene_comes_to_workers_that_see_the_drivers_memory_and_to_others(monkeypatch):
     load = SharedHandle.load
     seen: list[object] = []
