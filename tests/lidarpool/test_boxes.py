@@ -148,6 +148,37 @@ def test_nuscenes_has_boxes_at_the_times_of_samples(cloud, tmp_path):
     assert sum(counts) == len(cloud)
 
 
+def test_nuscenes_interpolates_boxes_between_samples(drive, tmp_path):
+    """By the rule of the devkit: sweeps between samples point to the sample that follows."""
+    survey, scene = drive
+    rear = Mounted(Sensor.grid(SCANS * 10, 4, rate_hz=30.0), Pose((-1, 0, 0.5), 200.0), "rear")
+    cloud = cloud_of(replace(survey, sensors=[survey.carried[0], rear]), scene)
+    save_cloud(cloud, tmp_path / "nu", format="nuscenes")
+    tables = nuscenes_tables(tmp_path / "nu")
+    samples = tables["sample"]
+    x_of_bus = {
+        row["sample_token"]: row["translation"][0]
+        for row in tables["sample_annotation"].values()
+        if row["size"][2] == SIZES[0, 2]
+    }
+    interpolated = []
+    last_us = max(row["timestamp"] for row in samples.values())
+    for row in tables["sample_data"].values():
+        sample = samples[row["sample_token"]]
+        if row["is_key_frame"]:
+            assert 0 <= row["timestamp"] - sample["timestamp"] < 34_000
+        elif row["timestamp"] < last_us:
+            before = samples[sample["prev"]]
+            times_us = [before["timestamp"], sample["timestamp"]]
+            assert times_us[0] < row["timestamp"] < times_us[1]
+            x = np.interp(
+                row["timestamp"], times_us, [x_of_bus[sample["prev"]], x_of_bus[sample["token"]]]
+            )
+            assert x == pytest.approx(STARTS[0, 0] + VELOCITIES[0, 0] * row["timestamp"] / 1e6)
+            interpolated.append(row)
+    assert len(interpolated) == 18
+
+
 @pytest.mark.parametrize(("sequence", "counts"), [("00", (10, 7)), ("01", (5, 4))])
 def test_kitti_has_boxes_at_the_times_of_sweeps(cloud, tmp_path, sequence, counts):
     save_cloud(cloud, tmp_path / "kitti", format="kitti")

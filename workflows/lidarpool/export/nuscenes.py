@@ -273,6 +273,10 @@ class _Tables:
                 x, y, z, w = sweeps.pose.quaternions[sweep].tolist()
                 position = sweeps.pose.positions[sweep].tolist()
                 timestamp = times[sweep]
+                is_key_frame = names[sweep].startswith("samples/")
+                # A sweep between samples points to the sample that follows, from whose boxes and
+                # those before nuscenes-devkit interpolates.
+                number = min(sample[sweep] + (not is_key_frame), count - 1)
                 self._add(
                     "ego_pose",
                     sweep,
@@ -283,7 +287,7 @@ class _Tables:
                 self._add(
                     "sample_data",
                     sweep,
-                    sample_token=self._token("sample", sample[sweep]),
+                    sample_token=self._token("sample", number),
                     ego_pose_token=self._token("ego_pose", sweep),
                     calibrated_sensor_token=self._token("calibrated_sensor", channel),
                     timestamp=timestamp,
@@ -291,7 +295,7 @@ class _Tables:
                     height=0,
                     width=0,
                     filename=names[sweep],
-                    is_key_frame=names[sweep].startswith("samples/"),
+                    is_key_frame=is_key_frame,
                     **neighbours,
                 )
 
