@@ -98,7 +98,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     for rows in tables.values():
         assert len({row["token"] for row in rows}) == len(rows)
     assert [row["name"] for row in tables["scene"]] == ["000", "001", "007"]
-    assert {row["channel"] for row in tables["sensor"]} == {"front", "rear_left"}
+    assert {row["channel"] for row in tables["sensor"]} == {"LIDAR_TOP", "rear_left"}
     assert {row["name"] for row in tables["category"]} == {"Car", "Van"}
     assert len(tables["map"]) == 1 and len(tables["log"]) == 1
     assert len(tables["sample"]) == 3 * TURNS and len(tables["sample_data"]) == 6 * TURNS

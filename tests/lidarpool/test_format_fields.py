@@ -366,7 +366,7 @@ def test_compensated_formats_are_so_whatever_the_clouds_frame(tmp_path, name, co
             path = tmp_path / f"out/sequences/00/velodyne/{sweep:06}.bin"
             placed = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
         elif name == "nuscenes":
-            (path,) = (tmp_path / "out").glob(f"s*/lidar/{sweep:06}.pcd.bin")
+            (path,) = (tmp_path / "out").glob(f"samples/LIDAR_TOP/{sweep:06}.pcd.bin")
             placed = np.fromfile(path, "<f4").reshape(-1, 5)[:, :3]
         else:
             with pye57.E57(str(tmp_path / "out")) as file:

@@ -293,6 +293,13 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     assert advice(build(scenario("output: {write: [laz, kitti]}"))) == []
 
 
+def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
+    sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
+    (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, kitti]}")))
+    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
+    assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
+
+
 @pytest.mark.parametrize(
     ("idle", "used"),
     [

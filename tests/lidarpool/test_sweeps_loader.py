@@ -227,7 +227,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "file"),
     [
-        ("nuscenes", "samples/front/00/000000.pcd.bin"),
+        ("nuscenes", "samples/LIDAR_TOP/00/000000.pcd.bin"),
         ("webdataset", "shards/train/00-000000.tar"),
         ("parquet", "points/job=0/part-00000.parquet"),
         ("mcap", "bags/00.mcap"),

@@ -21,7 +21,18 @@ from tests.killed_drivers import drive
 
 import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
-from lidarpool import Campaign, Job, LidarError, Material, Scene, Sensor, Survey, simulate, sweeps
+from lidarpool import (
+    Campaign,
+    Job,
+    LidarError,
+    Material,
+    Mounted,
+    Scene,
+    Sensor,
+    Survey,
+    simulate,
+    sweeps,
+)
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
@@ -124,6 +135,20 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
     assert verify(Storage.at(tmp_path / "ds")).endswith("is whole: 2 jobs")
     again = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client, overwrite=True)
     assert again.done == 2, "all files are known as the data set's own"
+
+
+def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
+    def make_named(number: int, rng: np.random.Generator) -> Job:
+        sensor = Sensor.grid(360, 20, step_deg=4)
+        roof = Mounted(sensor, name="roof" if number else "LIDAR_TOP")
+        what = Survey(sensors=[roof], poses=[(number, 0, 1)], steps=45)
+        return Job(Scene.seed(), what, values={"x": number})
+
+    run = Campaign(make_named, 3, keep="nuscenes").run(tmp_path / "ds", client=client)
+    (note,) = run.notes
+    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
+    assert {sweep.sensor for sweep in sweeps(tmp_path / "ds")} == {"roof", "LIDAR_TOP"}
+    assert [path.name for path in (tmp_path / "ds/samples").iterdir()] == ["LIDAR_TOP"]
 
 
 # -- each job alone -------------------------------------------------------------------------------

@@ -78,7 +78,9 @@ def forecast_scenario(
         figures["warnings"] += implausibilities(built)
         figures["sources"] = dict(built.findings.sources)
         if campaign is not None:
-            figures["notes"] += campaign.keep.of_jobs.contradictions(scenario.cloud.coordinates)
+            file_format = campaign.keep.of_jobs
+            figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
+            figures["notes"] += file_format.renamed([*scenario.sensors])
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 

@@ -267,9 +267,11 @@ def recorded_sweeps(
         sensors=tuple(names),
         objects=(),
         actors=(),
-        actor_poses=SweepPoses(np.zeros((0, 2 * count, 3)), np.zeros((0, 2 * count, 4))),
+        actor_poses=SweepPoses(np.zeros((0, count, 3)), np.zeros((0, count, 4))),
+        actor_velocities=np.zeros((0, count, 3)),
         actor_bounds=np.zeros((0, 2, 3)),
         actor_there=np.zeros((0, count), np.bool_),
+        actor_comes=np.zeros((0, count), np.bool_),
         coordinates="sensor" if any(pose is None for pose in poses) else "world",
         precision_m=0.001,
     )

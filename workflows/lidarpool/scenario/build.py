@@ -130,8 +130,7 @@ class Job:
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             positions, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-            mesh_bounds = (actor.mesh.animation or actor.mesh).bounds
-            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(mesh_bounds).max()))
+            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(actor.bounds).max()))
         if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
