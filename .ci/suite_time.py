@@ -1,7 +1,7 @@
 """Fail if `make test` takes much more processor time than it should.
 
-Machines differ, so its time is compared with that of `make demo` in the same run; and a busy machine
-makes a run longer, but takes no more processor time for it.
+Machines differ, so its time is compared with that of `make demo` in the same run. A busy machine
+takes longer for a run, but little more processor time.
 
 Usage: python .ci/suite_time.py TEST_SECONDS DEMO_SECONDS    (files that .ci/timed has written)
 """

@@ -103,8 +103,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> Generator[None, N
 def _leave_out_rows(items: list[pytest.Item]) -> None:
     """Take the marks `extended` and `slow` from the rows that the marks say to keep.
 
-    `keep` has the ids of rows, with wildcards; `every=n` keeps the first row and each n-th one after.
-    Of a product of parameters, each value is kept if their numbers have no factor of `n`.
+    `keep` has the ids of rows, with wildcards; `every=n` keeps the first of each n rows. If values
+    of several parameters are multiplied, no number of values should have a factor of `n`.
     """
     counts: Counter[tuple[str, str]] = Counter()
     for item in items:
