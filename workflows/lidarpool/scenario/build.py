@@ -33,6 +33,7 @@ from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
 from lidarsim.simulator.static_bodies import warn_of_reach
 from lidarsim.simulator.surfaces import warn_of_grey
+from lidarsim.simulator.visibility import unseen_objects
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.format_table import check_whole
@@ -123,6 +124,7 @@ class Job:
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
         # Largest local coordinate, also of actors; over the precision it must fit 32-bit integers.
         reach_m = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:  # vehicles on a wet road raise spray
@@ -198,6 +200,7 @@ def build(
     with mistakes.noted():
         with prefixed(scenario.source):
             survey = _build_survey(parts, _materials(scenario, findings, scene, vehicles), columns)
+            unseen_objects(scene, survey)
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     if plans:
         with mistakes.noted(), prefixed(scenario.source):
@@ -291,7 +294,7 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
         landscape=bool(findings.rasters) or any(map(_has_roads, scenario.scene.files)),
         buildings=findings.named(BUILDING),
         roads=findings.named(ROAD_SURFACE),
-        narrow=is_unmounted and not scenario.sensor.model_fields_set,
+        narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
 
 
@@ -573,7 +576,8 @@ def _build_survey(
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else scenario.poses or track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
-    needs_no_mounting = not scenario.sensors and scenario.mount is None and sensors[0].noise is None
+    mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
+    needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None
     survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, parts.origin))) for p in poses],
         trajectory=track,
