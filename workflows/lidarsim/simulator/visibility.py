@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..base.arrays import Bools
@@ -45,3 +47,32 @@ def static_key(scene: Scene, unseen: Bools | None) -> bytes:
     if unseen is None or not unseen[: len(scene.names)].any():
         return b""
     return unseen[: len(scene.names)].tobytes()
+
+
+def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
+    """Return the static objects of a scene that are seen, by a mask (objects,).
+
+    Objects keep their numbers; colours, materials and actors are left out. None if no object is
+    left.
+    """
+    faces = np.flatnonzero(~unseen[scene.face_object])
+    instances = scene.instances
+    if instances is not None:
+        rows = np.flatnonzero(~unseen[instances.owner])
+        instances = replace(
+            instances,
+            part=instances.part[rows],
+            transforms=instances.transforms[rows],
+            owner=instances.owner[rows],
+        )
+        instances = instances if len(rows) else None
+    if not len(faces) and instances is None:
+        return None
+    return Scene(
+        scene.vertices,
+        scene.faces[faces],
+        scene.face_object[faces],
+        scene.names,
+        scene.origin,
+        instances=instances,
+    )
