@@ -174,9 +174,8 @@ class DeviceColumns:
         the first ray of each scan, counted from the first ray of the window.
         """
         survey = self.survey
-        number = specs[0].sensor
-        sensor = survey.carried[number].sensor
-        seen = self._seen_bodies[number]
+        sensor = survey.carried[specs[0].sensor].sensor
+        seen = self._seen_bodies[specs[0].sensor]
         keep_every = survey.keep_every
         scan = check_scan(
             pattern,
@@ -189,8 +188,9 @@ class DeviceColumns:
             tally=True,
         )
         actor_hits = _actor_hits(seen, scan, poses)
-        max_points = -(-len(scan) // keep_every) + len(groups)
-        transfer = _ColumnTransfer(self, seen, specs, groups, max_points)
+        transfer = _ColumnTransfer(
+            self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
+        )
         try:
             hits, tally = seen.caster.caster.visit(scan, transfer.make, seen.counters, actor_hits)
         finally:  # else the device would write to memory that goes back to the pool
@@ -224,9 +224,10 @@ class DeviceColumns:
     def write_ranges(
         self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges of rays of sensor `number` to `image` (n,), metres, which are inf before.
+        """Write the ranges of rays of sensor `number` to `image` (n,), metres.
 
-        Ray i is row ``i % len(pattern)`` of the pattern. A ray without a return keeps inf.
+        Ray i is row ``i % len(pattern)`` of the pattern. `image` has inf before; a ray without a
+        return keeps inf.
         """
         sensor = self.survey.carried[number].sensor
         seen = self._seen_bodies[number]
