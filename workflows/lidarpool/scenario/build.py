@@ -137,7 +137,8 @@ class Job:
         if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}."
+                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}"
+                f"{_outlier_advice(scene)}."
             )
         warn_of_grey(scene, survey)
         warn_of_reach(scene, survey)
@@ -151,6 +152,17 @@ class Job:
     def sweeps(self) -> Sweeps:
         """Sweeps with poses and boxes of actors; takes seconds for thousands of poses."""
         return Sweeps.from_survey(self.survey, self.scene)
+
+
+def _outlier_advice(scene: Scene) -> str:
+    """Return advice to leave out the object that is far from all others, or an empty string."""
+    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
+        middles = scene.object_bounds.mean(axis=1)
+    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
+    order = np.argsort(np.nan_to_num(distances_m))
+    if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
+        return ""
+    return f", or leave out {scene.names[order[-1]]!r}, which is far from all else"
 
 
 def build(
