@@ -249,6 +249,23 @@ def test_effects_do_not_see_unseen_objects_either(name):
     assert names[0].tolist() == names[1].tolist() and len(clouds[1]) > 50
 
 
+def test_spray_of_an_unseen_vehicle_stays():
+    way = Track([0, 2], [[4, 0, 0.2], [54, 0, 0.2]])
+    car = Actor(box("Car", (4.5, 1.8, 1.5)), way, spray=True)
+    scene = Scene.from_meshes([level("Ground", half=60)]).with_actors([car])
+    options = {
+        "columns": ["cause"], "wet": 0.5, "spray_g_m3": 5.0, "backend": "numpy",
+        "noise": Noise(detection_range_m=100), "returns": Returns("all", divergence_mrad=3),
+    }  # fmt: skip
+    sprays = []
+    for unseen in ((), "Car"):
+        scanner = Scanner(scene, GRID, unseen=unseen, **options)
+        cloud = scanner.sweep((0, 0, 1), number=1, start_s=0.3)
+        sprays.append(int((cloud.cause == CAUSES.index("spray")).sum()))
+        assert (1 in cloud.object) == (not unseen)
+    assert sprays[1] >= sprays[0] > 0  # the car no longer hides spray
+
+
 def test_crosstalk_is_of_light_that_its_sensor_sends_and_the_receiver_sees():
     """The other sensor fires 200 ns later from the same place: as if 30 m farther away."""
     optics = Optics(divergence_mrad=10.0)
