@@ -227,8 +227,8 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     scans = plural(figures["scans"], "scan")
     yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
     for name, unseen in figures["unseen"].items():
-        sensor = f"by {name}, " * bool(name)
-        yield f"unseen      {sensor}{plural(len(unseen), 'object')}: {listed(unseen)}"
+        by_sensor = f"by {name}, " * bool(name)
+        yield f"unseen      {by_sensor}{plural(len(unseen), 'object')}: {listed(unseen)}"
 
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:

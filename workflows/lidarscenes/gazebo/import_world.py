@@ -104,7 +104,7 @@ def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
     models = [name.partition("/")[0] for name in names]
     counts = Counter(models)
     unseen_counts = Counter(compress(models, is_unseen))
-    patterns = {}
+    patterns: dict[str, None] = {}
     for name, model in compress(zip(names, models, strict=True), is_unseen):
         is_whole = 1 < counts[model] == unseen_counts[model]
         patterns[f"{escape(model)}/*" if is_whole else escape(name)] = None
