@@ -9,7 +9,10 @@ import pytest
 from tests.meshes import write
 
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import scene_graph
 from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.transform import Transform
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 
@@ -221,6 +224,27 @@ def test_what_cannot_be_read_says_what_it_is(tmp_path, edit, message):
     edit(header)
     with pytest.raises(LidarError, match=message):
         load(tmp_path, header)
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["instances", "copies"])
+def test_a_node_that_is_too_far_away_is_left_out(tmp_path, monkeypatch, shared):
+    """Of instances and of copies, also where a placement moves them there."""
+    monkeypatch.setattr(scene_graph, "SHARED_TRIANGLES", 1 if shared else 1000)
+    header = triangle()
+    header["nodes"] += [
+        {"name": "Fallen", "mesh": 0, "translation": [0, -7.5e8, 0]},
+        {"name": "Near", "mesh": 0, "translation": [0, 3, 0]},
+    ]
+    header["scenes"][0]["nodes"] = [0, 1, 2]
+    notes = []
+    path = write(tmp_path / "m.glb", glb(header, CORNERS))
+    meshes = load_meshes(path, up_axis="z", tell=notes.append)
+    assert [mesh.name for mesh in meshes] == ["Sign", "Near"]
+    assert all(isinstance(mesh, SceneInstance) == shared for mesh in meshes)
+    assert len(notes) == 1 and "(7.5e+08 m from the origin), which are left out: Fal" in notes[0]
+    wide = Transform.from_parts(scale=3e7)
+    (sign,) = load_meshes(path, up_axis="z", transform=wide, tell=notes.append)
+    assert sign.name == "Sign"
 
 
 def hidden(visible=False):

@@ -39,7 +39,7 @@ from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.device import DevicePoints
 from lidarsim.simulator.memory import rig_bytes
 from lidarsim.simulator.rig import Rig
-from raybeam import registry
+from raybeam import available_backends, registry
 
 GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)
 COLUMNS = ["ray", "range", "time", "intensity", "triangle"]
@@ -69,12 +69,14 @@ def scene_of(items, actors=("Car", "Van")):
     return Scene.from_meshes(items).with_actors(moving)
 
 
-@pytest.fixture(params=[*CPU, "source"])
+@pytest.fixture(params=[*CPU, "source", pytest.param("cuda", marks=pytest.mark.gpu)])
 def backend(request, monkeypatch):
-    """Name of a backend; a CUDA device is played by the CPU."""
+    """Name of a backend; a CUDA device is played by the CPU, or a real one."""
     if request.param == "source":
         played = request.getfixturevalue("source_backend")
         monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, played))
+    elif reason := available_backends()[request.param]:
+        pytest.skip(f"{request.param}: {reason}")
     return request.param
 
 
@@ -129,7 +131,7 @@ def test_each_sensor_of_a_survey_has_its_own_unseen_objects(kind, backend):
     batches = list(rig.cast(0, together.scan_count))
     assert len({*rig.scene_casters}) == 3
     for number, (name, batch) in enumerate(zip(unseen, batches, strict=True)):
-        if backend == "source":
+        if backend in ("source", "cuda"):
             assert isinstance(batch, DevicePoints)
         alone = survey([name])
         (expected,) = Rig(scene, alone, backend).cast(0, alone.scan_count)
