@@ -92,6 +92,7 @@ def same_points(cloud, scene, other, other_scene):
     assert len(cloud) > 50
 
 
+@pytest.mark.extended(keep=("*-both-actors", "source-*-actors", "*-faces-"))
 @pytest.mark.parametrize("actors", [(), ("Car", "Van")], ids=["", "actors"])
 @pytest.mark.parametrize("kind", ["faces", "instances", "both"])
 def test_a_sensor_sees_the_scene_without_the_unseen_objects(kind, actors, backend):
@@ -183,6 +184,7 @@ def test_unseen_objects_of_a_vast_scene_are_left_out(monkeypatch):
         assert not {0, 7} & {*cloud.object.tolist()}
 
 
+@pytest.mark.extended(keep=("*-both", "source-*"))
 @pytest.mark.parametrize("kind", ["faces", "instances", "both"])
 def test_a_sensor_may_see_nothing_at_all(kind, backend):
     scene = scene_of(objects(kind))
