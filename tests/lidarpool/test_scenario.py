@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
-from lidarpool import Scene
+from lidarpool import Pose, Scene, SceneInstance
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.actors import box
 from lidarsim.sensor import Noise, Returns, Sensor, Survey
 from lidarsim.sensor.materials import MaterialTable, SurfaceKinds
 
@@ -473,6 +474,17 @@ def test_what_would_disappoint_is_in_the_advice(scenario, text, words):
     assert words in " ".join(advice(build(scenario(text))))
     calm = text.replace("red", "range").replace("linear", "smooth")
     assert words not in " ".join(advice(build(scenario(calm))))
+
+
+def test_an_object_far_from_all_others_is_named_where_points_would_be_too_coarse():
+    meshes = [box(name, (1, 1, 1)) for name in ("one", "two", "three")]
+    fallen = SceneInstance(box("fallen", (1, 1, 1)), Pose((0, 0, -7e7)))
+    survey = Survey(poses=[(0, 0, 1)], precision_m=0.001)
+    message = "use at least 0.018, or leave out 'fallen', which is far from all else."
+    with pytest.raises(LidarError, match=re.escape(message)):
+        Job(Scene.from_meshes([*meshes, fallen]), survey)
+    with pytest.raises(LidarError, match=r"use at least 0.018\.$"):
+        Job(Scene.from_meshes([fallen, meshes[0]]), survey)
 
 
 def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):

@@ -394,6 +394,15 @@ def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
         np.testing.assert_allclose(points, evaluated(path, code, name), atol=2e-3)
 
 
+def test_what_moves_too_far_away_is_left_out(tmp_path):
+    falls = sampled("translate", t0="(0, 0, 5)", t24="(0, 0, -750000000)") + order("translate")
+    path = write(tmp_path / "m.usda", prim("Quad"), prim("Fallen", text=QUAD + falls))
+    notes = []
+    objects = load_objects(path, tell=notes.append)
+    assert [mesh.name for mesh in objects.static] == ["Quad"] and not objects.actors
+    assert any("(7.5e+08 m from the origin), which are left out: Fallen" in note for note in notes)
+
+
 def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     path = person(tmp_path / "m.usda", stage=METRES + "\nstartTimeCode = 7.3\nendTimeCode = 19")
     objects, lines = told(path)

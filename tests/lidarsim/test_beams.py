@@ -274,7 +274,7 @@ def test_ranges_on_a_slanted_plane_scatter_by_the_second_moment(profile, lean_de
     (pulses,) = (rig := rig_of([mesh], survey)).pulse_casters
     beams = pulses.emitter.subrays_of(rig.pattern(0, 0, 1))
     _, directions = pattern_rays(beams, np.arange(61), (0, 0, 0))
-    spread = rig.scene_caster.caster.cast(np.zeros((61, 3)), directions).distance
+    spread = rig.scene_casters[0].caster.cast(np.zeros((61, 3)), directions).distance
     assert spread.std() == pytest.approx(50 * math.tan(lean) * 2e-3 / 4, rel=0.01)
 
 

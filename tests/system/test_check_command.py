@@ -178,6 +178,24 @@ def test_objects_with_masks_are_named(check, tmp_path):
     assert "have masks" not in check("--no-plan", text=json.dumps(scenario)).out
 
 
+def test_objects_that_sensors_do_not_see_are_named(check):
+    names = list(Scene.seed().names)
+    seats = {"front": {"unseen": [names[0], names[1]]}, "rear": {}, "blind": {"unseen": "*"}}
+    scenario = SHORT | {"sensors": {k: SHORT.get("sensor", {}) | v for k, v in seats.items()}}
+    scenario.pop("sensor", None)
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert f"unseen      by front, 2 objects: {names[0]}, {names[1]}\n" in told
+    assert f"unseen      by blind, 6 objects: {', '.join(names[:3])} and 3 more\n" in told
+    said = json.loads(check("--json", "--no-plan", text=json.dumps(scenario)).out)
+    assert said["unseen"] == {"front": names[:2], "blind": names}
+    scenario["sensors"]["rear"]["unseen"] = "Nobody"
+    outcome = check(text=json.dumps(scenario))
+    assert outcome.code == 2 and "unseen of sensor 'rear' names 'Nobody'" in outcome.err
+    assert f"There are {names[0]}, " in outcome.err
+    told = check(text=json.dumps(SHORT | {"sensor": {"unseen": "*"}})).out
+    assert "no ray hit anything at any distance: check unseen, poses and units" in told
+
+
 def test_a_disk_without_room(check, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 1_000_000))
     outcome = check()

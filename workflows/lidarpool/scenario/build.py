@@ -33,6 +33,7 @@ from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
 from lidarsim.simulator.static_bodies import warn_of_reach
 from lidarsim.simulator.surfaces import warn_of_grey
+from lidarsim.simulator.visibility import unseen_objects
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.format_table import check_whole
@@ -123,6 +124,7 @@ class Job:
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
         # Largest local coordinate, also of actors; over the precision it must fit 32-bit integers.
         reach_m = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:  # vehicles on a wet road raise spray
@@ -134,7 +136,8 @@ class Job:
         if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}."
+                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}"
+                f"{_outlier_advice(scene)}."
             )
         warn_of_grey(scene, survey)
         warn_of_reach(scene, survey)
@@ -148,6 +151,17 @@ class Job:
     def sweeps(self) -> Sweeps:
         """Sweeps with poses and boxes of actors; takes seconds for thousands of poses."""
         return Sweeps.from_survey(self.survey, self.scene)
+
+
+def _outlier_advice(scene: Scene) -> str:
+    """Return advice to leave out the object that is far from all others, or an empty string."""
+    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
+        middles = scene.object_bounds.mean(axis=1)
+    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
+    order = np.argsort(np.nan_to_num(distances_m))
+    if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
+        return ""
+    return f", or leave out {scene.names[order[-1]]!r}, which is far from all else"
 
 
 def build(
@@ -197,6 +211,7 @@ def build(
     with mistakes.noted():
         with prefixed(scenario.source):
             survey = _build_survey(parts, _materials(scenario, findings, scene, vehicles), columns)
+            unseen_objects(scene, survey)
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     if plans:
         with mistakes.noted(), prefixed(scenario.source):
@@ -290,7 +305,7 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
         landscape=bool(findings.rasters) or any(map(_has_roads, scenario.scene.files)),
         buildings=findings.named(BUILDING),
         roads=findings.named(ROAD_SURFACE),
-        narrow=is_unmounted and not scenario.sensor.model_fields_set,
+        narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
 
 
@@ -572,7 +587,8 @@ def _build_survey(
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else scenario.poses or track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
-    needs_no_mounting = not scenario.sensors and scenario.mount is None and sensors[0].noise is None
+    mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
+    needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None
     survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, parts.origin))) for p in poses],
         trajectory=track,

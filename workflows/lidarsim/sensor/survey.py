@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import FILLED_IN, Several, about, written_as
+from ..base.declared import FILLED_IN, Names, Several, about, written_as
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.signatures import ReadableSignature
@@ -73,6 +73,9 @@ class Mounted:
         Time steps from each station; by default the survey's.
     returns, noise
         Instead of the survey's, which by default are the sensor's.
+    unseen
+        Names of objects that the sensor does not see, with * and ?: its rays pass through these
+        objects, such as the sensor's own housing.
     """
 
     sensor: Sensor
@@ -81,6 +84,11 @@ class Mounted:
     steps: StepCount | None = None
     returns: Returns | None = None
     noise: Noise | None = None
+    unseen: Names = ()
+
+    def __post_init__(self) -> None:
+        names = (self.unseen,) if isinstance(self.unseen, str) else tuple(self.unseen)
+        object.__setattr__(self, "unseen", names)
 
 
 @dataclass(frozen=True)
