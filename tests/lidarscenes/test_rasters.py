@@ -265,7 +265,8 @@ def test_many_pixels_are_a_choice(tmp_path, monkeypatch):
 
 def test_small_files_that_claim_much(tmp_path):
     options = {"width": 2_000_000, "height": 2_000_000, "count": 1, "dtype": "float32"}
-    options |= {"crs": "EPSG:25832", "transform": from_origin(X0, Y0, 1, 1), "tiled": True}
+    west = X0 - 1_000_000  # so that the middle of 2,000 km is in the middle of the zone
+    options |= {"crs": "EPSG:25832", "transform": from_origin(west, Y0, 1, 1), "tiled": True}
     tiles = {"blockxsize": 4096, "blockysize": 4096, "sparse_ok": True, "bigtiff": "yes"}
     with rasterio.open(tmp_path / "m.tif", "w", **options, **tiles):
         pass
@@ -354,7 +355,9 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
 def test_a_raster_alone_is_a_survey(tmp_path):
     _, columns = np.mgrid[:60, :60]
     heights = 100 + columns / 10.0
-    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")
+    x0, y0 = 2_600_000, 1_200_000
+    place = from_origin(x0, y0, 2, 2)
+    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056", place=place)
     checked = CliRunner().invoke(cli, ["check", "hill.tif"])
     assert checked.exit_code == 0, checked.output
     assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
@@ -363,14 +366,14 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
         [pose.position for pose in built.placing.poses],
-        [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
+        [(x0 + 60, y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
     assert built.survey.epsg == 2056 and advice(built)[1:] == []
-    at = np.array([X0 + 60, Y0 - 60, 110]) - built.scene.origin
+    at = np.array([x0 + 60, y0 - 60, 110]) - built.scene.origin
     cloud = Scanner(built.scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
     assert len(cloud) > 1000
-    np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
+    np.testing.assert_allclose(z, 100 + ((x - x0) / 2 - 0.5) / 10, atol=0.002)
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
     built = build(Scenario.load(tmp_path / "hole.tif"))

@@ -352,6 +352,14 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     help="Unit of x, y and z; by default that of a .las or .laz, else m.",
 )
 @click.option(
+    "--epsg",
+    type=click.IntRange(1024, 32767),
+    metavar="CODE",
+    help="EPSG code of a system in metres, to which a cloud is brought from the system that it "
+    "states: from degrees, or from Web Mercator.",
+)
+@options.flag("--keep-noise", help="Make surfaces of withheld points and noise, too.")
+@click.option(
     "--colour",
     type=click.Choice(["rgb", "intensity"]),
     help="What colours the surfels; by default rgb, else intensity, as the cloud has them.",
@@ -367,6 +375,8 @@ def points(
     voxel_m: float | None,
     size: float,
     unit: str | None,
+    epsg: int | None,
+    keep_noise: bool,
     colour: Literal["rgb", "intensity"] | None,
     overwrite: bool,
 ) -> None:
@@ -377,6 +387,7 @@ def points(
       lidarpool scene points scan.ply place.glb
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
       lidarpool scene points scan.xyz place.glb --unit mm
+      lidarpool scene points tile.laz place.glb --epsg 32618
       lidarpool scene points stations.e57 place.glb --colour intensity
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import scene_of_points
@@ -386,7 +397,14 @@ def points(
 
     def make() -> Scene:
         place = scene_of_points(
-            cloud, voxel_m=voxel_m, size=size, unit=unit, colour=colour, tell=tell
+            cloud,
+            voxel_m=voxel_m,
+            size=size,
+            unit=unit,
+            epsg=epsg,
+            keep_noise=keep_noise,
+            colour=colour,
+            tell=tell,
         )
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
             tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
