@@ -270,14 +270,14 @@ def view(
 
             from .terminal import Terminal
 
-            view = open_views(folders, keep_noise=keep_noise)
-            share(view, film, export, Terminal().writing)
+            shared = open_views(folders, keep_noise=keep_noise)
+            share(shared, film, export, Terminal().writing)
         else:
             growing = None
             if len(folders) == 1:
                 growing = growing_view(folders[0], keep_noise=keep_noise)
-            view = growing or open_views(folders, keep_noise=keep_noise)
-            show_view(view, port=port, browser=not no_browser)
+            shown = growing or open_views(folders, keep_noise=keep_noise)
+            show_view(shown, port=port, browser=not no_browser)
 
 
 @click.command()

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -369,17 +369,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     "cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz|.e57"
 )
 @_out
-def points(
-    cloud: Path,
-    out: Path,
-    voxel_m: float | None,
-    size: float,
-    unit: str | None,
-    epsg: int | None,
-    keep_noise: bool,
-    colour: Literal["rgb", "intensity"] | None,
-    overwrite: bool,
-) -> None:
+def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
 
     \b
@@ -396,16 +386,7 @@ def points(
         click.echo(f"note: {note}", err=True)
 
     def make() -> Scene:
-        place = scene_of_points(
-            cloud,
-            voxel_m=voxel_m,
-            size=size,
-            unit=unit,
-            epsg=epsg,
-            keep_noise=keep_noise,
-            colour=colour,
-            tell=tell,
-        )
+        place = scene_of_points(cloud, tell=tell, **settings)
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
             tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
         return place

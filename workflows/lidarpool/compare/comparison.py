@@ -167,8 +167,12 @@ def compare(
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
-    first = open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise)
-    second = open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise)
+    first = open_recording(
+        a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
+    )
+    second = open_recording(
+        b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
+    )
     comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
     if not first.is_cloud and not second.is_cloud:
         pairs = _pair_sweeps(first, second, match, comparing.notes)

@@ -19,7 +19,6 @@ from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size, open_input, read_input
-from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import did_you_mean, natural
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
@@ -697,8 +696,8 @@ def _open_ouster(path: Path, name: str, sensor: str | None, intensity: str | Non
     def points(scan: Any) -> Read:
         ring, column = np.nonzero(scan.field("RANGE"))
         columns = {"ring": ring}
-        for field in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(scan.fields):
-            columns[field.lower()] = scan.field(field)[ring, column]
+        for field_name in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(scan.fields):
+            columns[field_name.lower()] = scan.field(field_name)[ring, column]
         return compute_positions(scan)[ring, column], columns, None
 
     def times() -> Iterator[float]:

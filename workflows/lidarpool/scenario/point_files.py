@@ -174,9 +174,7 @@ def _check_points(path: Path, points: ScannedPoints) -> None:
         )
 
 
-def _without_noise(
-    path: Path, content: _FileContent, tell: Callable[[str], None]
-) -> _FileContent:
+def _without_noise(path: Path, content: _FileContent, tell: Callable[[str], None]) -> _FileContent:
     """Return content without withheld points and noise; call `tell` with their number."""
     usable, left_out = usable_points(content.columns, content.noise_classes)
     if usable is None:

@@ -45,6 +45,7 @@ from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
     Raster,
+    RasterOptions,
     ReadOptions,
     Window,
 )
@@ -95,13 +96,23 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
             f"is a raster, which rasterio reads: {install_command('lidarpool[geo]')}"
         )
     request = options.raster
-    window = request.window
-    chosen = request.step_m is not None or window is not None
-    with ExitStack() as stack:
-        source = _source(stack.enter_context(_open_raster(path)), path)
+    with _open_raster(path) as file:
+        source = _source(file, path)
         notes = _notes(source, path)
         target_crs = _target_crs(source, request.epsg, notes)
-        pixels = _RasterGrid(source.file, source.affine, source.crs, target_crs)
+        mesh, summary = _raster_mesh(source, target_crs, path, request, notes)
+    raster = Raster(*crs_key(target_crs), summary)
+    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+
+
+def _raster_mesh(
+    source: _Source, target_crs: Any, path: Path, request: RasterOptions, notes: list[str]
+) -> tuple[SceneMesh, str]:
+    """Return the mesh of a raster in a coordinate system, and its summary; append notes."""
+    window = request.window
+    chosen = request.step_m is not None or window is not None
+    pixels = _RasterGrid(source.file, source.affine, source.crs, target_crs)
+    with ExitStack() as stack:
         grid = pixels
         if request.step_m is not None:
             grid = stack.enter_context(_coarser_grid(grid, request.step_m, window))
@@ -110,13 +121,11 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
         _check_size(grid, columns, rows, path.name, chosen=chosen)
         values, valid = _read_values(grid, columns, rows)
         unit_m = UNITS_M[request.unit] if request.unit else _height_unit_m(source, notes)
-        heights = (values * source.file.scales[0] + source.file.offsets[0]) * unit_m
+        heights = source.heights_m(values, unit_m)
         mesh = _grid_mesh(path.stem, grid, columns, rows, heights, valid)
-        no_data_m = (_NO_DATA * source.file.scales[0] + source.file.offsets[0]) * unit_m
+        no_data_m = float(source.heights_m(np.array(_NO_DATA), unit_m))
         notes += _height_notes(pixels, grid, path, mesh, no_data_m)
-        summary = _summary(source, grid, request.step_m, valid)
-    raster = Raster(*crs_key(target_crs), summary)
-    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+        return mesh, _summary(source, grid, request.step_m, valid)
 
 
 def _read_values(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> tuple[Floats, Bools]:
@@ -183,6 +192,10 @@ class _Source:
     affine: Any  # from columns and rows to x and y
     crs: Any  # horizontal coordinate system of x and y; None for none on Earth
     up_m: float | None  # unit of heights of the vertical system, metres
+
+    def heights_m(self, values: Floats, unit_m: float) -> Floats:
+        """Return the heights in metres of values of the first band, which has a unit."""
+        return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
 def _source(file: Any, path: Path) -> _Source:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -19,14 +20,12 @@ from ...base.arrays import Floats
 from ...base.elementary import sin_cos
 from ...base.errors import LidarError
 from ...base.extras import install_command
+from ...base.vectors import turned
+from ...base.vocabulary import OF_THE_WORLD, WORLD_EPSG
+from ..scene_instances import SceneInstance
+from ..scene_mesh import SceneMesh
 
 MAX_SCALE_ERROR = 0.01  # of lengths that count as true
-# Codes of systems for maps of the whole Earth, whose metres are true along a line at most: Mercator
-# and cylindrical projections that are true along the equator or along 30 degrees.
-WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004, 54009})
-_OF_THE_WORLD = (
-    "for maps of the world, whose metres are not true: choose a UTM zone or a national grid"
-)
 UTM_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
 _UTM_MIDDLE_M = 500_000.0  # easting of the meridian in the middle of a zone
 _UTM_HALF_WIDTH_M = 900_000.0  # from the middle to where lengths are wrong by 0.96 %
@@ -274,17 +273,66 @@ def projection_kind(name: str) -> bool | None:
     return False if "mercator" in letters else None
 
 
-def target_problem(epsg: int, x: float, y: float) -> str:
+def middle_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
+    """Return x and y in the middle of the middles of objects, (2,); zero without any."""
+    if not objects:
+        return np.zeros(2)
+    middles = np.array([_middle(item)[:2] for item in objects])
+    middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    return middle
+
+
+def _middle(item: SceneMesh | SceneInstance) -> Floats:
+    """Return the middle of an object's bounds in the world, (3,)."""
+    if isinstance(item, SceneMesh):
+        return np.asarray(item.bounds.mean(axis=0))
+    middle = item.mesh.bounds.mean(axis=0)
+    return np.asarray(turned(middle[None], item.matrix[:3, :3])[0] + item.matrix[:3, 3])
+
+
+def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
+    """Return why lengths are not true at a place of a system, as a clause; empty if they are.
+
+    For systems of meshes, in metres. The clause follows the name of the system, such as «whose
+    metre is 0.68 m long on the ground here».
+
+    Parameters
+    ----------
+    system
+        A code such as EPSG:3857, WKT, or a definition of PROJ. Of a system that is not understood,
+        and without rasterio, only `WORLD_EPSG` are known.
+    x, y
+        Coordinates of the place, in the unit of the system.
+    in_system
+        Whether the mesh has coordinates of the system, so that the clause says what placement makes
+        its lengths true.
+    """
+    if not has_registry():
+        is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
+        return "whose metres are not true to scale" if is_known else ""
+    crs = crs_of_text(system)
+    scale = None if crs is None else ground_scale(horizontal_part(crs)[0], x, y)
+    if scale is None or scale.is_true:
+        return ""
+    clause = f"whose metre is {scale} long on the ground here"
+    if scale.is_even and in_system:
+        factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
+        clause += f": <file.scale=[{factor}, {factor}, 1]> makes its lengths true"
+    return clause
+
+
+def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
     """Return why lengths in a chosen system are not true metres at a place of that system.
 
     A clause that begins with the code, such as «EPSG:3857 (WGS 84 / Pseudo-Mercator), whose …»;
     empty if lengths are true within `MAX_SCALE_ERROR`. Systems of the whole Earth (`WORLD_EPSG`)
-    are refused everywhere. Without rasterio, only these systems are known.
+    are refused everywhere. Without rasterio, only these systems are known. `why_there` follows the
+    coordinates in the message.
     """
     if _is_utm(epsg) and abs(x - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M:
         return ""  # reading the registry takes half a second
     if not has_registry():
-        return f"EPSG:{epsg}, {_OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
+        return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
     crs = crs_of_code(epsg)
     if crs is None:
         return f"EPSG:{epsg}, a code that rasterio does not know"
@@ -293,7 +341,7 @@ def target_problem(epsg: int, x: float, y: float) -> str:
     if not horizontal.is_projected or horizontal.linear_units_factor[1] != 1:
         return f"{name}, which is not in metres"
     if epsg in WORLD_EPSG:
-        return f"{name}, {_OF_THE_WORLD}"
+        return f"{name}, {OF_THE_WORLD}"
     scale = ground_scale(horizontal, x, y)
     if scale is None:
         return f"{name}, which does not reach to x {x:.9g}, y {y:.9g}"
@@ -301,8 +349,8 @@ def target_problem(epsg: int, x: float, y: float) -> str:
         return ""
     advice = "choose a system for this place"
     if code := suggested_epsg(horizontal, x, y):
-        advice = f"EPSG:{code} has true metres"
-    return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}: {advice}"
+        advice = f"EPSG:{code} has true metres there"
+    return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
 
 
 def _is_utm(epsg: int) -> bool:

@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ...base.errors import LidarError
 from ...base.extras import install_command
@@ -125,8 +125,15 @@ _TOKENS = re.compile(
     r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)|([-+]?[\d.]+(?:[eE][-+]?\d+)?)|([][(),])'
 )
 _MAX_DEPTH = 50
-_HORIZONTAL = {"PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS",
-    "DERIVEDPROJCRS"}
+_HORIZONTAL = {
+    "PROJCS",
+    "PROJCRS",
+    "PROJECTEDCRS",
+    "LOCAL_CS",
+    "ENGCRS",
+    "ENGINEERINGCRS",
+    "DERIVEDPROJCRS",
+}
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
@@ -163,7 +170,9 @@ def wkt_units(text: str) -> CoordinateUnits:
     if horizontal is None:
         if angular := next((part for part in parts if part.keyword in _ANGULAR), None):
             kind = "geocentric" if _is_geocentric(angular) else "angles"
-            raise LidarError(f"its coordinates are {kind} ({name[:80]}): {advice_to_project(None)}.")
+            raise LidarError(
+                f"its coordinates are {kind} ({name[:80]}): {advice_to_project(None)}."
+            )
         raise ValueError(f"its coordinate system begins with {node.keyword[:20]}")
     unit = _length_unit(horizontal)
     if unit is None:

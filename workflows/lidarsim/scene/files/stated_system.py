@@ -18,12 +18,11 @@ import numpy as np
 from ...base.arrays import Floats
 from ...base.errors import LidarError
 from ...base.extras import install_command
-from ...base.vocabulary import UNITS_M
+from ...base.vocabulary import UNITS_M, WORLD_EPSG
 from ...base.words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
     UTM_EPSG,
-    WORLD_EPSG,
     crs_name,
     crs_of_code,
     crs_of_text,
@@ -32,8 +31,8 @@ from .coordinate_systems import (
     horizontal_part,
     is_geocentric,
     need_registry,
-    projjson,
     projection_kind,
+    projjson,
     suggested_epsg,
     target_problem,
     transformed,
@@ -69,7 +68,7 @@ class _TiffTag(NamedTuple):
 
     number: int
     type: int  # 3 for 16 bits, 4 for 32 bits, 12 for doubles, 2 for text
-    count: int
+    value_count: int
     values: bytes
 
 
@@ -140,9 +139,7 @@ class StatedSystem:
         if not has_registry():
             return None
         crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
-        on_earth = crs is not None and (
-            crs.is_projected or crs.is_geographic or is_geocentric(crs)
-        )
+        on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
         if not on_earth and self._code:  # codes of Esri are beside those of EPSG in GeoTIFF keys
             crs = crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
         return crs
@@ -189,7 +186,9 @@ class StatedSystem:
         if self._code is not None:
             return f"EPSG:{self._code}"
         quoted = re.search(r'"([^"]*)"', self.text)
-        return printable(quoted[1] if quoted else self.text)[:80] or "a coordinate system of its own"
+        return (
+            printable(quoted[1] if quoted else self.text)[:80] or "a coordinate system of its own"
+        )
 
     @property
     def _has_name(self) -> bool:
@@ -407,7 +406,7 @@ def _tiff(records: Mapping[int, bytes]) -> bytes:
     rows = b""
     body = b""
     for tag in tags:
-        rows += struct.pack("<HHI", tag.number, tag.type, tag.count)
+        rows += struct.pack("<HHI", tag.number, tag.type, tag.value_count)
         if len(tag.values) <= 4:
             rows += tag.values.ljust(4, b"\0")
         else:
