@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from itertools import accumulate
 from pathlib import Path
@@ -21,13 +22,13 @@ from lidarsim.base.words import plural, printable
 from lidarsim.scene.files.e57_system import e57_system
 from lidarsim.scene.files.las import las_system, noise_classes, open_las
 from lidarsim.scene.files.mesh_formats import advice_on
-from lidarsim.scene.files.noise_points import NOISE_CLASSES, usable_points
+from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
 from lidarsim.scene.files.pcd import checked_pcd
 from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 from lidarsim.scene.files.stated_system import (
+    Reprojection,
     StatedSystem,
     check_metric_format,
-    reprojected,
     stated_metres,
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
@@ -37,7 +38,7 @@ from ..base.open3d_module import load_open3d
 
 MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
-_SAMPLE = 1000  # points whose notes on another system are told
+_SAMPLE = 1000  # points that tell whether another system has true metres there
 _E57_BYTES = 24  # of the coordinates of a point, at least
 # Names of columns in files of various programs; the first name that a file has is read.
 _CLASSES = (
@@ -102,6 +103,7 @@ class _FileContent:
     system: StatedSystem | None = None  # that the file states
     in_metres: bool = False  # whether the format has true metres, whatever the system says
     noise_classes: tuple[int, ...] = NOISE_CLASSES
+    left_out: LeftOut = field(default_factory=LeftOut)  # withheld points and noise
 
 
 def read_points(
@@ -132,7 +134,7 @@ def read_points(
     ------
     LidarError
         If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
-        that are not true; see `stated_metres` and `reprojected`.
+        that are not true; see `stated_metres` and `Reprojection`.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -154,14 +156,19 @@ def read_points(
     except Exception as error:  # readers raise whatever they stumble over
         reason = printable(str(error).partition("\n")[0])[:200] or type(error).__name__
         raise LidarError(f"{path} is broken or cut short ({reason}).") from error
-    _check_points(path, points)
+    _check_points(path, points, content.left_out)
     if names := _left_out(content):
         tell(f"{path}: not kept, because surfels have no room for them: {', '.join(names)}")
     return points
 
 
-def _check_points(path: Path, points: ScannedPoints) -> None:
+def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
     """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
+    if len(points) < MIN_POINTS and (note := left_out.note()):
+        raise LidarError(
+            f"{path} has {plural(len(points), 'point')} to use, and at least {MIN_POINTS} are "
+            f"needed: {note}."
+        )
     if len(points) < MIN_POINTS:
         raise LidarError(
             f"{path} has {len(points)} points, and at least {MIN_POINTS} are needed: it is empty, "
@@ -185,6 +192,7 @@ def _without_noise(path: Path, content: _FileContent, tell: Callable[[str], None
         positions=content.positions[usable],
         columns={name: values[usable] for name, values in content.columns.items()},
         scanners=None if content.scanners is None else content.scanners[usable],
+        left_out=left_out,
     )
 
 
@@ -199,26 +207,21 @@ def _to_metres(
     finite = content.positions[np.isfinite(content.positions).all(axis=1)]
     if epsg is not None:
         if unit is not None:
-            raise LidarError("--epsg (epsg=) takes the units of the file's system: leave out unit.")
-        _, notes = reprojected(content.system, finite[:: len(finite) // _SAMPLE + 1], epsg)
-    elif content.in_metres and unit is None:
-        notes = check_metric_format(content.system, finite)
-        metres = (1.0, 1.0, 1.0)
+            raise LidarError("epsg takes the units of the file's system: leave out unit.")
+        reprojection = Reprojection(content.system, epsg)
+        reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
+        notes = reprojection.notes
+        convert = reprojection.apply
     else:
-        metres, notes = stated_metres(content.system, finite, unit)
+        if content.in_metres and unit is None:
+            notes = check_metric_format(content.system, finite)
+            metres = (1.0, 1.0, 1.0)
+        else:
+            metres, notes = stated_metres(content.system, finite, unit)
+        convert = partial(np.multiply, metres)
     for note in notes:
         tell(f"{path} {note}")
-    if epsg is None:
-        return lambda positions: positions * metres
-    return lambda positions: _finite_reprojected(content.system, positions, epsg)
-
-
-def _finite_reprojected(system: StatedSystem | None, positions: Floats, epsg: int) -> Floats:
-    """Return positions (n, 3) in another system; NaN for those that are not finite."""
-    finite = np.isfinite(positions).all(axis=1)
-    moved = np.full(positions.shape, np.nan)
-    moved[finite], _ = reprojected(system, positions[finite], epsg)
-    return moved
+    return convert
 
 
 def _scanned_points(content: _FileContent, to_metres: Callable[[Floats], Floats]) -> ScannedPoints:
@@ -231,7 +234,11 @@ def _scanned_points(content: _FileContent, to_metres: Callable[[Floats], Floats]
     if scanners is None:
         scanners = _first_vectors(columns, _ORIGINS)
     if scanners is not None:
-        outward = to_metres(scanners) - positions
+        try:
+            outward = to_metres(scanners) - positions
+        except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
+            outward = None
+            content.ignored.append("positions of scanners without a place in that system")
     classes = _first(columns, _CLASSES)
     intensities = _first(columns, _INTENSITIES)
     points = ScannedPoints(

@@ -31,6 +31,7 @@ _UTM_MIDDLE_M = 500_000.0  # easting of the meridian in the middle of a zone
 _UTM_HALF_WIDTH_M = 900_000.0  # from the middle to where lengths are wrong by 0.96 %
 _GROUND_STEP_M = 10.0  # of the differences by which a scale is computed
 _BLOCK_POINTS = 100_000  # that are reprojected at a time, through lists of Python
+UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
 _POLAR_DEG = 84.0  # latitude from which the polar stereographic projection stands for UTM
 _WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in metres, inverse flattening
@@ -153,7 +154,9 @@ def crs_name(crs: Any) -> str:
     """Return the code and the name of a coordinate system for messages."""
     _, code = crs_key(crs)
     name = str(projjson(crs)["name"])[:80]
-    return f"EPSG:{code} ({name})" if code else name
+    if not code:
+        return name
+    return f"EPSG:{code}" if name in UNNAMED else f"EPSG:{code} ({name})"
 
 
 def transformed(source: Any, target: Any, points: Floats) -> Floats:

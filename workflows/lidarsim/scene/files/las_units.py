@@ -33,7 +33,7 @@ _VERTICAL_UNIT = 4099
 # models
 _GEOGRAPHIC = 2
 _GEOCENTRIC = 3
-_USER_DEFINED = 32767
+USER_DEFINED = 32767
 
 _EPSG_UNITS = {  # {EPSG code: (name, metres)}
     1025: ("millimetre", 0.001),
@@ -305,9 +305,9 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
         raise LidarError(f"its coordinates are {kind} (EPSG:{code}): {advice_to_project(None)}.")
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
-    if keys.get(_LINEAR_UNIT) == _USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
+    if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
         unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
-    if projected not in (0, _USER_DEFINED) and unit is None:
+    if projected not in (0, USER_DEFINED) and unit is None:
         system = units_of_epsg(projected)
         unit = system.horizontal
         heights = system.vertical if system.vertical_stated else None
@@ -326,7 +326,7 @@ def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
     vertical = int(keys.get(_VERTICAL_CRS, 0))
     if _VERTICAL_UNIT in keys:
         return _unit_of_code(keys[_VERTICAL_UNIT])
-    return None if vertical in (0, _USER_DEFINED) else _vertical_unit_of_epsg(vertical)
+    return None if vertical in (0, USER_DEFINED) else _vertical_unit_of_epsg(vertical)
 
 
 def method_of_keys(keys: Mapping[int, float]) -> str:
@@ -336,7 +336,7 @@ def method_of_keys(keys: Mapping[int, float]) -> str:
 
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
     """Return the unit of an EPSG code; None without a code, or for a user-defined unit."""
-    if code is None or code in (0, _USER_DEFINED):
+    if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:
         raise LidarError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")

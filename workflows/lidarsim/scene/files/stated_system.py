@@ -22,7 +22,9 @@ from ...base.vocabulary import UNITS_M, WORLD_EPSG
 from ...base.words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
+    UNNAMED,
     UTM_EPSG,
+    crs_key,
     crs_name,
     crs_of_code,
     crs_of_text,
@@ -42,6 +44,7 @@ from .las_units import (
     GEO_KEYS,
     GEO_TEXTS,
     PROJECTED_CRS,
+    USER_DEFINED,
     CoordinateUnits,
     advice_to_project,
     geo_keys,
@@ -117,7 +120,8 @@ class StatedSystem:
         """EPSG code of the text or of the keys, if it is the code of a projected system."""
         if match := _CODE.fullmatch(self.text):
             return int(match[1])
-        return int(self._keys.get(PROJECTED_CRS, 0)) or None
+        code = int(self._keys.get(PROJECTED_CRS, 0))
+        return None if code in (0, USER_DEFINED) else code
 
     def units(self) -> CoordinateUnits | None:
         """Return the units of the coordinates; None if the file says nothing of a projection.
@@ -143,6 +147,15 @@ class StatedSystem:
         if not on_earth and self._code:  # codes of Esri are beside those of EPSG in GeoTIFF keys
             crs = crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
         return crs
+
+    @property
+    def angles(self) -> str:
+        """A clause on angles or geocentric coordinates that follows a file's name, or empty."""
+        if self.crs is None or self.crs.is_projected:
+            return ""
+        if is_geocentric(self.crs):
+            return f"is in {self.name}, geocentric"
+        return f"is in {self.name}, of angles" if self.crs.is_geographic else ""
 
     @property
     def is_true_by_name(self) -> bool | None:
@@ -182,18 +195,20 @@ class StatedSystem:
     def name(self) -> str:
         """Code and name of the system for messages."""
         if self.crs is not None and self._has_name:
-            return crs_name(self.crs)
+            return crs_name(self.crs if is_geocentric(self.crs) else horizontal_part(self.crs)[0])
         if self._code is not None:
             return f"EPSG:{self._code}"
-        quoted = re.search(r'"([^"]*)"', self.text)
+        projected = r'(?i)PROJ(?:CS|CRS|ECTEDCRS)\s*[\[(]\s*"([^"]*)"'
+        quoted = re.search(projected, self.text) or re.search(r'"([^"]*)"', self.text)
         return (
             printable(quoted[1] if quoted else self.text)[:80] or "a coordinate system of its own"
         )
 
     @property
     def _has_name(self) -> bool:
-        """Whether PROJ knows a name of the system: GDAL calls the others unnamed or unknown."""
-        return str(projjson(self.crs)["name"]).lower() not in ("unnamed", "unknown", "")
+        """Whether PROJ knows a code or a name of the system."""
+        _, code = crs_key(self.crs)
+        return code is not None or projjson(self.crs)["name"] not in UNNAMED
 
 
 @dataclass(frozen=True)
@@ -227,15 +242,15 @@ def stated_metres(
     """
     if unit is not None or system is None:
         metre = UNITS_M[unit or "m"]
-        problem = "" if system is None else _scale_of(system, positions).problem
+        problem = "" if system is None else system.angles or _scale_of(system, positions).problem
         note = f"{problem}; its coordinates are taken in {unit} of true length, as you say"
         return (metre, metre, metre), [note] if problem else []
-    units = system.units()
-    if units is None:
-        return (1.0, 1.0, 1.0), []
     scale = _scale_of(system, positions)
     if scale.problem:
         raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
+    units = system.units()
+    if units is None:
+        return (1.0, 1.0, 1.0), []
     return units.factors, [note for note in (units.note(), scale.note) if note]
 
 
@@ -305,10 +320,8 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
     return _Scale(f"is in {system.name}, whose metres are not true to scale")
 
 
-def reprojected(
-    system: StatedSystem | None, positions: Floats, epsg: int
-) -> tuple[Floats, list[str]]:
-    """Return positions (n, 3) in metres of a system in true metres, and notes as clauses.
+class Reprojection:
+    """Brings positions from the system that a file states to a system in true metres.
 
     Heights are converted to metres and stay as in the file, with their vertical datum; those of
     geocentric coordinates are above the ellipsoid.
@@ -317,53 +330,79 @@ def reprojected(
     ----------
     system
         The system that the file states.
-    positions
-        (n, 3), finite, in the units of the file.
     epsg
         Code of a projected system in metres.
+
+    Attributes
+    ----------
+    notes
+        Clauses that follow the name of the file.
 
     Raises
     ------
     LidarError
-        If the file states no system, PROJ does not understand one of the systems, a point is
-        outside of it, the chosen system is not in true metres there, or rasterio is missing.
+        If the file states no system, PROJ does not understand one of the systems, or rasterio is
+        missing.
     """
-    need_registry("clouds are brought to another coordinate system")
-    if system is None:
-        raise LidarError(
-            f"it states no coordinate system, so it cannot be brought to EPSG:{epsg}: leave out "
-            "--epsg (in Python epsg=), or state its system first (pdal translate IN OUT "
-            "--readers.las.override_srs=EPSG:CODE)."
+
+    def __init__(self, system: StatedSystem | None, epsg: int) -> None:
+        need_registry("clouds are brought to another coordinate system")
+        if system is None:
+            raise LidarError(
+                f"it states no coordinate system, so it cannot be brought to EPSG:{epsg}: leave "
+                "out --epsg (in Python epsg=), or state its system first (pdal translate IN OUT "
+                "--readers.las.override_srs=EPSG:CODE)."
+            )
+        source = system.crs
+        if source is None or not (
+            source.is_projected or source.is_geographic or is_geocentric(source)
+        ):
+            raise LidarError(f"its coordinate system {system.name!r} is not known to PROJ.")
+        target = crs_of_code(epsg)
+        if target is None:
+            raise LidarError(f"EPSG:{epsg} is not known to PROJ: give the code of another system.")
+        self._epsg = epsg
+        self._target, _ = horizontal_part(target)
+        self._is_geocentric = is_geocentric(source)
+        self._source = source if self._is_geocentric else horizontal_part(source)[0]
+        self.notes = [f"was brought from {system.name} to EPSG:{epsg}"]
+        self._height_m = 1.0
+        if not self._is_geocentric:
+            self._height_m, note = system.height_m()
+            self.notes += [note] if note else []
+
+    def check(self, positions: Floats) -> None:
+        """Check that the chosen system is in true metres in the middle of positions (n, 3).
+
+        LidarError if it is not.
+        """
+        moved = self.apply(positions)
+        if len(moved):
+            x, y = np.median(moved[:, :2], axis=0).tolist()
+            if problem := target_problem(self._epsg, x, y):
+                raise LidarError(f"it cannot be brought to {problem}.")
+
+    def apply(self, positions: Floats) -> Floats:
+        """Return positions (n, 3) in metres of the chosen system; NaN for positions not finite.
+
+        LidarError for a position that is outside of one of the systems.
+        """
+        finite = np.isfinite(positions).all(axis=1)
+        moved = np.where(finite[:, None], positions, np.nan).astype(np.float64)
+        axes = slice(3) if self._is_geocentric else slice(2)
+        try:
+            moved[finite, axes] = transformed(self._source, self._target, moved[finite, axes])
+        except Exception as error:  # errors of GDAL have classes that rasterio keeps private
+            raise self._no_place() from error
+        if not np.isfinite(moved[finite]).all():
+            raise self._no_place()
+        moved[:, 2] *= self._height_m
+        return moved
+
+    def _no_place(self) -> LidarError:
+        return LidarError(
+            f"points of it have no place in EPSG:{self._epsg}: give the code of another system."
         )
-    source = system.crs
-    if source is None or not (source.is_projected or source.is_geographic or is_geocentric(source)):
-        raise LidarError(f"its coordinate system {system.name!r} is not known to PROJ.")
-    target = crs_of_code(epsg)
-    if target is None:
-        raise LidarError(f"EPSG:{epsg} is not known to PROJ: give the code of another system.")
-    target, _ = horizontal_part(target)
-    moved = np.array(positions, np.float64)
-    notes = [f"was brought from {system.name} to EPSG:{epsg}"]
-    try:
-        if is_geocentric(source):
-            moved = transformed(source, target, moved)
-        else:
-            horizontal, _ = horizontal_part(source)
-            moved[:, :2] = transformed(horizontal, target, moved[:, :2])
-            height_m, note = system.height_m()
-            moved[:, 2] *= height_m
-            notes += [note] if note else []
-    except LidarError:
-        raise
-    except Exception as error:  # errors of GDAL have classes that rasterio keeps private
-        raise LidarError(f"points of it have no place in EPSG:{epsg} ({error}).") from error
-    if len(moved):
-        if not np.isfinite(moved).all():
-            raise LidarError(f"points of it have no place in EPSG:{epsg}: give another code.")
-        x, y = np.median(moved[:, :2], axis=0).tolist()
-        if problem := target_problem(epsg, x, y):
-            raise LidarError(f"it cannot be brought to {problem}.")
-    return moved, notes
 
 
 def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
