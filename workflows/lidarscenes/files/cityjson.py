@@ -366,7 +366,10 @@ class _System:
         name = f"{authority.upper()}:{number}"
         epsg = int(number) if authority.upper() == "EPSG" else None
         is_of_angles = looks_like_angles or epsg in _GEOGRAPHIC_SYSTEMS
-        crs = crs_of_text(name) if has_registry() else None
+        crs = None
+        if has_registry():
+            heights = f"+{codes[1][1]}" if len(codes) > 1 else ""
+            crs = crs_of_text(name + heights) or crs_of_text(name)
         if crs is None:
             return cls(name, epsg, None, is_of_angles)
         horizontal, up_m = horizontal_part(crs)

@@ -261,7 +261,7 @@ def zone_in_metres(longitude: float, latitude: float) -> int:
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
     """Return the EPSG code of a system in true metres at a place; None if it is not on Earth."""
-    place = longitude_latitude(crs, x, y)
+    place = longitude_latitude(horizontal_part(crs)[0], x, y)
     return None if place is None else zone_in_metres(*place)
 
 
@@ -320,7 +320,7 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
     clause = f"whose metre is {scale} long on the ground here"
     if scale.is_even and in_system:
         factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
-        clause += f": <file.scale=[{factor}, {factor}, 1]> makes its lengths true"
+        clause += f": scale [{factor}, {factor}, 1] makes its lengths true"
     return clause
 
 

@@ -387,7 +387,7 @@ class Reprojection:
 
         LidarError for a position that is outside of one of the systems.
         """
-        finite = np.isfinite(positions).all(axis=1)
+        finite = np.asarray(np.isfinite(positions).all(axis=1))
         moved = np.where(finite[:, None], positions, np.nan).astype(np.float64)
         axes = slice(3) if self._is_geocentric else slice(2)
         try:
