@@ -122,7 +122,7 @@ def _unbound(described: dict[str, Any]) -> dict[str, Any]:
 def horizontal_part(crs: Any) -> tuple[Any, float | None]:
     """Return the horizontal system of a system on Earth, and metres in its unit of heights.
 
-    None for a system without heights.
+    The unit is None for a system without heights.
     """
     described = projjson(crs)
     parts = [_unbound(part) for part in described.get("components", [described])]
@@ -137,9 +137,8 @@ def horizontal_part(crs: Any) -> tuple[Any, float | None]:
 def is_geocentric(crs: Any) -> bool:
     """Return True for a system with its origin in the middle of the Earth."""
     described = projjson(crs)
-    return bool(described.get("coordinate_system", {}).get("subtype") == "Cartesian") and (
-        described["type"] == "GeodeticCRS"
-    )
+    axes = described.get("coordinate_system", {})
+    return described["type"] == "GeodeticCRS" and axes.get("subtype") == "Cartesian"
 
 
 def crs_key(crs: Any) -> tuple[str, int | None]:
@@ -232,11 +231,10 @@ def _ground_metres_of_degrees(base: dict[str, Any], latitude_deg: float) -> tupl
     datum = base.get("datum") or base.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
     axis, inverse = _WGS84_ELLIPSOID
-    if isinstance(ellipsoid.get("semi_major_axis"), float | int):
-        axis = float(ellipsoid["semi_major_axis"])
+    radius = ellipsoid.get("radius", ellipsoid.get("semi_major_axis"))
+    if isinstance(radius, float | int):
+        axis = float(radius)
         inverse = float(ellipsoid.get("inverse_flattening", np.inf))
-    elif isinstance(ellipsoid.get("radius"), float | int):
-        axis, inverse = float(ellipsoid["radius"]), np.inf
     flattening = 1 / inverse
     square = flattening * (2 - flattening)  # of the eccentricity
     sine, cosine = sin_cos(np.radians(np.array([latitude_deg])))

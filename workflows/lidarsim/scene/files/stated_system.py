@@ -139,14 +139,25 @@ class StatedSystem:
 
     @cached_property
     def crs(self) -> Any:
-        """The `rasterio.crs.CRS`; None without rasterio, and if PROJ does not understand it."""
+        """The `rasterio.crs.CRS`; None without rasterio, and for none on Earth that PROJ knows."""
         if not has_registry():
             return None
         crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
         on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
         if not on_earth and self._code:  # codes of Esri are beside those of EPSG in GeoTIFF keys
-            crs = crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
-        return crs
+            return crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
+        return crs if on_earth else None
+
+    @property
+    def horizontal_m(self) -> float | None:
+        """Metres in the unit of x and y; None for angles, and if the unit is not known."""
+        if self.crs is not None:
+            return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
+        try:
+            units = self.units()
+        except (LidarError, ValueError):  # angles, or a text that is no WKT
+            return None
+        return None if units is None else units.horizontal.metres
 
     @property
     def angles(self) -> str:
@@ -268,11 +279,9 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
         return []
     if system.crs is not None and is_geocentric(system.crs):
         raise LidarError(f"it is in {system.name}, geocentric: {advice_to_project(None)}.")
-    try:
-        units = system.units()
-    except (LidarError, ValueError):  # angles, or a text that is no WKT
+    metre = system.horizontal_m
+    if metre is None:
         return [f"states the coordinate system {system.name!r}, and is taken in metres"]
-    metre = 1.0 if units is None else units.horizontal.metres
     scale = _scale_of(system, positions / metre)
     if scale.problem:
         raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
@@ -354,9 +363,7 @@ class Reprojection:
                 "--readers.las.override_srs=EPSG:CODE)."
             )
         source = system.crs
-        if source is None or not (
-            source.is_projected or source.is_geographic or is_geocentric(source)
-        ):
+        if source is None:
             raise LidarError(f"its coordinate system {system.name!r} is not known to PROJ.")
         target = crs_of_code(epsg)
         if target is None:
