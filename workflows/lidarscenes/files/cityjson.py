@@ -18,6 +18,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.vectors import matmul
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.files.coordinate_systems import (
@@ -323,7 +324,9 @@ class _CityFile:
         system.check(corners)
         if system.height_units != 1 and self._unit is None:
             matrix = np.diag([1.0, 1.0, system.height_units, 1.0])
-            self._placed = [node._replace(matrix=matrix @ node.matrix) for node in self._placed]
+            self._placed = [
+                node._replace(matrix=matmul(matrix, node.matrix)) for node in self._placed
+            ]
         content = placed_content(self._placed)
         content.unit_m = system.unit_m
         content.up_axis = "z"

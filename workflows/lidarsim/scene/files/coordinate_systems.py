@@ -215,7 +215,18 @@ def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
     longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps may cross the date line
     latitude = np.diff(degrees[:, 1])[::2]
     steps = np.stack([longitude * east_m, latitude * north_m]) / _GROUND_STEP_M
-    longest, shortest = np.linalg.svd(steps, compute_uv=False).tolist()
+    return _ellipse(steps)
+
+
+def _ellipse(steps: Floats) -> GroundScale:
+    """Return the half axes of Tissot's ellipse: the singular values of steps (2, 2)."""
+    squares = float((steps * steps).sum())
+    east, north = steps
+    difference = float((east * east).sum() - (north * north).sum())
+    product = 2 * float((east * north).sum())
+    spread = float(np.sqrt(difference * difference + product * product))
+    shortest = float(np.sqrt(max(squares - spread, 0.0) / 2))
+    longest = float(np.sqrt((squares + spread) / 2))
     return GroundScale(shortest, longest)
 
 
