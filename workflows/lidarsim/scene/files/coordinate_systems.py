@@ -341,7 +341,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
     are refused everywhere. Without rasterio, only these systems are known. `why_there` follows the
     coordinates in the message.
     """
-    if _is_utm(epsg) and abs(x - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M:
+    if is_utm(epsg) and is_true_in_utm(np.array([x])):
         return ""  # reading the registry takes half a second
     if not has_registry():
         return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
@@ -365,6 +365,11 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
     return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
 
 
-def _is_utm(epsg: int) -> bool:
+def is_utm(epsg: int) -> bool:
     """Return True for UTM zones of WGS 84, ETRS89 and NAD83."""
     return any(epsg in codes for codes in UTM_EPSG)
+
+
+def is_true_in_utm(eastings: Floats) -> bool:
+    """Return True if lengths at all eastings (n,) of a UTM zone, metres, are true."""
+    return bool((np.abs(eastings - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M).all())

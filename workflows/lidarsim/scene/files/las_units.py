@@ -194,6 +194,16 @@ def wkt_method(text: str) -> str:
     return ""
 
 
+def wkt_code(text: str) -> int | None:
+    """Return the EPSG code of the projected system in WKT, or None."""
+    _, parts = _systems(text)
+    for part in parts:
+        code = part.child({"AUTHORITY", "ID"}) if part.keyword in _HORIZONTAL else None
+        if code and len(code.values) > 1 and code.values[0].upper() == "EPSG":
+            return int(code.values[1]) if code.values[1].isdecimal() else None
+    return None
+
+
 def _systems(text: str) -> tuple[_Node, list[_Node]]:
     """Return the system in WKT, and its parts: horizontal and vertical, or the system alone."""
     node = _without_transformation(_parsed(text))

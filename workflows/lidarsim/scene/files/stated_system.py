@@ -23,7 +23,6 @@ from ...base.words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
     UNNAMED,
-    UTM_EPSG,
     crs_key,
     crs_name,
     crs_of_code,
@@ -32,6 +31,8 @@ from .coordinate_systems import (
     has_registry,
     horizontal_part,
     is_geocentric,
+    is_true_in_utm,
+    is_utm,
     need_registry,
     projection_kind,
     projjson,
@@ -52,6 +53,7 @@ from .las_units import (
     method_of_keys,
     units_of_epsg,
     units_of_keys,
+    wkt_code,
     wkt_method,
     wkt_units,
 )
@@ -116,10 +118,20 @@ class StatedSystem:
         return geo_keys(self.records)
 
     @cached_property
+    def _is_code(self) -> bool:
+        """Whether the text is a code alone."""
+        return _CODE.fullmatch(self.text) is not None
+
+    @cached_property
     def _code(self) -> int | None:
-        """EPSG code of the text or of the keys, if it is the code of a projected system."""
+        """EPSG code that the text or the keys state, of a projected system if they are no code."""
         if match := _CODE.fullmatch(self.text):
             return int(match[1])
+        if self.text:
+            try:
+                return wkt_code(self.text)
+            except ValueError:  # no WKT, which counts as metres where the user gives the unit
+                return None
         code = int(self._keys.get(PROJECTED_CRS, 0))
         return None if code in (0, USER_DEFINED) else code
 
@@ -135,7 +147,9 @@ class StatedSystem:
         """
         if not self.text:
             return units_of_keys(self._keys)
-        return wkt_units(self.text) if self._code is None else units_of_epsg(self._code)
+        if self._is_code and self._code is not None:
+            return units_of_epsg(self._code)
+        return wkt_units(self.text)
 
     @cached_property
     def crs(self) -> Any:
@@ -153,6 +167,11 @@ class StatedSystem:
         """Metres in the unit of x and y; None for angles, and if the unit is not known."""
         if self.crs is not None:
             return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
+        return self._stated_m
+
+    @property
+    def _stated_m(self) -> float | None:
+        """Metres in the unit of x and y by the text or keys themselves, or None."""
         try:
             units = self.units()
         except (LidarError, ValueError):  # angles, or a text that is no WKT
@@ -173,12 +192,12 @@ class StatedSystem:
         """Whether the projection is made for true lengths, by its code or name; None if unknown."""
         if self._code in WORLD_EPSG:
             return False
-        if self._code is not None and any(self._code in codes for codes in UTM_EPSG):
+        if self._code is not None and is_utm(self._code):
             return True
         if not self.text:
             method = method_of_keys(self._keys)
             has_projection = PROJECTED_CRS in self._keys
-        elif self._code is not None:
+        elif self._is_code:
             return None
         else:
             try:
@@ -187,6 +206,12 @@ class StatedSystem:
                 return None
             has_projection = bool(method)
         return projection_kind(method) if has_projection else True  # of a local system
+
+    def is_in_utm_zone(self, positions: Floats) -> bool:
+        """Return True for a UTM zone whose metres are true at all positions (n, 3)."""
+        if self._code is None or not is_utm(self._code) or self._stated_m != 1:
+            return False
+        return not len(positions) or is_true_in_utm(positions[:, 0])
 
     def height_m(self) -> tuple[float, str]:
         """Return the metres in the unit of heights, and a clause if the unit is not stated."""
@@ -296,12 +321,14 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
 
     Without rasterio, or where PROJ cannot tell, the name of the projection counts.
     """
+    middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
+    if system.is_in_utm_zone(positions):
+        return _Scale()  # without the registry, which takes half a second to load
     horizontal = None
     if system.crs is not None and not is_geocentric(system.crs):
         horizontal, _ = horizontal_part(system.crs)
     if horizontal is None or not len(positions):
         return _scale_by_name(system)
-    middle = np.median(positions[:, :2], axis=0)
     scale = ground_scale(horizontal, *middle.tolist())
     if scale is None:
         return _Scale() if horizontal.is_geographic else _scale_by_name(system)
