@@ -431,10 +431,10 @@ LOWEST = float(np.finfo(np.float32).min)
 @pytest.mark.parametrize(
     ("value", "options", "words"),
     [
-        (LOWEST, {}, "state it as its nodata, rio edit-info --nodata "),
+        (LOWEST, {}, "state it as its nodata (rio edit-info --nodata "),
         (-LOWEST, {}, "state it as its nodata"),
         (1e20, {}, "state it as its nodata"),
-        (LOWEST, {"nodata": -9999}, r"its nodata is -9999.0"),
+        (LOWEST, {"nodata": -9999}, "as its nodata, which is -9999.0 now"),
     ],
 )
 @pytest.mark.parametrize("step_m", [None, 4.0])

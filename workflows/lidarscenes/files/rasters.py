@@ -162,11 +162,11 @@ def _height_notes(
     if DRIVERS[path.suffix.lower()] == "GTiff":
         command = f"rio edit-info --nodata {value!r} {path.name}"
     stated = pixels.file.nodata
-    state = f"(its nodata is {float(stated)!r})" if stated is not None else "as its nodata"
+    state = "as its nodata" if stated is None else f"as its nodata, which is {float(stated)!r} now"
     if max(-lowest_m, highest_m) > MAX_COORDINATE_M:
         raise MeshFileError(
             f"has the value {value!r}, which is no height: if it stands for no data, state it "
-            f"{state}, {command}"
+            f"{state} ({command})"
         )
     return [
         f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m: if {value!r} stands for no data, "
