@@ -3,6 +3,7 @@
 import re
 from datetime import UTC, datetime
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -455,6 +456,38 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
+
+
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+@pytest.mark.parametrize(
+    ("epsg", "place", "words"),
+    [
+        (32632, [0, 0, 0], ""),
+        (2056, [2_600_000, 1_200_000, 400], ""),
+        (7415, [84_600, 447_000, 0], ""),
+        (3857, [0, 0, 0], r"Pseudo-Mercator\), for maps of the world"),
+        (3395, [1_000_000, 6_000_000, 0], "for maps of the world"),
+        (2056, [0, 0, 0], r"metre is 0\.983 m long at x 0, y 0, where the scene is \(translation"),
+        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true metres"),
+        (2263, [0, 0, 0], "which is not in metres"),
+        (4326, [8, 47, 0], "which is not in metres"),
+    ],
+)
+def test_the_coordinate_system_has_true_metres(tmp_path, epsg, place, words):
+    mesh_file(tmp_path / "hall.stl", (8, 6, 2), 2)
+    entries = [{"file": "hall.stl", "up_axis": "z", "translation": place}]
+    data = {"scene": {"files": entries}, "cloud": {"epsg": epsg}}
+    scenario = Scenario.from_data(data, folder=tmp_path)
+    if not words:
+        assert build(scenario).survey.epsg == epsg
+        return
+    with pytest.raises(
+        LidarError, match=rf"cloud\.epsg \(in Python epsg=\) is EPSG:{epsg}.*{words}"
+    ):
+        build(scenario)
+    if epsg == 2056:
+        with pytest.raises(LidarError, match="EPSG:2056"):
+            Job(Scene.seed(), Survey(poses=[(0, 0, 1)], epsg=epsg))
 
 
 WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in range(3)) + "]"

@@ -296,6 +296,13 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
         f"{path} has a map conversion, which is not applied: translation [691000.5, 5336000.25, "
         "500] and rotation_deg [0, 0, 90] move it into EPSG:25832"
     ]
+    system.Name = "EPSG:3857"
+    load_meshes(model.write(path), tell=notes.append)
+    if find_spec("rasterio") is not None:
+        assert "into EPSG:3857, whose metre is 0.72" in notes[1]
+        assert notes[1].endswith("long on the ground here, unlike that of the building")
+    system.Name = "EPSG:25832"
+    del notes[1]
     conversion.Scale = 1.0
     load_meshes(model.write(path), tell=notes.append)
     assert notes[1].endswith("into EPSG:25832 whose scale, 1000, does not fit its units")

@@ -128,11 +128,13 @@ def recorded_view(
     if first.is_cloud:
         cloud = _cloud_of(first)
         sweeps = None
+        notes += first.left_out_notes
     else:
         cloud, sweeps, further_notes = _sweeps_of(sensors)
         notes += further_notes
     if not len(cloud):
-        raise LidarError(f"{first.name} has no points.")
+        left_out = "".join(f" {note}." for note in first.left_out_notes)
+        raise LidarError(f"{first.name} has no points.{left_out}")
     names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
     return View(
         OrderedPoints(cloud), None, sweeps, " ".join(notes), title, downloads=downloads, names=names

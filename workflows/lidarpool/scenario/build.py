@@ -18,6 +18,7 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.coordinate_systems import target_problem
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
@@ -107,7 +108,8 @@ class Job:
     ------
     LidarError
         If a field has another type, the survey's precision is too fine for the scene, a
-        material is for no object, or an object lacks a material while others have one.
+        material is for no object, an object lacks a material while others have one, or the
+        survey's coordinate system is not in metres that are true where the scene is.
     """
 
     scene: Scene
@@ -139,6 +141,8 @@ class Job:
                 f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}"
                 f"{_outlier_advice(scene)}."
             )
+        if survey.epsg is not None:
+            check_epsg(survey.epsg, scene)
         warn_of_grey(scene, survey)
         warn_of_reach(scene, survey)
 
@@ -193,6 +197,8 @@ def build(
     shapes = Shapes(scenario, findings)
     epsg = _common_epsg(scenario, findings)
     with prefixed(scenario.source):  # errors begin with the scenario's name
+        if scenario.cloud.epsg is not None:
+            check_epsg(scenario.cloud.epsg, scene)
         track = _carrier_track(shapes, static.standing)
         sensors = _mounted_sensors(shapes)
     placing: Placing | None = None
@@ -332,6 +338,22 @@ def _build_traffic(
         # of the survey, by the clock of the carrier's trajectory
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
         return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
+
+
+def check_epsg(epsg: int, scene: Scene) -> None:
+    """Check that a coordinate system is in metres that are true where a scene is.
+
+    Raises
+    ------
+    LidarError
+        If lengths in the system are wrong by more than 1 % in the middle of the scene, or not in
+        metres. Without rasterio, only systems for maps of the world are refused.
+    """
+    lower, upper = scene.bounds + scene.origin
+    x, y, _ = ((lower + upper) / 2).tolist()
+    why_there = ", where the scene is (translation moves it)"
+    if problem := target_problem(epsg, x, y, why_there=why_there):
+        raise LidarError(f"cloud.epsg (in Python epsg=) is {problem}.")
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:

@@ -20,6 +20,7 @@ from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields, shown
+from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..base.words import listed, plural
 from ..columns.table import (
     COORDINATES,
@@ -366,6 +367,8 @@ class Survey(CloudOptions, Weather):
 
     def _check_values(self) -> None:
         """Check that options fit together and to the sensors."""
+        if self.epsg in WORLD_EPSG:
+            raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
         if self.navigation is not None:
             check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):

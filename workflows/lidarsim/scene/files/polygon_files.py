@@ -364,6 +364,7 @@ class _PlyHeader(NamedTuple):
     elements: list[_Element]
     order: str  # byte order, '' of text
     body: bytes
+    comments: list[str]  # texts of comment and obj_info
 
 
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -424,6 +425,11 @@ def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
 
 
+def ply_comments(data: bytes) -> list[str]:
+    """Return the comments of a Stanford polygon file, also of its lines obj_info."""
+    return _ply_header(data).comments
+
+
 def _ply_vertices(rows: _PlyRows) -> Floats:
     """Return the positions of vertices, (v, 3); ValueError if an axis is missing."""
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
@@ -438,6 +444,7 @@ def _ply_header(data: bytes) -> _PlyHeader:
     if not header_match:
         raise ValueError("no PLY header, or cut within it")
     elements: list[_Element] = []
+    comments: list[str] = []
     order = ""
     for line in (header_match[1] or b"").decode("latin-1").splitlines():
         match line.split():
@@ -451,11 +458,13 @@ def _ply_header(data: bytes) -> _PlyHeader:
                 elements[-1].properties[name] = _PLY_TYPES[kind], _PLY_TYPES[length]
             case ["property", kind, name]:
                 elements[-1].properties[name] = _PLY_TYPES[kind], ""
-            case [] | ["comment" | "obj_info", *_]:
+            case [] | ["comment" | "obj_info"]:
                 pass
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
             case _:
                 raise ValueError(f"'{line[:60]}' is not a line of a PLY header")
-    return _PlyHeader(elements, order, data[header_match.end() :])
+    return _PlyHeader(elements, order, data[header_match.end() :], comments)
 
 
 def _ply_rows(header: _PlyHeader) -> _PlyRows:
@@ -464,7 +473,7 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
     Text is read in double precision, whatever type its header states: georeferenced vertices are
     often declared `float` and have more digits.
     """
-    elements, order, body = header
+    elements, order, body, _ = header
     if not order:
         words = np.array(list(map(float, body.split())))
         body = words.tobytes()
