@@ -4,7 +4,11 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow sample compat chaos soak lint docs format bench clean dev
+.PHONY: help demo test test-all durations slow compat chaos soak lint docs format bench clean dev
+
+# Where Python may not write what it has compiled, as in containers, each of the many processes of a
+# run or of the tests would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -23,18 +27,22 @@ demo:  ## the default survey, then a drive through a city; results in $(OUT)/ an
 	@echo "and scan a mesh of yours:  $(BIN)/lidarpool run YOUR.glb --out $(OUT)/yours"
 
 # Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
-# file stay together, for they share clusters; files come in the order of testpaths.
-PARALLEL := -n 3 --dist loadfile --no-loadscope-reorder
+# file stay together, for they share clusters; tests/conftest.py puts the longest files first.
+PYTEST := $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-test: dev  ## run the test suite
-	$(BIN)/python -m pytest $(PARALLEL) $(MORE)
+test: dev  ## one test of each kind of behaviour: five minutes
+	$(TIMED) $(PYTEST) $(MORE)
 
-slow: dev  ## the tests that take minutes, which `test` leaves out
+test-all: dev  ## all tests but the slow ones: what CI runs
+	$(PYTEST) -m "not slow" $(MORE)
+
+durations: dev  ## seconds of each file of tests, into tests/durations.json; on a quiet machine
+	$(PYTEST) -m "not slow" --junitxml=build/junit.xml
+	$(BIN)/python .ci/durations.py build/junit.xml >tests/durations.json
+
+slow: dev  ## the tests that take minutes
 	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
-
-sample: dev  ## of the slow tests, one of each kind
-	$(BIN)/python -m pytest -m sample -n 2 --dist loadfile  # a browser draws with the processor
 
 compat:  ## the tests with the oldest and the newest versions allowed, on three Pythons
 	@sh .ci/compat

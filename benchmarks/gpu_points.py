@@ -91,7 +91,7 @@ def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
     """Measure the device times of kernels and of copies of columns while the body runs."""
     split = Split(cupy)
-    engine = rig.scene_caster.caster.engine
+    engine = rig.scene_casters[0].caster.engine
     run = engine._run  # type: ignore[attr-defined]
     kernel = lidarsim.simulator.device._kernel
     send = Outbox.send
@@ -131,7 +131,7 @@ def columns(session: Session) -> Rows:
         row = time_batches(rig, rays, 3 * sizes.seconds)
         row["bus_share"] = row["mpoints_s"] * row["bytes_a_point"] / 1e3 / bus
         yield name, row
-    engine: Any = rig.scene_caster.caster.engine
+    engine: Any = rig.scene_casters[0].caster.engine
     for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
         with patch.object(engine, "chunk", chunk):
             yield f"chunks of {chunk:,} rays", time_batches(rig, sizes.batch, sizes.seconds)

@@ -1,13 +1,15 @@
 """What all tests start from."""
 
 import gc
+import json
 import logging
 import os
 import signal
 import sys
 import types
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -82,19 +84,38 @@ else:
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "patient"))
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as slow the rows of tests with `every_nth(n)`, but for the first, the n-th after it, …
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> Generator[None, None, None]:
+    """Choose tests by their marks, and put the files that take longest first.
 
-    Of a product of parameters, each value is met if their numbers have no factor of `n`.
+    Processes share the files in this order, so that none is left with a long one in the end.
     """
-    counts: Counter[str] = Counter()
+    _leave_out_rows(items)
+    yield  # pytest leaves out what `-m` does not ask for
+    durations = json.loads((Path(__file__).parent / "durations.json").read_text())
+    seconds: Counter[Path] = Counter()
     for item in items:
-        if mark := item.get_closest_marker("every_nth"):
-            test = item.nodeid.partition("[")[0]
-            if counts[test] % mark.args[0]:
-                item.add_marker(pytest.mark.slow)
-            counts[test] += 1
+        tests = durations.get(item.nodeid.partition("::")[0], {})
+        seconds[item.path] += tests.get(getattr(item, "originalname", item.name), 0.02)
+    items.sort(key=lambda item: -seconds[item.path])
+
+
+def _leave_out_rows(items: list[pytest.Item]) -> None:
+    """Take the marks `extended` and `slow` from the rows that the marks say to keep.
+
+    `keep` has the ids of rows, with wildcards; `every=n` keeps the first of each n rows. If values
+    of several parameters are multiplied, no number of values should have a factor of `n`.
+    """
+    counts: Counter[tuple[str, str]] = Counter()
+    for item in items:
+        test, _, row = item.nodeid.partition("[")
+        for mark in [mark for mark in item.own_markers if mark.name in ("extended", "slow")]:
+            kept = any(fnmatchcase(row[:-1], pattern) for pattern in mark.kwargs.get("keep", ()))
+            if every := mark.kwargs.get("every"):
+                kept |= counts[test, mark.name] % every == 0
+                counts[test, mark.name] += 1
+            if kept:
+                item.own_markers.remove(mark)
 
 
 def pytest_collection_finish() -> None:

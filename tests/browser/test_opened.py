@@ -122,7 +122,9 @@ def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new
         pytest.skip("needs laspy")
     monkeypatch.setattr(recorded, "LARGE_POINTS", 1000)
     is_drawn = threading.Event()
-    monkeypatch.setattr(opened, "open_view", lambda path: is_drawn.wait(120) and open_view(path))
+    monkeypatch.setattr(
+        opened, "open_view", lambda path, **_: is_drawn.wait(120) and open_view(path)
+    )
     view = growing_view(place_of(kinds, "las"))
     with page_server(view.answer, port=0) as page:
         tab = new_tab(page.url)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from tests.rows import quick
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,7 +38,9 @@ def site(tmp_path):
     return tmp_path / "site"
 
 
-@pytest.mark.parametrize("page", quick(("deep/sweeps.html",), ("index.html", "deep/sweeps.html")))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("deep/sweeps.html",))
+@pytest.mark.parametrize("page", ("index.html", "deep/sweeps.html"))
 def test_search_works_from_disk_and_asks_no_network(site, new_tab, page):
     tab = new_tab((site / page).as_uri())
     tab.wait_for(lambda text: tab.value("document.readyState") == "complete" and "Overview" in text)

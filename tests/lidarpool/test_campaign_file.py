@@ -132,6 +132,7 @@ def test_each_kind_of_choice_comes_to_where_its_path_leads(campaign):
     assert each[8][:6] == (1, 7, 19, 1, 7, 19)
 
 
+@pytest.mark.extended
 def test_numbers_are_distributed_as_they_say():
     draw = JobRandom(1, 2, "test")
     count = 4000
@@ -551,6 +552,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 
+@pytest.mark.extended
 def test_a_grid_that_is_too_large(campaign):
     many = {"each": list(range(1, 1001))}
     vary = {"steps": many, "planning.seed": many, "noise.seed": many}

@@ -99,6 +99,7 @@ def test_card_says_how_to_read_and_repeat(card):
     assert all((folder / path).is_file() for path in pictures)
 
 
+@pytest.mark.extended
 def test_classes_have_their_names(tmp_path):
     place = Storage.at(tmp_path, durable=False)
     write(place, [row(1, classes={0: 5, 6: 10, 7: 20})], classes={6: "building & yard", 9: "water"})
@@ -121,6 +122,7 @@ def test_page_shows_what_failed_and_why(card):
     assert "campaign.yaml --retry-failed" in page
 
 
+@pytest.mark.extended
 def test_same_jobs_make_the_same_files(card, tmp_path):
     folder, report = card
     other = [*ROWS[:-1], row(29, sha256="f" * 64)]
@@ -130,6 +132,7 @@ def test_same_jobs_make_the_same_files(card, tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
 
 
+@pytest.mark.extended
 def test_letters_of_users_are_escaped(tmp_path):
     names = (EVIL, "a")
     rows = [
@@ -150,6 +153,7 @@ def test_letters_of_users_are_escaped(tmp_path):
     assert "[a](b)" not in card.replace(r"\[", "").replace(r"\]", "")
 
 
+@pytest.mark.extended(every=9)
 @pytest.mark.parametrize(
     "rows",
     [
@@ -176,6 +180,7 @@ def test_any_jobs_have_a_card(tmp_path, rows):
     assert all((tmp_path / path).is_file() for path in re.findall(r"\((pictures/.*?)\)", text))
 
 
+@pytest.mark.extended
 def test_an_earlier_report_goes_first(tmp_path):
     """What has a report.json is complete."""
 

@@ -187,6 +187,7 @@ def test_nuscenes_has_labels_and_categories(saved, sweeps):
     assert "lidarseg" not in tables and "index" not in tables["category"][0]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", DATA_SETS)
 def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
     data = DataSet(Storage.at(tmp_path), name)

@@ -118,6 +118,7 @@ def test_examples_are_enough_for_a_survey(name):
     ClusterFile.load(EXAMPLES / name).require({"GPU": 1, "LIDAR": 4, "OTHER": 1})
 
 
+@pytest.mark.extended
 def test_a_file_leaves_interrupts_to_the_program():
     import_jobqueue()
     script = """

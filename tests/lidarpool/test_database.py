@@ -250,6 +250,7 @@ def test_a_job_that_is_restarted_has_nothing(db, job):
     again.close()
 
 
+@pytest.mark.extended
 def test_thousands_of_jobs_take_little_memory_and_time(db):
     db.end_jobs((number, number % 1000 == 0, {"points": number}) for number in range(50_000))
     again = reopened(db)

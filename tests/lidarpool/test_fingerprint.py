@@ -97,6 +97,7 @@ content = st.recursive(
 )  # fmt: skip
 
 
+@pytest.mark.extended
 @settings(max_examples=50)
 @given(content)
 def test_whatever_is_plain_has_one_that_lasts(thing):
@@ -236,6 +237,7 @@ def asked(folder: Path) -> str:
     ).stdout.strip()
 
 
+@pytest.mark.extended
 def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_not(packages):
     ours = sources()
     assert asked(packages) == ours
@@ -245,6 +247,7 @@ def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_n
     assert asked(packages) not in ("", ours)
 
 
+@pytest.mark.extended
 def test_a_process_older_than_its_files_does_not_speak_for_them(packages):
     late = time.time() + 3600
     os.utime(packages / "lidarsim" / "simulator" / "returns.py", (late, late))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
-from tests.rows import quick
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
 from lidarpool.compare.fit import Estimate, _with_performance
@@ -48,6 +47,7 @@ def test_intervals_hold_what_was_put_in():
     assert len(held) > 45 and np.mean(held) > 0.85
 
 
+@pytest.mark.extended
 def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
     written = fitted.save(tmp_path / "mine.yaml")
     assert [path.name for path in written] == ["mine.yaml", "mine.html"]
@@ -74,6 +74,7 @@ def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
     assert "unknown: detection_range_m" in text and "range_per_m" in text
 
 
+@pytest.mark.extended
 def test_noise_by_energy_is_in_the_file(tmp_path):
     truth = {"range_m": 0.015, "range_at_threshold_m": 0.07, "detection_range_m": 10}
     made = fit(recorded(Noise(**truth, dropout=0.01, angle_deg=0.05, seed=1)))
@@ -82,6 +83,7 @@ def test_noise_by_energy_is_in_the_file(tmp_path):
         assert getattr(noise, name) == pytest.approx(true, rel=0.1), name
 
 
+@pytest.mark.extended
 def test_a_model_keeps_what_the_recording_does_not_tell(recording):
     flat = fit(recording, model="ouster/os1-64")
     stated = flat.model.performance
@@ -102,6 +104,7 @@ def test_range_noise_of_a_model_stays_if_none_was_fitted():
     assert fitted.detection == model.performance.detection
 
 
+@pytest.mark.extended
 def test_bias_of_channels_against_planes_and_against_the_scene():
     bias = 0.005 * (-1.0) ** np.arange(16)
     made = recorded(Noise(range_m=0.01, seed=2), bias)
@@ -120,6 +123,7 @@ def test_bias_of_channels_against_planes_and_against_the_scene():
         fit(made, scene=street(), pose=(3, 1, 0))
 
 
+@pytest.mark.extended
 def test_beams_that_begin_beside_zero_bias_no_ring():
     sensor = load_sensor("ouster/os1-32", columns=512)
     quiet = {"noise": Noise(range_m=0.003), "precision_m": 1e-4, "coordinates": "sensor"}
@@ -208,6 +212,7 @@ def test_points_that_are_not_in_metres_are_refused(recording):
         fit(replace(recording, read=scaled))
 
 
+@pytest.mark.extended
 def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
     """Sweeps without lost pulses, in which packets are missing and every third is cut."""
     whole = recorded(replace(NOISE, dropout=0.0))
@@ -302,6 +307,7 @@ def test_what_a_single_sweep_covers_tells_no_false_alarms(recording):
     assert "false_alarms" not in figures
 
 
+@pytest.mark.extended
 def test_points_on_the_sensors_cover_tell_nothing(recording):
     """Half of the pulses of four rings return from 1 cm, and are brighter than all others."""
 
@@ -318,6 +324,7 @@ def test_points_on_the_sensors_cover_tell_nothing(recording):
     assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
 
 
+@pytest.mark.extended
 def test_ranges_that_drift_are_refused():
     """3 mm a sweep, less than their noise, as of a sensor that warms up; no motion explains it."""
     steady = recorded(Noise(range_m=0.006, angle_deg=0.02, dropout=0.02, seed=3))
@@ -332,6 +339,7 @@ def test_ranges_that_drift_are_refused():
         fit(replace(steady, read=longer))
 
 
+@pytest.mark.extended
 def test_rings_that_meet_surfaces_steeply_have_no_bias(recording):
     """The ground alone, at 70° to 80°."""
 
@@ -345,6 +353,7 @@ def test_rings_that_meet_surfaces_steeply_have_no_bias(recording):
     assert fitted.figures["figures"]["dropout"]["value"] == pytest.approx(0.02, rel=0.2)
 
 
+@pytest.mark.extended
 def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     """Things beside the walls of this hall tilt the planes that are found."""
     truth, fitted = trial(30, place_name="hall")
@@ -356,7 +365,9 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.parametrize("where", quick(("street", "forest"), PLACES))
+@pytest.mark.extended(keep=("street",))
+@pytest.mark.slow(keep=("street", "forest"))
+@pytest.mark.parametrize("where", PLACES)
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
     """Two recordings of a place each; fidelity.md has 40."""
     for number in (PLACES.index(where), PLACES.index(where) + 4):
@@ -368,6 +379,7 @@ def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
                 assert abs(fitted[name]["value"] - true) < 2 * half, (number, name)
 
 
+@pytest.mark.extended
 def test_where_only_the_ground_is_smooth_noise_is_not_determined():
     noise = Noise(range_m=0.02, range_per_m=0.0005, angle_deg=0.1, dropout=0.02, seed=3)
     scene, at = place("forest", 3)
@@ -377,6 +389,7 @@ def test_where_only_the_ground_is_smooth_noise_is_not_determined():
     assert figures.figures["figures"]["dropout"]["value"] == pytest.approx(0.02, rel=0.3)
 
 
+@pytest.mark.extended
 def test_intensities_of_unknown_scale_need_the_white_one():
     made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energies=False)
     found = fit(made)

@@ -125,7 +125,7 @@ def xyz_of(rows):
     return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("model", SPINNING)
 @pytest.mark.parametrize("layout", ["velodyne", "images", "autoware", "ouster"])
 def test_bags_hold_what_a_driver_publishes(tmp_path, layout, model):
@@ -366,7 +366,7 @@ def test_compensated_formats_are_so_whatever_the_clouds_frame(tmp_path, name, co
             path = tmp_path / f"out/sequences/00/velodyne/{sweep:06}.bin"
             placed = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
         elif name == "nuscenes":
-            (path,) = (tmp_path / "out").glob(f"s*/lidar/{sweep:06}.pcd.bin")
+            (path,) = (tmp_path / "out").glob(f"samples/LIDAR_TOP/{sweep:06}.pcd.bin")
             placed = np.fromfile(path, "<f4").reshape(-1, 5)[:, :3]
         else:
             with pye57.E57(str(tmp_path / "out")) as file:
@@ -431,7 +431,8 @@ def vectors_of(fields, prefix=""):
     return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=18)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("format_name", ["pcd", "mcap"])
@@ -542,6 +543,7 @@ def across_deg(survey, positions, time_ns):
     return np.degrees(np.arctan2((rays * right).sum(axis=1), -rays[:, 2]))
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("head", AIRBORNE)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, coordinates):
@@ -560,6 +562,7 @@ def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, 
     assert ("world" if coordinates == "world" else "firing of each") in str(frame.record_data)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("chunk", [700, 1_000_000])
 @pytest.mark.parametrize(("head", "lines_s"), [("sine", 80), ("polygon", 50)])
 def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, lines_s, chunk):

@@ -54,6 +54,7 @@ def counted(counts):
     return [counts.limits, counts.density, counts.no_surface, *(a.tolist() for a in arrays)]
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("first_points", [3, 65_536])
 @pytest.mark.parametrize("parts", [PARTS, MANY, FEW])
 @pytest.mark.parametrize("order", ["sorted", "reversed", "shuffled"])

@@ -122,6 +122,7 @@ def made(tmp_path_factory):
     return make
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", SURVEYS)
 def test_each_ray_that_was_fired_is_there_once(made, name):
     cloud, sweeps, images = made(name)
@@ -137,6 +138,7 @@ def test_each_ray_that_was_fired_is_there_once(made, name):
     assert 0 < silent == survey.ray_count - len(pulses) < survey.ray_count
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", SURVEYS)
 def test_images_have_the_values_of_the_cloud(made, name):
     """Each value is found by the scan, the firing and the channel of its ray."""

@@ -102,6 +102,7 @@ def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     assert len(live.cloud) == 10
 
 
+@pytest.mark.extended
 def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
     job = make_job(100)
     first = RunStore(job, location=tmp_path / "run")
@@ -209,6 +210,7 @@ def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_
     assert "sweep_scans" in ask(live.page.url, "state")["arrays"]
 
 
+@pytest.mark.extended
 def test_a_run_brings_no_page_and_no_pictures_before_it_needs_them():
     """Matplotlib takes a second."""
     code = "import sys, lidarpool.cli.run_command; print(*sys.modules, sep='\\n')"
@@ -303,6 +305,7 @@ def test_busy_slots_are_a_share_over_the_last_seconds():
     assert busy_slots([(0.0, load(0, 0, 0))])[0][1:] == [0.0, 0]
 
 
+@pytest.mark.extended
 def test_a_campaign_is_watched_to_its_end(tmp_path):
     states = set()
     with (

@@ -51,6 +51,7 @@ def gymnasium(monkeypatch):
         monkeypatch.setitem(sys.modules, "gymnasium", stand_in)
 
 
+@pytest.mark.extended
 @pytest.mark.usefixtures("gymnasium")
 def test_a_robot_reaches_its_goal_by_its_ranges(capsys):
     runpy.run_path(str(EXAMPLES / "robot_env.py"), run_name="__main__")
@@ -72,6 +73,7 @@ def test_a_robot_of_mujoco_scans_while_balls_fall(tmp_path, monkeypatch, capsys)
     assert (tmp_path / "balls.ply").exists()
 
 
+@pytest.mark.extended
 def test_robots_of_a_vector_environment_avoid_columns(capsys):
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
     pytest.importorskip("gymnasium", reason="Gymnasium is not installed: pip install gymnasium")

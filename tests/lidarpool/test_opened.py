@@ -143,6 +143,7 @@ def growth_of(view):
         time.sleep(0.01)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["cloud.las", "cloud.laz"])
 def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypatch, name, tmp_path):
     folder, cloud, _ = exported

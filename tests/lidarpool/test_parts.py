@@ -202,6 +202,7 @@ def test_a_notebook_shows_stored_points_as_it_shows_points_in_memory(tmp_path):
     assert shown.replace("StoredCloud", "Cloud") == cloud.load()._repr_html_()
 
 
+@pytest.mark.extended
 @settings(max_examples=40)
 @given(counts_of_parts, st.integers(1, 30))
 def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, points):

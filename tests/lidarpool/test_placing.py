@@ -57,6 +57,7 @@ OBJECTS = {
 }
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("name", "far"), [*((name, 0.0) for name in OBJECTS), ("casing", 4_000_000.0)]
 )
@@ -92,6 +93,7 @@ LONG = creation.cylinder(0.01, 6.0)
 LONG.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     ("mesh", "points", "rays"),
     [
@@ -169,6 +171,7 @@ def flipped(scene):
     return Scene(scene.vertices, scene.faces[:, ::-1], scene.face_object, scene.names, scene.origin)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", PLACES)
 def test_in_a_place_the_sensor_stands_in_the_middle(name):
     scene = PLACES[name]()
@@ -179,6 +182,7 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
     assert ("only the backs" in placed.note) == (name == "box hall")
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("species", SPECIES, ids=lambda species: species.name)
 def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
     alone = tree(species)

@@ -39,6 +39,7 @@ scene = st.lists(
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=8, derandomize=True)
 @given(discs=scene)
 def test_random_scenes(discs):
@@ -94,6 +95,7 @@ def test_a_trial_does_not_claim_a_path_that_collides():
     assert any(-0.5 < room < 0 for room in rooms)
 
 
+@pytest.mark.extended
 def test_another_process_without_wide_vector_instructions_gives_the_same_bits():
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     script = (

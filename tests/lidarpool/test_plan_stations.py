@@ -43,6 +43,7 @@ def areas(plan, scene):
     }
 
 
+@pytest.mark.extended
 def test_a_hall_with_a_column_and_a_door():
     column = placed("Column", (0.6, 0.6, 3), (3, 0, 0))
     scene = Scene.from_meshes([*rooms((0, -3, -0.5), (0, 0.5, 3)), column])
@@ -79,12 +80,14 @@ def test_what_is_inside_closed_things_or_under_them_does_not_count():
     assert not (np.abs(within - 5) < 1).all(axis=1).all()
 
 
+@pytest.mark.extended
 def test_each_side_of_a_thin_wall_counts_by_itself():
     scene = Scene.from_meshes([*rooms(), wall("Sheet", 2, (-3, 3), (0, 3))])
     plan = plan_stations(scene, EVERYWHERE, count=1, slant_deg=90)
     assert areas(plan, scene)["Sheet"] == pytest.approx((36, 18), rel=0.02)
 
 
+@pytest.mark.extended
 def test_a_hall_may_be_modelled_by_its_outside_alone():
     scene = Scene.from_meshes([box("Hall", (8, 6, 3)), placed("Case", (1, 1, 2.5), (2.1, 1.1, 0))])
     plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
@@ -93,6 +96,7 @@ def test_a_hall_may_be_modelled_by_its_outside_alone():
     assert (np.abs(plan.candidates[:, :2] - (2.1, 1.1)).max(axis=1) > 0.5).all()
 
 
+@pytest.mark.extended
 def test_range_field_of_view_and_slant_limit_what_is_seen():
     far = placed("Far", (2, 2, 5), (60, 0, 0))
     scene = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2)), far])

@@ -134,6 +134,23 @@ def test_a_sensor_in_the_body_of_an_actor(tmp_path):
     assert warning.startswith("the sensor is inside Car 1 at (")
 
 
+def test_a_housing_that_a_sensor_does_not_see_is_no_fault(tmp_path):
+    """Of the scene or of an actor, for the sensor that does not see it alone."""
+    at_car = {"poses": [[0, 20, 1]]}
+    [warning] = warnings_of(tmp_path, TOWN, **at_car)
+    assert "if it is the sensor's housing, give its name as unseen of the sensor" in warning
+    assert warnings_of(tmp_path, TOWN, **at_car, sensor={"unseen": ["Car"]}) == []
+    sensors = {"one": {"unseen": "Car"}, "other": {"mount": [0, 0, 0.1]}}
+    [warning] = warnings_of(tmp_path, TOWN, **at_car, sensors=sensors)
+    assert " at 1 of 2 positions that were tried, first at (0.000, 20.000, 1.100)" in warning
+    points = [{"time_s": 0, "position": [-20, 5, 0]}, {"time_s": 4, "position": [20, 5, 0]}]
+    drive = {"trajectory": {"points": points}, "steps": 36, "mount": [0, 0, 0.8]}
+    drive["actors"] = [{"name": "Robot", "box": [4.5, 1.8, 1.5]}]
+    [warning] = warnings_of(tmp_path, TOWN, **drive)
+    assert "or give the name as unseen of the sensor" in warning
+    assert warnings_of(tmp_path, TOWN, **drive, sensor={"unseen": ["Rob*"]}) == []
+
+
 @pytest.mark.parametrize("sensor", [{}, {"sensor": "velodyne/vlp16"}], ids=["grid", "vlp16"])
 def test_noise_above_a_tenth_of_the_range(tmp_path, sensor):
     poses = {"poses": [[0, 0, 2]]}
@@ -183,6 +200,7 @@ CIRCLE = (
 TURNING = np.tile([0.0, 5, 2], (len(TIMES), 1)), TIMES / 3
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("path", [STRAIGHT, CIRCLE, TURNING], ids=["line", "circle", "standing"])
 def test_quaternions_in_another_order(tmp_path, path):
     positions, yaw = path
@@ -225,6 +243,7 @@ def with_city(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     "name",
     [

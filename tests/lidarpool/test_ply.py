@@ -199,6 +199,7 @@ def test_a_pipe_is_refused_instead_of_waited_for(tmp_path):
         read_cloud(tmp_path / "cloud.ply")
 
 
+@pytest.mark.extended
 def test_it_comes_without_its_viewers_and_whole_to_whoever_imports_it():
     """Dash and Plotly take longer to import than all that writing needs.
 

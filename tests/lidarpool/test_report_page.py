@@ -364,6 +364,7 @@ def test_without_planning(write):
     assert "The path" not in text and "swarm" not in text and text.count(" hidden>") == 1
 
 
+@pytest.mark.extended
 def test_the_scenario_on_the_page_is_the_scenario(write):
     scenario = Scenario.from_data(
         {

@@ -192,6 +192,7 @@ def test_fields_of_several_numbers_and_of_the_same_name():
         point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("layout", "model", "mode"),
     [
@@ -248,6 +249,7 @@ def test_a_column_of_an_organized_ouster_looks_in_one_direction(tmp_path):
     assert (column[returned] == np.broadcast_to(np.arange(1024), column.shape)[returned]).all()
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     ("layout", "organized"),
     [

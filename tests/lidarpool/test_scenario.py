@@ -3,6 +3,7 @@
 import re
 from datetime import UTC, datetime
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
-from lidarpool import Scene
+from lidarpool import Pose, Scene, SceneInstance
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.actors import box
 from lidarsim.sensor import Noise, Returns, Sensor, Survey
 from lidarsim.sensor.materials import MaterialTable, SurfaceKinds
 
@@ -293,6 +295,13 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     assert advice(build(scenario("output: {write: [laz, kitti]}"))) == []
 
 
+def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
+    sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
+    (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, kitti]}")))
+    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
+    assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
+
+
 @pytest.mark.parametrize(
     ("idle", "used"),
     [
@@ -449,6 +458,38 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
 
 
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+@pytest.mark.parametrize(
+    ("epsg", "place", "words"),
+    [
+        (32632, [0, 0, 0], ""),
+        (2056, [2_600_000, 1_200_000, 400], ""),
+        (7415, [84_600, 447_000, 0], ""),
+        (3857, [0, 0, 0], r"Pseudo-Mercator\), for maps of the world"),
+        (3395, [1_000_000, 6_000_000, 0], "for maps of the world"),
+        (2056, [0, 0, 0], r"metre is 0\.983 m long at x 0, y 0, where the scene is \(translation"),
+        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true metres"),
+        (2263, [0, 0, 0], "which is not in metres"),
+        (4326, [8, 47, 0], "which is not in metres"),
+    ],
+)
+def test_the_coordinate_system_has_true_metres(tmp_path, epsg, place, words):
+    mesh_file(tmp_path / "hall.stl", (8, 6, 2), 2)
+    entries = [{"file": "hall.stl", "up_axis": "z", "translation": place}]
+    data = {"scene": {"files": entries}, "cloud": {"epsg": epsg}}
+    scenario = Scenario.from_data(data, folder=tmp_path)
+    if not words:
+        assert build(scenario).survey.epsg == epsg
+        return
+    with pytest.raises(
+        LidarError, match=rf"cloud\.epsg \(in Python epsg=\) is EPSG:{epsg}.*{words}"
+    ):
+        build(scenario)
+    if epsg == 2056:
+        with pytest.raises(LidarError, match="EPSG:2056"):
+            Job(Scene.seed(), Survey(poses=[(0, 0, 1)], epsg=epsg))
+
+
 WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in range(3)) + "]"
 
 
@@ -466,6 +507,17 @@ def test_what_would_disappoint_is_in_the_advice(scenario, text, words):
     assert words in " ".join(advice(build(scenario(text))))
     calm = text.replace("red", "range").replace("linear", "smooth")
     assert words not in " ".join(advice(build(scenario(calm))))
+
+
+def test_an_object_far_from_all_others_is_named_where_points_would_be_too_coarse():
+    meshes = [box(name, (1, 1, 1)) for name in ("one", "two", "three")]
+    fallen = SceneInstance(box("fallen", (1, 1, 1)), Pose((0, 0, -7e7)))
+    survey = Survey(poses=[(0, 0, 1)], precision_m=0.001)
+    message = "use at least 0.018, or leave out 'fallen', which is far from all else."
+    with pytest.raises(LidarError, match=re.escape(message)):
+        Job(Scene.from_meshes([*meshes, fallen]), survey)
+    with pytest.raises(LidarError, match=r"use at least 0.018\.$"):
+        Job(Scene.from_meshes([fallen, meshes[0]]), survey)
 
 
 def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):

@@ -189,6 +189,7 @@ def test_every_field_is_in_it_with_a_comment_of_its_own():
     assert max(map(len, TEXT.splitlines())) <= 100
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     "line", [line for line in TEXT.splitlines() if OFF.match(line) and "$schema" not in line]
 )

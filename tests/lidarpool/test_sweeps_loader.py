@@ -20,7 +20,6 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from tests.daemons import wait_until
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
-from tests.rows import quick
 
 import lidarpool
 from lidarpool import LidarError, Scene, Sweep
@@ -63,6 +62,7 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
     return sweep.job_number, sweep.sensor, sweep.number
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     "name", [*DATA_SETS, *(f"mcap-{layout}" for layout in LAYOUTS if layout != "velodyne")]
 )
@@ -117,6 +117,7 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         data[len(data)]
 
 
+@pytest.mark.extended(every=7)
 @pytest.mark.parametrize("name", DATA_SETS)
 def test_the_order_follows_from_the_seed(written, name):
     place = written(name)
@@ -226,7 +227,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "file"),
     [
-        ("nuscenes", "samples/front/00/000000.pcd.bin"),
+        ("nuscenes", "samples/LIDAR_TOP/00/000000.pcd.bin"),
         ("webdataset", "shards/train/00-000000.tar"),
         ("parquet", "points/job=0/part-00000.parquet"),
         ("mcap", "bags/00.mcap"),
@@ -250,7 +251,8 @@ def _read(data: Any, queue: Any) -> None:
     queue.put([(identity(sweep), float(sweep.points.sum())) for sweep in data])
 
 
-@pytest.mark.parametrize("name", quick(("kitti", "mcap"), DATA_SETS))
+@pytest.mark.slow(keep=("kitti", "mcap"))
+@pytest.mark.parametrize("name", DATA_SETS)
 def test_threads_and_forks_read_beside_each_other(written, name):
     data = lidarpool.sweeps(written(name), shuffle=2)
     alone = [(identity(sweep), float(sweep.points.sum())) for sweep in data]

@@ -1,6 +1,7 @@
 """CityJSON: the finest geometry of each object, once, with its name, place, colour and class."""
 
 import json
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tests.meshes import NESTED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import triangle_areas
@@ -215,6 +217,58 @@ def test_reference_systems(tmp_path):
     ):
         with pytest.raises(LidarError, match="in degrees"):
             load(tmp_path, city({"a": thing(geometry())}, **more))
+
+
+def placed(x, y, reference, scale=(0.001, 0.001, 0.001), **more):
+    metadata = {"referenceSystem": reference}
+    transform = {"scale": scale, "translate": [x, y, 0]}
+    return city({"a": thing(geometry())}, metadata=metadata, transform=transform, **more)
+
+
+URN = "urn:ogc:def:crs:EPSG::"
+URL = "https://www.opengis.net/def/crs/EPSG/0/"
+
+
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+@pytest.mark.parametrize(
+    ("reference", "words"),
+    [
+        (URN + "3857", r"is in EPSG:3857, whose metre is 0\.678 m long.*crs_reproject 32632 save"),
+        (URL + "3857", r"EPSG:3857.*crs_reproject 32632"),
+        (URL + "3395", r"EPSG:3395.*crs_reproject 32632"),
+        ("https://www.opengis.net/def/crs/ESRI/0/102100", r"ESRI:102100, whose metre.* 32632"),
+        ("urn:ogc:def:crs,crs:EPSG::3857,crs:EPSG::5773", r"EPSG:3857, whose metre.* 32632 save"),
+        (URN + "4978", r"in degrees \(EPSG:4978\)|geocentric"),
+        ("http://www.opengis.net/def/crs/OGC/1.3/CRS84", "in degrees"),
+    ],
+)
+def test_systems_without_true_metres_are_refused(tmp_path, reference, words):
+    with pytest.raises(LidarError, match=words):
+        load(tmp_path, placed(1e6, 6e6, reference))
+
+
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+def test_feet_of_a_system_are_converted(tmp_path):
+    notes = []
+    (cube,) = load(tmp_path, placed(984_250, 200_000, URN + "2263", (1, 1, 1)), notes)
+    foot_m = 1200 / 3937
+    np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), 2 * foot_m)
+    np.testing.assert_allclose(cube.bounds[0, :2], [984_250 * foot_m, 200_000 * foot_m])
+    assert any("is in EPSG:2263" in note and "was converted to metres" in note for note in notes)
+    heights_in_metres = "urn:ogc:def:crs,crs:EPSG::2263,crs:EPSG::5703"
+    (cube,) = load(tmp_path, placed(984_250, 200_000, heights_in_metres, (1, 1, 1)))
+    np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), [2 * foot_m, 2 * foot_m, 2])
+    (cube,) = load(tmp_path, placed(984_250, 200_000, URN + "2263", (1, 1, 1)), unit="ft")
+    np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), 2 * 0.3048)
+
+
+def test_without_rasterio_systems_of_the_world_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
+    with pytest.raises(LidarError, match="EPSG:3857, whose metres are not true to scale"):
+        load(tmp_path, placed(1e6, 6e6, URN + "3857"))
+    notes = []
+    load(tmp_path, placed(84_600, 447_000, URN + "7415"), notes)
+    assert any("is in EPSG:7415" in note for note in notes)
 
 
 def test_the_first_version_needs_no_transform(tmp_path):

@@ -16,6 +16,8 @@ from lidarpool.cli.scenario_commands import import_
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.files.meshfile import load_objects
+from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.rig import Rig
 
 BOX = "<geometry><box><size>1 1 1</size></box></geometry>"
 VISUAL = f'<visual name="v">{BOX}</visual>'
@@ -400,7 +402,10 @@ BROKEN = {
     "whose quaternion has no length": world(
         model("a", link("l", pose="<pose rotation_format='quat_xyzw'>1 2 3 0 0 0 0</pose>"))
     ),
-    "must be 6 finite numbers": world(model("a", link("l", pose="<pose>1 2 3 0 0 nan</pose>"))),
+    "must be 6 finite numbers": world(model("a", link("l", pose="<pose>1 2 3 0 0 x</pose>"))),
+    "<visibility_flags> is '-1'; it must be a whole number from 0 to 4294967295": world(
+        model("a", link(inside=shape("<box/>", more="<visibility_flags>-1</visibility_flags>")))
+    ),
     "the frame 'x' is not defined": world(
         model("a", link("l", pose="<pose relative_to='x'>1 2 3 0 0 0</pose>"))
     ),
@@ -511,6 +516,175 @@ def test_a_full_turn_has_no_direction_twice_and_other_lidars_are_told(tmp_path):
         with pytest.raises(LidarError, match=f"makes no scenario: .*{words}"):
             CliRunner().invoke(import_, arguments, catch_exceptions=False)
         assert not (tmp_path / "x").exists()
+
+
+def visual(name, flags=None, text=BOX):
+    more = "" if flags is None else f"<visibility_flags>{flags}</visibility_flags>"
+    return f'<visual name="{name}">{text}{more}</visual>'
+
+
+def lidar(name, mask=None, more=""):
+    more += "" if mask is None else f"<visibility_mask>{mask}</visibility_mask>"
+    return f"""<sensor name="{name}" type="gpu_lidar"><update_rate>10</update_rate>
+        <lidar><scan><horizontal><samples>180</samples><min_angle>-3.14</min_angle><max_angle>3.14</max_angle></horizontal>
+        <vertical><samples>9</samples><min_angle>-0.6</min_angle><max_angle>0.2</max_angle>
+        </vertical></scan><range><min>0.1</min><max>40</max></range>{more}</lidar></sensor>"""
+
+
+def imported(folder, text, *options):
+    path = write(folder / "w.sdf", text)
+    arguments = [str(path), "--out", str(folder / "out"), *options]
+    result = CliRunner().invoke(import_, arguments, catch_exceptions=False)
+    scenario = folder / "out" / "scenario.yaml"
+    return result.output, yaml.safe_load(scenario.read_text()), Scenario.load(scenario)
+
+
+def test_lidars_see_visuals_by_masks_and_flags(tmp_path):
+    """Links are divided where a lidar sees one visual and not another."""
+    up = "<pose>0 0 1.5 0 0 0</pose>"
+    boat = model(
+        "boat",
+        "<pose>0 0 2 0 0 0</pose>",
+        link(
+            "hull",
+            visual("deck", 6) + visual("helper", "0x1") + visual("rail", 6) + visual("mark", 0),
+        ),
+        link(
+            "mast", lidar("all") + lidar("top", 0xFFFFFFFE) + lidar("low", 1) + lidar("off", 0), up
+        ),
+    )
+    at = "<pose>{} 0 0 0 0 0</pose>"
+    add_model(tmp_path, "buoy", sdf(model("buoy", link(inside=visual("v", 1)))))
+    text = world(
+        boat,
+        model("water", link(inside=visual("w", 1, "<geometry><plane><size>90 90</size></plane>"
+                                          "</geometry>"))),
+        model("quay [1]", at.format(5), link(inside=visual("v"))),
+        model("quay [2]", at.format(-5), link("a", visual("v", 2)), link("b", visual("v", 4))),
+        include("model://buoy", at.format(9)),
+        model("lost", link(inside=visual("v", 1, shape("<mesh><uri>no.dae</uri></mesh>")))),
+    )  # fmt: skip
+    _, data, scenario = imported(tmp_path, text)
+    assert "Not as in" not in (tmp_path / "out" / "scenario.yaml").read_text()
+    sensors = data["sensors"]
+    assert "unseen" not in sensors["all"]
+    assert sensors["top"]["unseen"] == ["boat/hull/helper", "water/link", "buoy/link"]
+    assert sensors["low"]["unseen"] == ["boat/hull", "quay [[]2]/*"]
+    assert sensors["off"]["unseen"] == ["*"]
+    built = build(scenario)
+    assert built.scene.names == (
+        "boat/hull", "boat/hull/helper", "water/link", "quay [1]/link", "quay [2]/a",
+        "quay [2]/b", "buoy/link",
+    )  # fmt: skip
+    assert any("visibility_flags> of 0, which are left out: boat::hull" in note
+               for note in built.findings.notes)  # fmt: skip
+    seen = {}
+    for batch in Rig(built.scene, built.survey, "numpy").cast(0, 4):
+        numbers = np.unique(columns_of([batch]).columns["object"])
+        seen[batch.specs[0].sensor] = {built.scene.names[number] for number in numbers}
+    assert list(sensors) == ["all", "top", "low", "off"]
+    assert seen[1] and seen[1] <= {"quay [1]/link", "quay [2]/a", "quay [2]/b", "boat/hull"}
+    assert seen[2] and seen[2] <= {"water/link", "boat/hull/helper", "buoy/link", "quay [1]/link"}
+    assert not seen[3] and "water/link" in seen[2]
+
+
+def test_links_are_whole_where_no_lidar_tells_their_visuals_apart(tmp_path):
+    """And their names stay; collision shapes have no flags."""
+    parts = visual("a", 1) + visual("b", 2) + visual("c")
+    whole = load(tmp_path, world(model("m", link(inside=parts))))[0]
+    assert list(whole) == ["m/link"] and len(whole["m/link"].faces) == 36
+    text = world(model("m", link(inside=parts)), model("robot", link(inside=lidar("s", 3))))
+    assert list(load(tmp_path, text)[0]) == ["m/link"]
+    text = text.replace("<visibility_mask>3<", "<visibility_mask>2<")
+    assert list(load(tmp_path, text)[0]) == ["m/link", "m/link/b"]
+    text = text.replace("</visual>", "</visual><collision name='c'>" + BOX + "</collision>", 1)
+    assert list(load(tmp_path, text, geometry="collision")[0]) == ["m/link"]
+
+
+def test_actors_and_roads_are_seen_by_all_masks_but_zero(tmp_path):
+    road = "<road name='way'><width>2</width><point>0 0 0</point><point>9 0 0</point></road>"
+    text = world(
+        road, model("m", link(inside=visual("v", 4))), model("r", link("l", lidar("s", 3)))
+    )
+    _, data, scenario = imported(tmp_path, text)
+    assert data["sensors"]["s"]["unseen"] == ["m/link"]
+    assert build(scenario).scene.names == ("m/link", "way")
+
+
+def test_elements_of_lidars_that_are_not_read_are_listed(tmp_path):
+    """Misspelt or foreign ones, types of sensors, and noise; prefixes and topics are none."""
+    robot = ROBOT.replace("<update_rate>20</update_rate>", "<updaterate>20</updaterate><topic/>")
+    robot = robot.replace("<vertical>", "<vertcal/><vertical><sample/>").replace(
+        "<min>", "<mx/><min>"
+    )
+    robot = robot.replace("<noise>", "<visibility/><ros:x/><noise><bias_mean>1</bias_mean>")
+    robot = robot.replace("</link></model>", "<sensor name='b' type='gpu_lidr'/></link></model>")
+    output, _, _ = imported(tmp_path, world(robot, include("model://ground_plane")))
+    listed = ("robot::mast::scan: elements that are not read: sensor/updaterate, lidar/visibility, "
+              "scan/vertcal, vertical/sample, range/mx")  # fmt: skip
+    text = (tmp_path / "out" / "scenario.yaml").read_text()
+    kind = "sensor 'robot::mast::b' is of the unknown type 'gpu_lidr'. Did you mean"
+    for words in (listed, "a bias of its noise", kind):
+        assert words in output and words in text
+    text = ROBOT.replace("<lidar>", "<lidr>").replace("</lidar>", "</lidr>")
+    with pytest.raises(LidarError, match=r"neither <lidar> nor <ray>\. Did you mean 'lidr'"):
+        imported(tmp_path / "x", world(text))
+    with pytest.raises(LidarError, match=r"it has no lidar .* is of the unknown type 'lidarr'"):
+        imported(tmp_path / "y", world(ROBOT.replace("gpu_lidar", "lidarr")))
+
+
+FAR = {
+    "a model": (model("fallen", "<pose>0 0 -750000000 0 0 0</pose>", link()), ""),
+    "1,000 km": (model("fallen", "<pose>0 0 -1.1e6 0 0 0</pose>", link()), ""),
+    "infinite": (model("fallen", "<pose>0 0 -1e400 0 0 0</pose>", link()), ""),
+    "NaN": (model("fallen", "<pose>0 0 0 nan 0 0</pose>", link()), ""),
+    "a link": (model("fallen", link(pose="<pose>2e7 0 0 0 0 0</pose>")), ""),
+    "a quaternion": (
+        model("fallen", "<pose rotation_format='quat_xyzw'>9e8 0 0 0 0 0 1</pose>", link()), "",
+    ),
+    "a frame": (
+        model("fallen", "<frame name='f'><pose>0 0 -8e8 0 0 0</pose></frame>",
+              link(pose="<pose relative_to='f'/>")), "",
+    ),
+    "a nested model": (
+        model("fallen", "<pose>-4e7 0 0 0 0 0</pose>", model("inner", link(), link("second"))), "",
+    ),
+    "an included model": (
+        include("model://crate", "<name>fallen</name><pose>0 -2e9 0 0 0 0</pose>"), "",
+    ),
+    "a state": (
+        model("fallen", link()),
+        "<state world_name='w'><model name='fallen'><pose>0 0 -7.5e8 0 0 0</pose></model></state>",
+    ),
+    "an actor": (
+        "<actor name='fallen'><skin><filename>model://crate/skin.dae</filename></skin>"
+        "<pose>0 0 -1e10 0 0 0</pose></actor>", "",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAR)
+def test_what_fell_for_a_long_time_is_left_out_and_named(tmp_path, name):
+    """Two public worlds have such a model; a third has NaN."""
+    add_model(tmp_path, "crate")
+    write(tmp_path / "crate" / "skin.dae", DAE)
+    element, state = FAR[name]
+    objects, _, notes = load(tmp_path, world(model("kept", link()), element, state))
+    assert list(objects) == ["kept/link"]
+    notes = [note for note in notes if "skins" not in note]
+    assert len(notes) == 1 and "1,000 km and more away, or nowhere: left out are fallen" in notes[0]
+    scene = Scene.load(tmp_path / "w.sdf")
+    assert np.abs(scene.bounds).max() <= 0.5 and not scene.origin.any()
+
+
+def test_lidars_of_models_that_fell_are_listed(tmp_path):
+    fallen = ROBOT.replace("'robot'", "'fallen'").replace("2 1 0", "2 1 -7.5e8")
+    output, data, scenario = imported(tmp_path, world(ROBOT, fallen))
+    assert list(data["sensors"]) == ["scan"]
+    assert "1,000 km and more away, or nowhere: left out are fallen" in output
+    assert build(scenario).scene.names == ("robot/base",)
+    with pytest.raises(LidarError, match=r"it has no lidar.*left out are fallen"):
+        imported(tmp_path / "x", world(fallen))
 
 
 def test_garbled_worlds_give_objects_or_a_line(tmp_path):

@@ -88,6 +88,7 @@ def test_detailed_trees_and_cars_are_instances(furnished):
     assert furnished.kept_triangles < 200_000 < furnished.triangles
 
 
+@pytest.mark.extended
 def test_same_seed_same_trees_and_cars(tmp_path):
     files = [
         write_scene(tmp_path / f"{seed}{n}.glb", city(20_000, seed, trees=50, cars=30))
@@ -135,6 +136,7 @@ def test_it_is_a_height_field_without_holes():
     assert (np.cross(b - a, c - a)[:, 2] > 0).all()
 
 
+@pytest.mark.extended
 def test_trees_stand_on_ground_that_is_not_steep():
     plain = terrain(80_000, 1, 200.0)
     scene = terrain(80_000, 1, 200.0, trees=400)

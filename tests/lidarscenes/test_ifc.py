@@ -296,6 +296,13 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
         f"{path} has a map conversion, which is not applied: translation [691000.5, 5336000.25, "
         "500] and rotation_deg [0, 0, 90] move it into EPSG:25832"
     ]
+    system.Name = "EPSG:3857"
+    load_meshes(model.write(path), tell=notes.append)
+    if find_spec("rasterio") is not None:
+        assert "into EPSG:3857, whose metre is 0.72" in notes[1]
+        assert notes[1].endswith("long on the ground here, unlike that of the building")
+    system.Name = "EPSG:25832"
+    del notes[1]
     conversion.Scale = 1.0
     load_meshes(model.write(path), tell=notes.append)
     assert notes[1].endswith("into EPSG:25832 whose scale, 1000, does not fit its units")
@@ -373,6 +380,7 @@ def test_unknown_entities_are_noted(house, forked, tmp_path):
     assert any("without which ifcopenshell reads it" in n and "IFCSLEB" in n for n in notes)
 
 
+@pytest.mark.extended
 def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
     random = np.random.default_rng(7)
     data = np.frombuffer(house.read_bytes(), np.uint8)
@@ -390,6 +398,7 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
         assert not any("\n" in note for note in notes)
 
 
+@pytest.mark.extended
 @needs_ifcopenshell
 def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
     monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)

@@ -204,18 +204,17 @@ def test_rangefinders_become_sensors_that_measure_as_in_mujoco(room):
     result = CliRunner().invoke(import_, [str(room), "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert "also meet geoms of group 3: groups of" in result.output
-    assert "no sensor sees any body that carries" in result.output
     scenario = yaml.safe_load((out / "scenario.yaml").read_text())
     assert [*scenario["sensors"]] == ["robot", "depth", "lens", "arm"]
     assert scenario["sensors"]["arm"]["max_range_m"] == 4.5
-    assert scenario["scene"]["files"] == [{"file": "../room.xml", "exclude": ["robot", "arm"]}]
-    # As MuJoCo's rays, which meet all groups and the other body: without the hull and the wedge.
+    assert scenario["scene"]["files"] == ["../room.xml"]
+    own = {name: sensor.get("unseen") for name, sensor in scenario["sensors"].items()}
+    assert own == {"robot": ["robot"], "depth": ["robot"], "lens": ["robot"], "arm": ["arm"]}
+    # As MuJoCo's rays, which meet all groups, but not the sensor's own body: without the hull.
     _, data = state(
         write(
             room.with_name("bare.xml"),
-            ROOM.replace('group="3"', 'rgba="0 0 0 0"').replace(
-                'mesh="wedge" material="paint"', 'mesh="wedge" rgba="0 0 0 0"'
-            ),
+            ROOM.replace('group="3"', 'rgba="0 0 0 0"'),
         )
     )
     built = build(Scenario.load(out / "scenario.yaml"))
@@ -311,6 +310,7 @@ def test_mujoco_is_asked_for(room, monkeypatch):
         load(room)
 
 
+@pytest.mark.extended
 def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch):
     monkeypatch.setattr(child_process, "subprocess", subprocess)
     text = '<asset><hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/></asset>'
@@ -323,6 +323,7 @@ def test_a_model_that_takes_too_much_ends_its_process_only(tmp_path, monkeypatch
         load(write(path, world(BOX * 50)))
 
 
+@pytest.mark.extended
 def test_garbled_models_give_objects_or_a_line(room):
     peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     whole = ROOM.encode()

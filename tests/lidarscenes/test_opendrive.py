@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -538,6 +539,20 @@ def test_notes_on_coordinate_systems(tmp_path, header, note):
     load(tmp_path, document(road(), header=f'<header revMajor="1">{header}</header>'), notes)
     assert len(notes) == 1
     assert note in notes[0]
+
+
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+@pytest.mark.parametrize("system", ["EPSG:3857", "+proj=merc +a=6378137 +b=6378137"])
+def test_stretched_metres_are_noted_with_the_scale_that_helps(tmp_path, system):
+    notes = []
+    roads = road(at=(1e6, 6e6, 0))  # 47.35 degrees north
+    header = f'<header revMajor="1"><geoReference><![CDATA[{system}]]></geoReference></header>'
+    load(tmp_path, document(roads, header=header), notes)
+    (note,) = notes
+    assert "whose metre is 0.67" in note
+    scale, again = re.search(r"here: scale \[(0\.67\d+), (0\.67\d+), 1\] makes", note).groups()
+    assert scale == again and float(scale) == pytest.approx(0.678, abs=1e-3)
+    assert "cloud.epsg" not in note
 
 
 def test_unknown_elements_are_named_once(tmp_path):

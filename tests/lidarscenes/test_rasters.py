@@ -23,6 +23,7 @@ from lidarsim.simulator.scanner import Scanner
 pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="needs rasterio, an extra")
 if find_spec("rasterio") is not None:
     import rasterio
+    from rasterio.rio.main import main_group
     from rasterio.transform import Affine, from_origin
     from rasterio.warp import transform
 
@@ -128,7 +129,8 @@ def test_pixels_without_height_are_holes(tmp_path):
         read(write(tmp_path / "none.tif", np.full((4, 4), 7.0), nodata=7))
     for low in (-32768, -9999):
         *_, notes = read(write(tmp_path / "untold.tif", np.where(SLOPE == 3, low, SLOPE)))
-        assert f"heights from {low:,} to 47 m" in notes[0] and "--nodata" in notes[0]
+        assert f"heights from {low:,} to 47 m" in notes[0]
+        assert f"rio edit-info --nodata {low}.0 untold.tif" in notes[0]
 
 
 @pytest.mark.parametrize(
@@ -265,7 +267,8 @@ def test_many_pixels_are_a_choice(tmp_path, monkeypatch):
 
 def test_small_files_that_claim_much(tmp_path):
     options = {"width": 2_000_000, "height": 2_000_000, "count": 1, "dtype": "float32"}
-    options |= {"crs": "EPSG:25832", "transform": from_origin(X0, Y0, 1, 1), "tiled": True}
+    west = X0 - 1_000_000  # so that the middle of 2,000 km is in the middle of the zone
+    options |= {"crs": "EPSG:25832", "transform": from_origin(west, Y0, 1, 1), "tiled": True}
     tiles = {"blockxsize": 4096, "blockysize": 4096, "sparse_ok": True, "bigtiff": "yes"}
     with rasterio.open(tmp_path / "m.tif", "w", **options, **tiles):
         pass
@@ -301,6 +304,7 @@ def test_nothing_that_a_file_names_is_opened(tmp_path):
     assert mesh.bounds[1, 2] == 47 and notes[0].startswith("is read without plain.tif.msk")
 
 
+@pytest.mark.extended
 @settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -353,10 +357,124 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
     assert epsg_of(tmp_path, "west.tif", "east.tif", epsg=25832) == 25832
 
 
+STRETCHED = {  # {system: (x and y of its corner, metres on the ground in a metre)}
+    "EPSG:3857": ((1e6, 6e6), 0.678, "0.678 m"),  # 47.35 degrees north
+    "EPSG:3395": ((1e6, 6e6), 0.676, "0.676 m"),
+    "EPSG:5041": ((2e6, -1e6), 0.953, "0.953 m"),  # at 63 degrees north
+    "EPSG:6933": ((8e5, 5.36e6), 1.0, "0.788 to 1.27 m"),
+}
+
+
+@pytest.mark.parametrize("crs", STRETCHED)
+def test_stretched_metres_become_true_ones(tmp_path, crs):
+    corner, scale, words = STRETCHED[crs]
+    path = write(tmp_path / "m.tif", crs=crs, place=from_origin(*corner, 2, 2))
+    mesh, taken, (note,) = read(path)
+    zone = taken.epsg
+    assert 32601 <= zone <= 32660
+    assert f"whose metre is {words} long on the ground here: brought to EPSG:{zone}" in note
+    assert taken.summary.startswith("8 x 6 pixels of ")
+    assert f", EPSG:{zone} from {crs}" in taken.summary
+    # Vertices are where PROJ has the middles of pixels, with the heights of the file.
+    row, column = np.mgrid[:6, :8]
+    x, y = corner[0] + 2 * column.ravel() + 1, corner[1] - 2 * row.ravel() - 1
+    expected = np.transpose(transform(crs, f"EPSG:{zone}", x, y))
+    np.testing.assert_allclose(mesh.vertices[:, :2], expected, atol=1e-4)
+    np.testing.assert_array_equal(mesh.vertices[:, 2], SLOPE.ravel())
+    assert upward_area(mesh) == pytest.approx(14 * 10 * scale**2, rel=0.01)
+
+
+def test_true_metres_stay_and_chosen_ones_are_checked(tmp_path):
+    for crs, corner in (("EPSG:3857", (1e6, 0)), ("EPSG:5041", (2e6, 2.1e6))):
+        mesh, taken, notes = read(
+            write(tmp_path / "a.tif", crs=crs, place=from_origin(*corner, 2, 2))
+        )
+        assert (taken.crs, notes) == (crs, []) and upward_area(mesh) == 140
+    path = write(tmp_path / "m.tif", crs="EPSG:3857", place=from_origin(1e6, 6e6, 2, 2))
+    assert read(path, epsg=25832)[1].epsg == 25832
+    for epsg, message in (
+        (3857, r"cannot be brought to EPSG:3857 \(.*maps of the world.*cloud\.epsg"),
+        (3395, "maps of the world"),
+        (3994, r"EPSG:3994 \(.*\), whose metre is 0\.898 m long.*EPSG:32632 has true metres"),
+    ):
+        with pytest.raises(LidarError, match=message):
+            read(path, epsg=epsg)
+
+
+def test_a_wide_raster_of_stretched_metres_asks_for_a_system(tmp_path):
+    place = from_origin(1e6, 6e6, 300_000, 50_000)
+    path = write(tmp_path / "m.tif", crs="EPSG:3857", place=place)
+    with pytest.raises(LidarError, match=r"spans 21\.\d+ degrees.*give cloud\.epsg"):
+        read(path)
+    _, taken, notes = read(path, epsg=3035)
+    assert taken.epsg == 3035 and notes == []
+    europe = write(tmp_path / "e.tif", crs="EPSG:3035", place=from_origin(2e6, 5.5e6, 6e5, 8e5))
+    (note,) = read(europe)[2]
+    assert "is so wide that lengths of EPSG:3035" in note and "% at its edges" in note
+
+
+def test_what_has_no_place_on_earth_is_refused(tmp_path):
+    path = write(tmp_path / "m.tif", crs="IAU_2015:30110", place=from_origin(0, 1e6, 2, 2))
+    with pytest.raises(LidarError, match=r"has no place on Earth by it: .*gdalwarp -t_srs"):
+        read(path)
+    assert read(write(tmp_path / "m.tif", crs="IAU_2015:30110", place=()))[1] is not None
+
+
+def test_rasters_near_the_poles_are_in_polar_coordinates(tmp_path):
+    place = from_origin(10, 86, 1e-4, 1e-5)
+    mesh, taken, _ = read(write(tmp_path / "m.tif", crs="EPSG:4326", place=place))
+    metres = 1e-4 * 111_320 * np.cos(np.radians(86)), 1e-5 * 111_660
+    assert taken.epsg == 5041
+    assert upward_area(mesh) == pytest.approx(7 * 5 * metres[0] * metres[1], rel=0.015)
+
+
+LOWEST = float(np.finfo(np.float32).min)
+
+
+@pytest.mark.parametrize(
+    ("value", "options", "words"),
+    [
+        (LOWEST, {}, "state it as its nodata (rio edit-info --nodata "),
+        (-LOWEST, {}, "state it as its nodata"),
+        (1e20, {}, "state it as its nodata"),
+        (LOWEST, {"nodata": -9999}, "as its nodata, which is -9999.0 now"),
+    ],
+)
+@pytest.mark.parametrize("step_m", [None, 4.0])
+def test_values_that_are_no_heights_are_named(tmp_path, value, options, words, step_m):
+    heights = np.tile(np.arange(40.0, dtype=np.float32), (40, 1))
+    heights[20, 20] = value
+    path = write(tmp_path / "m.tif", heights, **options)
+    value = float(np.float32(value))
+    with pytest.raises(LidarError) as refused:
+        read(path, step_m=step_m)
+    told = str(refused.value)
+    assert f"{path} has the value {value!r}, which is no height" in told
+    assert "nodata" in told and words in told and "\n" not in told
+
+
+def test_the_command_that_a_message_names_helps(tmp_path):
+    heights = SLOPE.astype(np.float32)
+    heights[2, 2] = LOWEST
+    path = write(tmp_path / "m.tif", heights)
+    with pytest.raises(LidarError) as refused:
+        read(path)
+    command = re.search(r"rio (edit-info --nodata \S+) m\.tif", str(refused.value))[1]
+    done = CliRunner().invoke(main_group, [*command.split(), str(path)])
+    assert done.exit_code == 0, done.output
+    mesh, _, notes = read(path)
+    assert len(mesh.faces) == 2 * (35 - 4) and notes == []
+    grid = write(tmp_path / "m.asc", heights.astype(np.float64), driver="AAIGrid")
+    with pytest.raises(LidarError, match=r"gdal_translate -a_nodata -3\.4"):
+        read(grid)
+
+
 def test_a_raster_alone_is_a_survey(tmp_path):
     _, columns = np.mgrid[:60, :60]
     heights = 100 + columns / 10.0
-    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")
+    x0, y0 = 2_600_000, 1_200_000
+    place = from_origin(x0, y0, 2, 2)
+    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056", place=place)
     checked = CliRunner().invoke(cli, ["check", "hill.tif"])
     assert checked.exit_code == 0, checked.output
     assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
@@ -365,14 +483,14 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
         [pose.position for pose in built.placing.poses],
-        [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
+        [(x0 + 60, y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
     assert built.survey.epsg == 2056 and advice(built)[1:] == []
-    at = np.array([X0 + 60, Y0 - 60, 110]) - built.scene.origin
+    at = np.array([x0 + 60, y0 - 60, 110]) - built.scene.origin
     cloud = Scanner(built.scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
     assert len(cloud) > 1000
-    np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
+    np.testing.assert_allclose(z, 100 + ((x - x0) / 2 - 0.5) / 10, atol=0.002)
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
     built = build(Scenario.load(tmp_path / "hole.tif"))

@@ -209,7 +209,11 @@ def test_mesh_files_of_packages(tmp_path):
         ("../../../secret.dae", "outside the package"),
         ("package://my_robot/../../secret.dae", "outside the package"),
         (f"file://{tmp_path}/secret.dae", "outside the package"),
-        ("package://../secret.dae", "package that is not there"),
+        ("package://../secret.dae", "names no package: write package://NAME/FILE, or the path of"),
+        ("package:///leg.dae", "from the folder 'urdf' of the .urdf"),
+        ("package://", "from the folder 'urdf' of the .urdf"),
+        ("model:///other/meshes/leg.dae", "put the .urdf into the folder 'other' of that package"),
+        ("package:///other//leg.dae", "names no package: write package://other/leg.dae, and"),
         ("package://unknown/leg.dae", "put the .urdf into the folder 'unknown'"),
         ("../meshes/arm.dae", "does not exist"),
         ("http://example.org/leg.dae", "must be a file's name"),
@@ -257,6 +261,7 @@ def test_broken_robots_are_refused_in_a_line(tmp_path, words):
     assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 500
 
 
+@pytest.mark.extended
 def test_xacro_other_files_and_garbled_copies(tmp_path):
     path = tmp_path / "arm.urdf"
     for text, words in (
@@ -389,6 +394,7 @@ def rover_at(name, time_ns):
     return at
 
 
+@pytest.mark.extended
 def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground):
     robot = load_robot(EXAMPLES / "rover.urdf")
     actors = robot.actors(DRIVE, MOTION, without=["lidar"])

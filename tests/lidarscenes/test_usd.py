@@ -220,6 +220,7 @@ def test_what_moves_in_instances_moves_in_each(tmp_path):
     assert low == [[5, 0, 0], [5, 10, 0]] and len(scene.names) == 1
 
 
+@pytest.mark.extended
 def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     grows = sampled("scale", t2="(1, 1, 1)", t6="(2, 1, 1)") + order("scale")
     camera = prim("Rig", "Xform", DRIVE + prim("Camera", "Camera", ""))
@@ -374,6 +375,7 @@ def played(path, name, code, first=1, rate_hz=24):
     return own.vertices_at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", ["", "Walk", "Run"])
 def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
     """At poses, and at random times between, where they move straight within 2 mm."""
@@ -392,6 +394,15 @@ def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
         np.testing.assert_allclose(points, evaluated(path, code, name), atol=2e-3)
 
 
+def test_what_moves_too_far_away_is_left_out(tmp_path):
+    falls = sampled("translate", t0="(0, 0, 5)", t24="(0, 0, -750000000)") + order("translate")
+    path = write(tmp_path / "m.usda", prim("Quad"), prim("Fallen", text=QUAD + falls))
+    notes = []
+    objects = load_objects(path, tell=notes.append)
+    assert [mesh.name for mesh in objects.static] == ["Quad"] and not objects.actors
+    assert any("(7.5e+08 m from the origin), which are left out: Fallen" in note for note in notes)
+
+
 def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     path = person(tmp_path / "m.usda", stage=METRES + "\nstartTimeCode = 7.3\nendTimeCode = 19")
     objects, lines = told(path)
@@ -408,6 +419,7 @@ def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     np.testing.assert_allclose(own.vertices[-1], evaluated(path, 19), atol=2e-6)
 
 
+@pytest.mark.extended
 def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     person(tmp_path / "man.usda")
     meta = "references = @./man.usda@\ninstanceable = true"
@@ -433,6 +445,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     assert load_objects(path, animation="").static[0].animation.vertices.shape == (61, 4, 3)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("stage", "text", "name", "message"),
     [
@@ -458,6 +471,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, 
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.extended
 def test_a_person_of_a_scenario_moves(tmp_path):
     """Each point is on the surface that UsdSkel gives at its time."""
     path = person(tmp_path / "man.usda")
@@ -586,6 +600,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         )
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -611,6 +626,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.extended
 def test_few_lines_do_not_make_millions_of_objects(tmp_path):
     count = nodes.MAX_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
@@ -648,6 +664,7 @@ def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkey
         )
 
 
+@pytest.mark.extended
 @settings(
     max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -748,6 +765,7 @@ def shifted(light):
     return as_srgb(np.clip(light, 0, 1)).tolist()
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("image", "place", "expected"),
     [
@@ -784,6 +802,7 @@ def test_masks_let_light_pass(folder):
     assert "without holes, taken as solid: M;" in seen(glass)[1][0]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
@@ -858,6 +877,7 @@ def test_packed_images_and_shapes(folder):
     assert seen(path) == (PICTURE, [])
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("inputs", "image", "kind", "colour", "why"),
     [

@@ -69,7 +69,7 @@ def beyond(offset):
     return (math.acos(offset) - offset * math.sqrt(1 - offset**2)) / math.pi
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 133])
 @pytest.mark.parametrize("offset", [-0.8, -0.3, 0.0, 0.5])
 def test_surfaces_on_both_sides_of_an_edge_get_their_shares(angle_deg, offset):
@@ -123,6 +123,7 @@ def test_a_beam_on_a_road_is_one_return(model, subrays):
             assert found["intensity"][ray] == pytest.approx(exact, rel=0.05, abs=1e-6)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("model", ["velodyne/vlp32c", "ouster/os1-64"])
 @pytest.mark.parametrize("subrays", [7, 61])
 def test_a_whole_sensor_reports_the_ground_once(model, subrays):
@@ -273,7 +274,7 @@ def test_ranges_on_a_slanted_plane_scatter_by_the_second_moment(profile, lean_de
     (pulses,) = (rig := rig_of([mesh], survey)).pulse_casters
     beams = pulses.emitter.subrays_of(rig.pattern(0, 0, 1))
     _, directions = pattern_rays(beams, np.arange(61), (0, 0, 0))
-    spread = rig.scene_caster.caster.cast(np.zeros((61, 3)), directions).distance
+    spread = rig.scene_casters[0].caster.cast(np.zeros((61, 3)), directions).distance
     assert spread.std() == pytest.approx(50 * math.tan(lean) * 2e-3 / 4, rel=0.01)
 
 
@@ -294,7 +295,7 @@ SENSORS = {
 }
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize(("roll_deg", "width"), [(0, 4e-3), (90, 12e-3), (-90, 12e-3), (180, 4e-3)])
 @pytest.mark.parametrize("mounted", [False, True])

@@ -243,6 +243,7 @@ def vectors(cloud, name):
     return np.stack([cloud[f"{name}_{axis}"] for axis in "xyz"], axis=1)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("far_m", [0.0, 500_000.0])
 def test_normals_incidence_and_origins_of_a_ramp(cluster_client, far_m):
     # A plane that rises to the east by 30 degrees, and a sensor that drives 3 m above it.

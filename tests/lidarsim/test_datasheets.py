@@ -55,7 +55,7 @@ def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name
     assert sheet.returns.subrays == (1 if model.optics.divergence_mrad is None else 7)
 
 
-@pytest.mark.every_nth(4)
+@pytest.mark.slow(every=4)
 @pytest.mark.parametrize("name", DETECTED)
 def test_a_wall_at_the_stated_range_returns_the_stated_share(name):
     stated = read_model(name).performance.detection
@@ -64,7 +64,7 @@ def test_a_wall_at_the_stated_range_returns_the_stated_share(name):
     assert abs(count - RAYS * stated.probability) < 4 * math.sqrt(spread)
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize(
     "name", [name for name in STATED if read_model(name).datasheet().noise.range_m]
 )

@@ -141,12 +141,14 @@ def same(scene, survey, backend, cuts):
         )
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("name", MADE)
 def test_columns_have_the_bits_of_numpy(name, scenes, backend):
     survey = MADE[name]
     same(scenes["plain"], survey, backend, (0, 1, survey.scan_count // 2, survey.scan_count))
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("scene", ["instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_instances(scene, name, scenes, backend):
@@ -201,7 +203,8 @@ MORE = {
 }
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     "actors",
     [pytest.param((), id=""), pytest.param(ACTORS, id="actors", marks=NEEDS_NUMBA)],
@@ -224,6 +227,7 @@ def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
     assert not isinstance(next(rigs[0].cast(0, 1)), DevicePoints)
 
 
+@pytest.mark.extended(every=5)
 @NEEDS_NUMBA
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
@@ -262,7 +266,8 @@ def test_images_of_ranges(actors, scenes, backend):
     assert np.isinf(images[0][2]).all()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=9)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
 def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):

@@ -200,6 +200,7 @@ def test_noise_of_velocities():
     assert (found_of(Rig(Scene.seed(), other, "numpy")).radial_velocity != found).mean() > 0.99
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("subrays", [1, 7])
 def test_drops_are_at_rest(subrays):
     # A moving carrier in rain, before a wall and among cars.

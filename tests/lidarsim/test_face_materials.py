@@ -332,6 +332,7 @@ def usd(folder):
     return folder / "house.usda"
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("colours", [False, True])
 @pytest.mark.parametrize("write", [gltf, dae, threemf, cityjson, usd])
 def test_faces_of_files_have_their_materials(write, colours, tmp_path):

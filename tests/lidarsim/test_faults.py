@@ -84,6 +84,7 @@ FAULTS = {
 SURVEYS = {"standing": STANDING, "drive": DRIVE, "stations": STATIONS}
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("place", SURVEYS)
 def test_batches_and_backends_do_not_matter(place):
     survey = replace(SURVEYS[place], faults=[*FAULTS.values()])

@@ -72,7 +72,7 @@ def test_paint_returns_itself_and_what_it_mirrors(backend, subrays):
     assert alone["cause"].tolist() == [0], "the paint is brighter"
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("degrees", [0, 30, 45, 60, 80, 87])
 @pytest.mark.parametrize("dirt", [0.0, 0.2])
 def test_no_light_is_lost_or_made_at_glass(degrees, dirt):
@@ -146,7 +146,7 @@ def test_bad_mirrors(values, message):
 # -- wet ground ------------------------------------------------------------------------------------
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("degrees", [0, 40, 70, 85])
 @pytest.mark.parametrize("dry", [0.05, 0.3, 0.9])
 def test_light_on_wet_ground_is_mirrored_returned_or_absorbed(degrees, dry):
@@ -170,7 +170,7 @@ def road(wet, down_deg, backend="numpy", **options):
     return cast(meshes, sensor, wet=wet, backend=backend, **options)
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("wet", [0.5, 1.0])
 @pytest.mark.parametrize("down_deg", [5, 20, 50])

@@ -9,7 +9,10 @@ import pytest
 from tests.meshes import write
 
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.files import scene_graph
 from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.transform import Transform
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 
@@ -220,6 +223,83 @@ def test_what_cannot_be_read_says_what_it_is(tmp_path, edit, message):
     header = triangle()
     edit(header)
     with pytest.raises(LidarError, match=message):
+        load(tmp_path, header)
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["instances", "copies"])
+def test_a_node_that_is_too_far_away_is_left_out(tmp_path, monkeypatch, shared):
+    """Of instances and of copies, also where a placement moves them there."""
+    monkeypatch.setattr(scene_graph, "SHARED_TRIANGLES", 1 if shared else 1000)
+    header = triangle()
+    header["nodes"] += [
+        {"name": "Fallen", "mesh": 0, "translation": [0, -7.5e8, 0]},
+        {"name": "Near", "mesh": 0, "translation": [0, 3, 0]},
+    ]
+    header["scenes"][0]["nodes"] = [0, 1, 2]
+    notes = []
+    path = write(tmp_path / "m.glb", glb(header, CORNERS))
+    meshes = load_meshes(path, up_axis="z", tell=notes.append)
+    assert [mesh.name for mesh in meshes] == ["Sign", "Near"]
+    assert all(isinstance(mesh, SceneInstance) == shared for mesh in meshes)
+    assert len(notes) == 1 and "(7.5e+08 m from the origin), which are left out: Fal" in notes[0]
+    wide = Transform.from_parts(scale=3e7)
+    (sign,) = load_meshes(path, up_axis="z", transform=wide, tell=notes.append)
+    assert sign.name == "Sign"
+
+
+def hidden(visible=False):
+    return {"extensions": {"KHR_node_visibility": {"visible": visible}}}
+
+
+@pytest.mark.parametrize("where", ["extensionsUsed", "extensionsRequired", "nowhere"])
+def test_hidden_nodes_are_left_out_with_all_below(tmp_path, where):
+    """Also visible nodes below, whether the extension is used or required."""
+    header = triangle()
+    header["nodes"] = [
+        {"name": "Sign", "mesh": 0, **hidden(True)},
+        {"name": "Hidden", "mesh": 0, "children": [2, 3], **hidden()},
+        {"name": "Below", "mesh": 0},
+        {"name": "Group", "children": [4], **hidden(True)},
+        {"name": "Deep", "mesh": 0, **hidden(True)},
+        {"name": "Shown", "children": [6, 7], "translation": [5, 0, 0]},
+        {"name": "Post", "mesh": 0},
+        {"mesh": 0, **hidden()},
+    ]
+    header["scenes"][0]["nodes"] = [0, 1, 5]
+    header[where] = ["KHR_node_visibility"]
+    notes = []
+    path = write(tmp_path / "m.glb", glb(header, CORNERS))
+    meshes = load_meshes(path, up_axis="z", tell=notes.append)
+    assert [mesh.name for mesh in meshes] == ["Sign", "Post"]
+    assert notes == [
+        f"{path} has 2 hidden nodes (KHR_node_visibility), left out with all below: Hidden, node 7"
+    ]
+
+
+def test_a_file_that_is_hidden_altogether_or_unclear_is_refused(tmp_path):
+    header = triangle()
+    header["nodes"][0] |= hidden()
+    with pytest.raises(LidarError, match=r"no triangles that can be read: it has 1 hidden node"):
+        load(tmp_path, header)
+    header["nodes"][0] |= hidden("no")
+    with pytest.raises(LidarError, match=r"node 0 has 'no' as KHR_node_visibility\.visible"):
+        load(tmp_path, header)
+
+
+def test_extensions_that_are_used_and_not_read_are_noted_once(tmp_path):
+    header = triangle()
+    known = ["KHR_materials_ior", "KHR_lights_punctual", "KHR_xmp_json_ld", "EXT_mesh_features"]
+    header["extensionsUsed"] = [*known, "MSFT_lod", "ACME_tilt", "MSFT_lod"]
+    header["nodes"][0]["extensions"] = {"ACME_tilt": {}, "MSFT_lod": {"ids": [0]}}
+    notes = []
+    path = write(tmp_path / "m.glb", glb(header, CORNERS))
+    assert len(load_meshes(path, up_axis="z", tell=notes.append)) == 1
+    assert notes == [f"{path} uses extensions that are not read: MSFT_lod, ACME_tilt"]
+    header["extensionsUsed"] = known
+    load(tmp_path, header)
+    header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "mode": 0}]
+    header["extensionsUsed"] = ["KHR_gaussian_splatting"]
+    with pytest.raises(LidarError, match=r"uses extensions that are not read: KHR_gaussian_splat"):
         load(tmp_path, header)
 
 

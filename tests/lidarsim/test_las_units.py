@@ -10,7 +10,7 @@ from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.files import las_units
+from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
@@ -129,7 +129,7 @@ def check_conversion(folder, records, metres, height_m, **options):
 
 @pytest.mark.parametrize("case", STATED)
 def test_stated_units_are_converted(tmp_path, monkeypatch, case):
-    monkeypatch.setattr(las_units, "find_spec", lambda name: None)  # without the registry
+    monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)  # without the registry
     check_conversion(tmp_path, *STATED[case])
 
 
@@ -171,7 +171,7 @@ def test_of_both_the_header_says_which_counts(tmp_path, wkt_bit):
 def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(
     tmp_path, monkeypatch, records, message
 ):
-    monkeypatch.setattr(las_units, "find_spec", lambda name: None)
+    monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
     path = written(tmp_path / "a.las", PLACE / FOOT, records)
     with pytest.raises(LidarError, match=message):
         scene_of_points(path)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.rows import quick
 from tests.shapes import BALL_AROUND as SCENE
 from tests.shapes import SPIN_OF_128_BEAMS as MANY
 
@@ -82,7 +81,9 @@ SURVEYS = {
 }
 
 
-@pytest.mark.parametrize("name", quick(QUICK, SURVEYS))
+@pytest.mark.extended(keep=("positions",))
+@pytest.mark.slow(keep=("positions", "one beam, on the move", "lost returns", "crosstalk", "rain"))
+@pytest.mark.parametrize("name", SURVEYS)
 def test_the_estimate_is_safe_and_near(name):
     survey = SURVEYS[name]
     rig = Rig(SCENE, survey, "embree", threads=1)

@@ -152,11 +152,20 @@ def test_what_is_no_mesh_is_recognised(tmp_path, content, message):
         load_meshes(write(tmp_path / "m.obj", content))
 
 
-def test_a_scene_farther_than_anything_on_earth(tmp_path):
+def test_objects_farther_than_anything_on_earth(tmp_path):
+    """One is left out with a note, as of a body that fell for a long time; all are refused."""
     path = write(tmp_path / "m.obj", OBJ.format(x=0, x1=2e5))
     assert len(load_meshes(path)) == 2
-    with pytest.raises(LidarError, match=r"Object 'Box' reaches 2e\+08 m from the origin"):
-        load_meshes(path, unit="km")
+    notes = []
+    (near,) = load_meshes(path, unit="km", tell=notes.append)
+    assert near.name == "Ball" and np.abs(near.bounds).max() < 1e5
+    assert [note.partition(" has objects ")[2] for note in notes] == [
+        "farther than anything on Earth (2e+08 m from the origin), which are left out: Box; check "
+        "their units and placement"
+    ]
+    away = Transform.from_parts((2e8, 0, 0))
+    with pytest.raises(LidarError, match=r"Object 'Box' reaches 2e\+08 m from the origin, farther"):
+        load_meshes(path, transform=away)
 
 
 def test_mirrored_objects_keep_their_outside(tmp_path, two_objects):
@@ -180,6 +189,7 @@ def damaged(content, rng):
     ][int(rng.integers(4))]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply", ".off", ".3mf", "ascii"])
 def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffix, capfd):
     source = two_objects if suffix in (".glb", ".obj", ".3mf") else two_objects.to_mesh()
@@ -207,6 +217,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

@@ -310,6 +310,7 @@ COVERED = {
 }
 
 
+@pytest.mark.extended(every=6)
 @pytest.mark.parametrize(("name", "shares"), COVERED.items(), ids=COVERED)
 def test_livox_sensors_cover_their_field_as_documented(name, shares):
     """Cells are as wide as the beam, 0.28°; the field are those that are met within 4 s."""

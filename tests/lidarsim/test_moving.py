@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.rows import quick
 from tests.shapes import level, made, quad
 
 from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
@@ -43,6 +42,7 @@ def wall():
     return Scene.from_meshes([quad("Wall", *corners)])
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "velodyne/hdl64e-s2", "ouster/os0-32"])
 def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model):
     sensor = load_sensor(model, max_range_m=30)
@@ -95,8 +95,10 @@ SURVEYS = {
 }
 
 
+@pytest.mark.extended(keep=("standing-*",))
+@pytest.mark.slow(keep=("standing-*", "driving-*"))
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
-@pytest.mark.parametrize("name", quick(("standing", "driving"), SURVEYS))
+@pytest.mark.parametrize("name", SURVEYS)
 def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     sensor = load_sensor("velodyne/vlp16")
     options = {"keep_every": 1, "columns": COLUMNS, "precision_m": 1e-3, **SURVEYS[name]}
@@ -162,10 +164,10 @@ TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)],
 MIRROR = quad("Mirror", (-9, -3, 0), (9, -3, 0), (9, -3, 9), (-9, -3, 9))
 
 
+@pytest.mark.extended(keep=("driving-*",))
+@pytest.mark.slow(keep=("driving-*", "turned-*", "mirror-*"))
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
-@pytest.mark.parametrize(
-    "name", quick(("driving", "turned", "mirror"), [*SURVEYS, "turned", "noise", "mirror"])
-)
+@pytest.mark.parametrize("name", [*SURVEYS, "turned", "noise", "mirror"])
 def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, name, model):
     options = SURVEYS | {
         "turned": TURNED,

@@ -121,6 +121,7 @@ def markov(sigma, time):
     return expected
 
 
+@pytest.mark.extended
 def test_allan_variance_of_a_bias_that_wanders():
     sigma = 5e-3
     time = 10.0
@@ -175,6 +176,7 @@ def test_axes_have_constant_scales_and_angles():
     assert np.abs(np.corrcoef(errors.T)[np.triu_indices(3, 1)]).max() < 4.5 / np.sqrt(400)
 
 
+@pytest.mark.extended
 def test_positions_drift_during_outages_and_return():
     """By many seeds: a bias alone grows as t^2, a random walk alone as t^1.5."""
     gnss = Gnss(rate_hz=2, outages=[(10, 25)])

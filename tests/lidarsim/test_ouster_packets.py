@@ -463,6 +463,7 @@ def test_stamps_jump_and_frozen_sweeps_are_new_frames():
     assert (np.diff(due_ns) > 0).all()
 
 
+@pytest.mark.extended
 def test_frames_of_stations_follow_each_other():
     _, cloud, sweeps = case_of(
         "os1-32", DUAL, steps=53, poses=[Pose((0.0, 0.0, 0.0), 25.0 * n) for n in range(2)]

@@ -213,6 +213,7 @@ def test_a_shape_is_filled_wherever_its_outline_begins(name):
         assert (parts @ whole > -1e-12).all()
 
 
+@pytest.mark.extended
 @given(
     st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=9),
     st.sampled_from([1.0, 1e-9, 1e8, float("nan")]),

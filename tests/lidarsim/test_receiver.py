@@ -8,7 +8,6 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from tests.rows import quick
 from tests.shapes import Cart, beam_along_x, cast, cast_between, made, wall
 
 from lidarpool import (
@@ -113,7 +112,7 @@ def full(meshes, noise=FULL, retro="none", **options):
     return cast(meshes, noise=noise, materials=materials, columns=PULSES, **options)
 
 
-@pytest.mark.every_nth(4)
+@pytest.mark.slow(every=4)
 @pytest.mark.parametrize("waveform", ["none", "peaks", "gaussian"])
 @pytest.mark.parametrize("distance", [2.0, 10.0, 40.0, 44.8, 90.0])
 def test_a_full_receiver_clips_and_widens(distance, waveform):
@@ -454,6 +453,7 @@ def test_other_wavelengths_and_hidden_spots_are_not_seen():
     assert (ahead["cause"] == CROSSTALK).sum() > 200, "a little apart, most spots are in view"
 
 
+@pytest.mark.extended
 def test_counts_of_sensors_that_turn_against_each_other_are_those_of_all_pairs():
     turns = 7
     f = 20_000
@@ -534,7 +534,9 @@ def drive(subrays=1, backend="numpy", **noise):
     ), survey
 
 
-@pytest.mark.parametrize("subrays", quick((7,), (1, 7)))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("7",))
+@pytest.mark.parametrize("subrays", (1, 7))
 def test_batches_do_not_matter(subrays):
     rig, survey = drive(subrays, crosstalk=True)
     whole = cast_between(rig, survey, [0, 24])

@@ -36,7 +36,7 @@ def pool(nadir_deg):
     return angle, HEIGHT / math.cos(angle), below, DEPTH / math.cos(below)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("surface", [SURFACE, box("Water", (-80, -80, -3), (80, 80, 0))])
 @pytest.mark.parametrize("nadir_deg", [0.0, 25.0, 60.0, 80.0])

@@ -96,6 +96,7 @@ def rays_of_scan(survey, scan):
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", SURVEYS)
 def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     survey = SURVEYS[name]

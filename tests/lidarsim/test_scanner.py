@@ -104,7 +104,8 @@ def same(one: Cloud, other: Cloud):
     return True
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["", "physics"])
 @pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
 @pytest.mark.parametrize("name", SENSORS)
@@ -359,6 +360,7 @@ def with_bodies(scene, **options):
     return Scanner(bodies, GRID, columns=COLUMNS, **options)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_bodies_that_move_together_give_the_bytes_of_bodies_that_move_one_by_one(
@@ -461,6 +463,7 @@ def test_threads_share_a_scanner(scene, backend, sensor):
         assert list(pool.map(scan, [*range(4)] * 2)) == alone * 2
 
 
+@pytest.mark.extended
 def test_a_forked_process_scans_with_the_scanner_of_its_parent(scene):
     scanner = Scanner(scene, GRID, backend="embree", threads=2)
     poses = [HERE] * 2000
@@ -567,6 +570,7 @@ def test_wrong_arguments(scene, name):
     assert says in str(raised.value) and len(str(raised.value).splitlines()) <= 2
 
 
+@pytest.mark.extended
 def test_a_scan_needs_no_cluster_and_imports_none():
     code = (
         "import sys; from lidarpool import Scanner, Scene, Sensor\n"

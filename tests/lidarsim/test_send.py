@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.rows import quick
 
 from lidarsim import LidarError
 from lidarsim.packets import sender_process
@@ -130,7 +129,8 @@ def test_leaving_the_context_ends_the_process_and_says_what_was_sent(receiver):
     assert sender.lateness.sent == 1
 
 
-@pytest.mark.parametrize("number", quick((signal.SIGKILL,), (signal.SIGKILL, signal.SIGHUP)))
+@pytest.mark.slow(keep=("9",))
+@pytest.mark.parametrize("number", (signal.SIGKILL, signal.SIGHUP))
 def test_the_process_ends_with_its_parent(number):
     code = """
 import time, numpy as np

@@ -94,6 +94,7 @@ def same(scene, cloud, whole):
     return is_cut.sum() > 20 and (~is_cut).sum() > 20
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "effects"])
 @pytest.mark.parametrize("kind", ["faces", "instances", "masks"])
@@ -112,8 +113,8 @@ def test_points_are_those_of_the_whole_scene(kind, physics, backend, uncut):
     poses = [HERE, (0, 0, 1), REMOTE]
     images = [each.ranges(poses, number=2) for each in (scanner, whole)]
     assert np.allclose(*images, rtol=1e-7) and np.isfinite(images[0]).any(axis=(1, 2)).all()
-    triangles = scanner._rig.scene_caster.caster.face_count
-    assert triangles < whole._rig.scene_caster.caster.face_count + 100
+    triangles = scanner._rig.scene_casters[0].caster.face_count
+    assert triangles < whole._rig.scene_casters[0].caster.face_count + 100
 
 
 def test_a_survey_is_that_of_the_whole_scene(monkeypatch):
@@ -155,7 +156,7 @@ def test_bodies_that_fall_for_ever_are_left_out(uncut):
         expected = whole.sweep(HERE, number=1)
         assert len(cloud) > 300 and np.array_equal(cloud.object, expected.object)
         assert np.abs(cloud.positions - expected.positions).max() <= 0.002
-        in_trees.append(scanner._rig.scene_caster.caster.instance_count - 1)
+        in_trees.append(scanner._rig.scene_casters[0].caster.instance_count - 1)
     assert in_trees == [3, 2, 2, 1, 3]
 
 

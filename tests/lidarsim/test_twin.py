@@ -131,7 +131,7 @@ def test_random_bits_are_those_of_splitmix64():
         assert raw(seed[0], purpose, scan, ray, number).tolist() == [mine]
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("planes", [False, True])
 @pytest.mark.parametrize("airy", [False, True])
 @pytest.mark.parametrize("each", [1, 7, 19])
@@ -154,6 +154,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("waves", [False, True])
 @pytest.mark.parametrize("full", [0.01, 0.1])
 def test_saturation_is_that_of_the_twin(full, waves):
@@ -182,7 +183,8 @@ def test_saturation_is_that_of_the_twin(full, waves):
     assert (found.amplitude == full).mean() > 0.1
 
 
-@pytest.mark.every_nth(4)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=4)
 @pytest.mark.parametrize("mode", ["all", "first", "last", "strongest", "dual", "two_strongest"])
 @pytest.mark.parametrize("losses", [{}, {"dropout": 0.2}, {"detection_range_m": 4.0}])
 def test_reported_returns_are_those_of_the_twin(mode, losses):
@@ -253,6 +255,7 @@ def test_energies_are_those_of_the_twin(extinction):
     assert np.allclose(surfaces.energy(triangle, cosine, distance, light), expected, tolerance, 0)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("each", [1, 7])
 @pytest.mark.parametrize("weather", [{"rain_mm_h": 50}, {"rain_mm_h": 20, "snow_mm_h": 1}, FOG])
 def test_what_the_air_returns_is_as_in_the_twin(weather, each):
@@ -344,6 +347,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     assert np.allclose(light, left, 1e-14, 0) and min(left) < 0.9
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("planes", [False, True])
 @pytest.mark.parametrize("each", [1, 7, 19])
 def test_peaks_of_waveforms_are_those_of_the_twin(each, planes):

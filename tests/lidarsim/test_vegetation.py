@@ -91,7 +91,8 @@ def test_projections_of_known_leaves():
 # -- Beer and Lambert ----------------------------------------------------------------------------
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=9)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("leaf_angle", ["spherical", "planophile", "erectophile", 2.0])
 @pytest.mark.parametrize("nadir_deg", [0.0, 50.0])
 def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg):
@@ -130,6 +131,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     assert cone["returns"].max() > 2
 
 
+@pytest.mark.extended
 def test_moved_and_turned_crowns_hold_the_same_leaves():
     """Instances, mirrored ones too, and actors; and meshes whose triangles wind inwards."""
     crown = ball("Crown", 1.0)
@@ -194,6 +196,7 @@ ALL_ON = {
 }
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("order", [1, -1])
 def test_layers_that_touch_each_other(backend, order):
@@ -213,6 +216,7 @@ def test_layers_that_touch_each_other(backend, order):
     assert counts == pytest.approx(np.exp(-0.2 * np.arange(6)) * (1 - math.exp(-0.2)), rel=0.1)
 
 
+@pytest.mark.extended
 def test_a_wood_of_crowns_that_overlap_anyhow():
     """From within and outside, gaps are those of the chords of all ellipsoids, added up."""
     rng = np.random.default_rng(3)

@@ -382,6 +382,7 @@ def moving_survey(**options):
     )  # fmt: skip
 
 
+@pytest.mark.extended
 def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
     """A revolution of 1,808.4 firings is not a whole number of packets of 24."""
     survey = moving_survey()

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from tests.lidarsim.test_vegetation import ALL_ON, AT, GROUND, MANY, cast, rays
-from tests.rows import quick
 from tests.shapes import CPU, Cart, ball, box, cast_between
 
 from lidarpool import (
@@ -189,7 +188,9 @@ def test_empty_and_huge_grids_are_refused_in_little_memory(tmp_path):
 # -- light ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("nadir_deg", quick((122.0,), (90.0, 73.0, 122.0)))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("122.0",))
+@pytest.mark.parametrize("nadir_deg", (90.0, 73.0, 122.0))
 def test_an_even_grid_is_the_box_with_that_density(tmp_path, nadir_deg):
     """Bit for bit the same leaves, but for the rounding of sums of voxels."""
     grid = tree(tmp_path / "T.vox", np.full((5, 24, 24), 0.3), low=(3, -6, -6), size=0.5)
@@ -235,6 +236,7 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     assert counts[[1, 4]].tolist() == [0, 0]
 
 
+@pytest.mark.extended
 def test_random_grids_stop_what_the_integral_says(tmp_path):
     """From outside and within, in all directions: the mean gap within three standard deviations."""
     draw = np.random.default_rng(4)
@@ -283,6 +285,7 @@ def test_turned_scaled_and_mirrored_copies_are_where_they_stand(tmp_path):
         assert found["range"] == pytest.approx(first["range"], abs=1e-4)
 
 
+@pytest.mark.extended
 def test_crowns_and_grids_that_overlap_add_up(tmp_path):
     """Leaves belong to each in proportion; two grids, and a crown of one density."""
     one = tree(tmp_path / "One.vox", np.full((4, 8, 8), 0.2), low=(5, -4, -4))
@@ -310,7 +313,9 @@ STANDS = {"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}
 MOVES = {"trajectory": Cart()}
 
 
-@pytest.mark.parametrize("path", quick((MOVES,), (STANDS, MOVES)))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("path1",))
+@pytest.mark.parametrize("path", (STANDS, MOVES))
 def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch):
     draw = np.random.default_rng(1)
     grids = [

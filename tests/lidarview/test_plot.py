@@ -104,6 +104,7 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
         assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
+@pytest.mark.extended
 def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     """Along x, the sensor at 10 m/s and an actor towards it."""
     scene = replace(
@@ -174,6 +175,7 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
         plot(result, "--only", "cloud", "--colour", "wettness")
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("coordinates", "pictures", "left_out"),
     [("world", {"scene.png", "hits.png", "cloud.png"}, "path"),

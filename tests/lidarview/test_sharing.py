@@ -132,6 +132,7 @@ def test_a_room_is_cut_open_at_its_top():
     assert reds(next(opened.frames()).astype(int)) > 1000
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
     film = tmp_path / f"film{suffix}"
@@ -147,6 +148,7 @@ def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
     assert film_of(open_result(drive), suffix) == film.read_bytes()
 
 
+@pytest.mark.extended
 def test_a_film_that_would_be_too_large_is_narrower(drive, monkeypatch):
     monkeypatch.setattr(lidarview.viewer.sharing, "FILM_BYTES", 400_000)
     made = film_of(open_result(drive), ".gif")
@@ -156,6 +158,7 @@ def test_a_film_that_would_be_too_large_is_narrower(drive, monkeypatch):
         assert 400 <= moving.size[0] < 960
 
 
+@pytest.mark.extended
 def test_each_point_of_a_drive_is_new_once_and_all_of_stations_are_there(drive, monkeypatch):
     counts = []
 

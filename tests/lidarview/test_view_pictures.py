@@ -149,6 +149,7 @@ def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
     assert ((green > red + 60) & (green > blue + 60)).sum() > 10
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize(
     ("corners", "poses"),
     [
@@ -174,6 +175,7 @@ def solid(k):
     return vertices + place, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(name):
     scene = Scene.from_meshes([SceneMesh(name, *solid(0)), SceneMesh("plain", *solid(1))])

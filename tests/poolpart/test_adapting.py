@@ -105,6 +105,7 @@ def is_kept(partition, queue, begin):
     return kept
 
 
+@pytest.mark.extended
 def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
     events = itertools.count()
     with cluster_of({"GPU": adaptive(0, 1)}) as client:
@@ -220,6 +221,7 @@ def test_jobs_that_the_queue_refuses_are_tried_again_while_there_is_work(queue, 
         assert task.result(LONG_S).startswith("GPU-")
 
 
+@pytest.mark.extended
 def test_workers_of_one_job_go_together(queue, wait_until):
     with cluster_of({"NODE": adaptive(0, 2, processes=2, slots=2)}) as client:
         node = Partition("NODE", client)

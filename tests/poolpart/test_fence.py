@@ -129,6 +129,7 @@ def shuffled(client):
     return [w.name for w in scheduler_of(client).workers.values() if w.has_what]
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     "way",
     [
@@ -227,6 +228,7 @@ def place(*_, pause_s=0.001):
     return [name for name, slots in get_worker().state.total_resources.items() if slots]
 
 
+@pytest.mark.extended
 def test_nothing_is_lost_while_workers_move_to_and_fro(start):
     client = start({name: {"nthreads": 2} for name in ("a", "b", "c", "d")})
     client.cluster.scheduler.validate = True

@@ -38,6 +38,7 @@ def client(start):
     return client
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("way", ["get_client", "worker_client", "compute"])
 def test_at_any_depth_and_on_a_single_slot(client, way):
     names = Partition("A", client).submit(descend, 3, way).result(LONG_S)

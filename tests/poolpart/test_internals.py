@@ -112,6 +112,7 @@ def test_what_fails_while_it_is_asked_does_not_reach_strangers(monkeypatch, star
     assert 0 < len(told) == len(set(told)) <= 5
 
 
+@pytest.mark.extended
 def test_it_is_imported_with_any_dask():
     lacking = "import distributed.shuffle._core as core; del core.barrier_key; import poolpart"
     subprocess.run([sys.executable, "-c", lacking], check=True, timeout=LONG_S)
@@ -164,6 +165,7 @@ except PoolError as error:
 """
 
 
+@pytest.mark.extended
 def test_without_what_division_needs_it_is_refused_at_once():
     printed = without("distributed.worker_state_machine:WorkerState.all_running_tasks", DIVIDE)
     assert re.match(
@@ -172,6 +174,7 @@ def test_without_what_division_needs_it_is_refused_at_once():
     )
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     "name",
     [

@@ -92,6 +92,7 @@ def await_that_it_is_gone(client, wait_until):
     wait_until(lambda: [name for name in clients if name.startswith("Client-")] == [client.id])
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("what", "after"),
     [

@@ -111,6 +111,7 @@ def _available(name, dask_worker):
 WAYS = ("gather", "result", "as_completed", "wait", "worker_client", "collection", "map")
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("way", WAYS)
 def test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time(start, way):
     part = one_worker(start, slots=1)
@@ -148,6 +149,7 @@ def descend(depth):
     return first + sum(client.gather(client.map(descend, [depth - 1] * 2, pure=False)))
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_thread_and_one_slot_each_are_enough_at_any_depth(start, workers):
     client = start({str(number): {} for number in range(workers)})
@@ -514,11 +516,13 @@ def tree(request):
     return grow
 
 
+@pytest.mark.extended(every=2)
 def test_a_tree_of_waiting_tasks_on_two_slots_ends(start, tree):
     client = start({"a": {"resources": {"A": 2}, "nthreads": 2}})
     assert tree(client) == 2 ** (LEVELS + 1) - 1
 
 
+@pytest.mark.extended(every=2)
 def test_a_tree_of_waiting_tasks_on_two_workers_ends(start, tree):
     client = start({name: {"resources": {"A": 1}} for name in "ab"})
     assert tree(client) == 2 ** (LEVELS + 1) - 1

@@ -126,6 +126,7 @@ def driver(tmp_path_factory):
     process.communicate()
 
 
+@pytest.mark.extended
 def test_scheduler_nannies_workers_and_dashboard_listen_on_loopback_only(driver):
     process, pids = driver
     # Scheduler, nannies and dashboard are in the driver.
@@ -147,6 +148,7 @@ def test_no_worker_outlives_a_driver_that_is_killed(driver, wait_until):
     wait_until(lambda: gone(pids))
 
 
+@pytest.mark.extended
 def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tmp_path):
     body = "print(client.submit(defined_here, 20).result(), file=sys.stderr)"
     driver = script(tmp_path, body, call="def defined_here(x): return 2 * x + 2\n\nmain()")
@@ -191,6 +193,7 @@ LATE = """
 """
 
 
+@pytest.mark.extended
 def test_workers_that_close_while_the_scheduler_owes_an_answer_say_nothing(tmp_path):
     """As the schedulers of busy machines do at the end of a run."""
     running = script(tmp_path, LATE)

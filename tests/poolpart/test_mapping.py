@@ -205,6 +205,7 @@ def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, c
     wait_until(lambda: task_count(client) <= 1)  # the failed one, by the traceback
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("retries", [0, 1])
 @pytest.mark.parametrize("chunk", [None, 1, 10])
 @pytest.mark.parametrize("ordered", [True, False])
@@ -333,6 +334,7 @@ def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, rec
     assert received.total() > 8 * 2**20
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_a_map_of_a_map_of_a_map_with_other_arguments(a, b, chunk):
     inner = a.map(twice, range(500), chunk=chunk)
@@ -349,6 +351,7 @@ def test_a_map_of_a_map_of_a_map_with_other_arguments(a, b, chunk):
     assert list(twins) == [4 * x for x in range(50)]
 
 
+@pytest.mark.extended
 def test_a_map_of_an_endless_map_has_a_bounded_number_under_way(a, b, client):
     results = b.map(twice, a.map(twice, itertools.count(), chunk=1), chunk=1)
     most = 0
@@ -380,6 +383,7 @@ def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
 # -- lost workers ----------------------------------------------------------------------
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("ordered", [True, False])
 def test_a_lost_worker_is_survived(nannies, ordered):
     partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)
@@ -408,6 +412,7 @@ def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordere
     assert list(results) == [True] * 4
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("as_results", [True, False])
 def test_items_that_kill_their_workers_are_named(nannies, as_results):
     partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)

@@ -20,6 +20,7 @@ def stamp():
     return time.monotonic()
 
 
+@pytest.mark.extended
 def test_tasks_run_on_its_workers_and_on_all_of_them(a, b):
     assert [worker.name for worker in a.workers] == ["A-0", "A-1"]
     assert (len(a), a.slots, len(b), b.slots) == (2, 4, 1, 1)

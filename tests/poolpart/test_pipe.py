@@ -62,6 +62,7 @@ def wait_for_waiters(client, counts):
     wait_until(lambda: all(len(queues[p.name].waiters) == n for p, n in counts.items()))
 
 
+@pytest.mark.extended
 @given(operations=OPERATIONS, capacity=st.integers(1, 4))
 @settings(max_examples=40)
 def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):

@@ -51,6 +51,7 @@ def compute(make):
         return names(make().compute())
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("exclusive", [False, True])
 @pytest.mark.parametrize("make", [rechunked, shuffled])
 def test_inside_a_task_of_a_partition(start, make, exclusive):

@@ -27,6 +27,7 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
+@pytest.mark.extended(every=3)
 def test_batches_may_be_cut_anywhere(caster, shapes, monkeypatch):
     vase = caster(*shapes["vase"]())
     origins, directions = rays(3000, 1)

@@ -60,7 +60,8 @@ def check(hits, mesh, rays, graze, t_min=0.0, t_max=np.inf):
     return surely_hit
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.extended(every=15)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
 @pytest.mark.parametrize("offset", [0.0, 5e5, 4e6])
 def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
@@ -210,7 +211,7 @@ def test_far_origins_lose_nothing(caster, shapes):
         np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
 def test_any_unit_of_length(caster, shapes, size):
     vertices, faces = shapes["vase"](20, 20)
@@ -223,7 +224,7 @@ def test_any_unit_of_length(caster, shapes, size):
     np.testing.assert_allclose(got.distance / size, want.distance, rtol=1e-12)
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_corners_of_an_open_sheet_and_of_a_ball_are_hit(backend, shapes, axis, sign):

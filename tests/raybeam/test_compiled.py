@@ -49,6 +49,7 @@ def printed(process):
     return process.communicate()[0].split()
 
 
+@pytest.mark.extended
 def test_only_a_change_of_imported_files_compiles_again(package):
     """A loop depends on what its file imports, also indirectly, and not on all of its package.
 
@@ -61,6 +62,7 @@ def test_only_a_change_of_imported_files_compiles_again(package):
     assert printed(start(package)) == ["31.0", "1"]
 
 
+@pytest.mark.extended
 def test_processes_that_start_together_compile_once(package):
     """The others wait, and load what the first has kept."""
     started = [start(package) for _ in range(4)]

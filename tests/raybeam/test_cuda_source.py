@@ -8,12 +8,10 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from tests.rows import quick
 
 from raybeam.cuda_backend import flags, source
 
-# The oldest and the newest in the fast tests.
-CARDS = quick((120,), (75, 80, 86, 89, 90, 100, 120))
+CARDS = (75, 80, 86, 89, 90, 100, 120)
 AS_CUPY = "-ftz=true"  # what it adds of itself
 # {(whether there are instances, whether there are masks): options}
 FLAGS = {kind: (*flags(64, *kind), AS_CUPY) for kind in product((False, True), repeat=2)}
@@ -61,6 +59,8 @@ def report(nvcc, folder, card, kind):
     return {name: tuple(map(int, numbers)) for name, *numbers in rows}
 
 
+@pytest.mark.extended(keep=("120-*",))
+@pytest.mark.slow(keep=("120-*",))
 @pytest.mark.parametrize("kind", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
 def test_compiles_without_spills(nvcc, tmp_path, card, kind):
@@ -76,6 +76,7 @@ def test_compiles_without_spills(nvcc, tmp_path, card, kind):
         assert registers <= 65_536 // (128 * blocks), name
 
 
+@pytest.mark.slow(keep=("120-*",))
 @pytest.mark.parametrize("kind", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
 def test_nvrtc_compiles_as_cupy_does(card, kind):

@@ -42,7 +42,7 @@ def rays_down(count, tilt, seed=0):
     return origins, np.column_stack([tilt * rng.normal(size=(count, 2)), np.full(count, -1.0)])
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("gap", SHEETS)
 def test_sheets_close_together(same_as_numpy, gap):
     for slope, tilt in ((0.0, 0.0), (0.0, 0.3), (30.0, 0.0), (30.0, 0.3)):
@@ -77,7 +77,7 @@ def test_grazing_rays(same_as_numpy):
     same_as_numpy(sheets([0.0, 1e-7, 1e-6, 1e-4]), origins, directions)
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("power", range(14, 24))
 def test_triangles_whose_products_underflow(same_as_numpy, power):
     """Of edges around 1e-20 of the scene, float32 keeps no area: all must go to the exact test."""

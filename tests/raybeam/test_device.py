@@ -56,6 +56,7 @@ def visited(caster, scan, counters=None, others=None):
     return joined, [np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)], *counted
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("every", [1, 3, 10**12])
 def test_a_visit_sees_what_a_scan_returns(vase, every):
     given = {"keep_every": every, "groups": [0, 0, 13, 1990], "tally": True}

@@ -72,7 +72,8 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.extended(every=15)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("offset", [0.0, 5e5])
 @pytest.mark.parametrize("kind", ["turned", "mirrored", "uneven", "sheared"])
 def test_as_the_same_triangles_in_one_mesh(backend, forest, kind, offset):

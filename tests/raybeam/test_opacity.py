@@ -42,7 +42,8 @@ def rays(count):
     return origins, rng.uniform(-20, 20, (count, 3)) - origins
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=15)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("place", [None, np.diag([2.0, -3, 1, 1])])
 @pytest.mark.parametrize("repeats", [1, 3])
 def test_a_ray_passes_where_the_mask_is_false(backend, place, repeats):
@@ -64,6 +65,7 @@ def test_a_ray_passes_where_the_mask_is_false(backend, place, repeats):
     np.testing.assert_allclose(hits.distance, np.where(stopped, 5, 6), rtol=1e-12)
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("kind", ["random", "sliver", "tiny"])
 def test_kernels_have_the_bits_of_numpy(kernels, shapes, kind):
     origins, directions = rays(4_000)

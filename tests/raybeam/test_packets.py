@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from benchmarks.gpu_scenes import grid_faces
-from tests.rows import quick
 
 from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
 
@@ -68,6 +67,7 @@ def test_neighbours_have_no_effect(mesh):
     np.testing.assert_array_equal(got.triangle, want[1][few])
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("limits", [(0.0, np.inf), (0.7, 1.5)])
 def test_embree_has_the_bits_of_numpy(mesh, limits):
     directions = lidar()
@@ -123,7 +123,9 @@ def ties(backend):
     return found.hexdigest()
 
 
-@pytest.mark.parametrize("isa", quick(("AVX2",), ("SSE4.2", "AVX", "AVX2", "AVX512")))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("AVX2",))
+@pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
 def test_the_lowest_of_equals_wins_with_every_instruction_set(isa):
     """Packets of 4, 8 and 16 rays, with and without fused multiply-adds."""
     flag = {"SSE4.2": "SSE42", "AVX512": "AVX512_SKX"}.get(isa, isa)
@@ -152,6 +154,7 @@ def test_forked_processes_cast_too():
     )
 
 
+@pytest.mark.extended(every=2)
 def test_which_rays_go_together_changes_nothing(mesh):
     """Groupings of rays are tried in turn, until one is known to be the fastest."""
     caster = RayCaster(*mesh, backend="embree", threads=1)

@@ -135,7 +135,8 @@ def check(caster, case, windows, limits):
         np.testing.assert_array_equal(to, directions[some])
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CASES)
 def test_rays_are_those_of_the_interface(caster, shapes, name):
     """Windows past the pattern's end, with and without limits, from near and from far."""
@@ -154,7 +155,8 @@ def test_rays_are_those_of_the_interface(caster, shapes, name):
 CUT = ["one pose", "a pose each ray", "firings, lever arms", "on the move, lever arms"]
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CUT)
 def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
     case = case_of(name)
@@ -178,7 +180,7 @@ def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
         same(got, vase.scan(pattern, *full, window=(0, 2400), rays_per_pose=40))
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize(("rays", "first"), [(7, 5), (40, 0), (40, 80), (40, 7)])
 @pytest.mark.parametrize("name", ["firings, lever arms", "on the move, lever arms"])
 def test_pattern_shorter_than_a_chunk(caster, shapes, name, rays, first):
@@ -205,7 +207,8 @@ def thinned(want, groups, every, rays):
     return hits, keep
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=12)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     ("name", "limits"),
     [

@@ -52,7 +52,8 @@ def poses(rng, kind, rays):
     return {**many, "rays_per_pose": 49, "motion": motion if kind == "moves" else None}
 
 
-@pytest.mark.every_nth(5)
+@pytest.mark.extended(every=20)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])
 def test_a_scan_has_the_bits_of_rays_made_one_by_one(backend, shapes, place, kind):
@@ -71,7 +72,7 @@ def test_a_scan_has_the_bits_of_rays_made_one_by_one(backend, shapes, place, kin
         assert np.array_equal(returns.triangle, hits.triangle[hits.hit])
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
 @pytest.mark.parametrize("kind", ["none", "origins", "", "axis starts offsets", "starts origins"])
 def test_loops_make_the_rays_of_numpy(place, kind):

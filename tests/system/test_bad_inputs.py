@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import trimesh
 from tests.clusters import cluster_of, import_jobqueue, thread_cluster
-from tests.rows import quick
 
 import lidarpool.run.cluster.connection
 import lidarpool.run.cluster.watch as lidarpool_watch
@@ -159,6 +158,7 @@ def test_a_bad_file(case, place, refused):
     refused(["run", name], says)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_bad_arguments(case, refused, impatient):
     refused(*OPTIONS[case])
@@ -180,6 +180,7 @@ def test_out_is_in_use_by_another_run(place, refused):
     os.close(handle)
 
 
+@pytest.mark.extended
 def test_a_listener_that_is_no_scheduler(refused, impatient):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -215,7 +216,9 @@ TOO_LARGE: dict[str, str] = {
 }
 
 
-@pytest.mark.parametrize("scenario", quick([*TOO_LARGE][:1], TOO_LARGE))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("steps: 100000*",))
+@pytest.mark.parametrize("scenario", TOO_LARGE)
 def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):
     (place / "s.yaml").write_text(scenario)
     workers = {

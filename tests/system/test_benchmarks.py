@@ -1,10 +1,11 @@
 """The benchmarks at toy size, so that they cannot rot; no figure is judged here."""
 
 import json
+import re
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import control, effects, formats, gpu, model, scale
+from benchmarks import control, decoders, effects, formats, gpu, model, scale
 from distributed import Client
 from docs.pictures import adapting as adapting_picture
 from docs.pictures.effects import __main__ as pictures
@@ -112,3 +113,18 @@ def test_mujoco(capsys):
 
     assert mujoco.main(["--quick"]) == 0
     assert "| 4 quadrupeds | 23,040 |" in capsys.readouterr().out
+
+
+def test_decoders(capsys, monkeypatch):
+    """Those that extras install; the others demand older packages, and are named."""
+    for module in ("velodyne_decoder", "pye57", "laspy", "mcap_ros2"):
+        pytest.importorskip(module)
+    programs = ["velodyne-decoder", "pye57", "laspy", "mcap"]
+    assert decoders.main(["--quick", "--only", *programs]) == 0
+    table = capsys.readouterr().out
+    assert all(f"| {program} " in table for program in programs)
+    assert "ring, reflectivity equal" in table and not re.search(r"\d differ|in the cloud", table)
+    monkeypatch.setattr(decoders, "python_of", lambda program, pythons: None)
+    assert decoders.main(["--quick", "--only", "pykitti"]) == 1
+    told = capsys.readouterr().err
+    assert "pykitti was left out: pip install pykitti opencv-python-headless" in told

@@ -38,6 +38,7 @@ def of(job, columns, name):
     return columns["object"] == job.scene.all_names.index(name)
 
 
+@pytest.mark.extended
 def test_all_sources_are_in_one_scene_and_meshes_are_kept_once(scanned):
     built, job, _ = scanned
     assert [*built.findings.sources] == [
@@ -50,6 +51,7 @@ def test_all_sources_are_in_one_scene_and_meshes_are_kept_once(scanned):
     assert len(cars) == 100 and len({id(car.mesh.vertices) for car in cars}) == 2
 
 
+@pytest.mark.extended
 def test_the_robot_and_the_cars_are_on_the_hills(scanned):
     _, job, _ = scanned
     at, _ = job.survey.path.poses(0, np.array([0.0, 1e9]))
@@ -59,6 +61,7 @@ def test_the_robot_and_the_cars_are_on_the_hills(scanned):
     np.testing.assert_allclose(heights, hills, atol=0.05)
 
 
+@pytest.mark.extended
 def test_lane_markings_stand_out_and_cars_have_their_class(scanned):
     _, job, columns = scanned
     street = of(job, columns, "Street")

@@ -18,11 +18,21 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 from tests.killed_drivers import drive
-from tests.rows import quick
 
 import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
-from lidarpool import Campaign, Job, LidarError, Material, Scene, Sensor, Survey, simulate, sweeps
+from lidarpool import (
+    Campaign,
+    Job,
+    LidarError,
+    Material,
+    Mounted,
+    Scene,
+    Sensor,
+    Survey,
+    simulate,
+    sweeps,
+)
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
@@ -109,7 +119,9 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     return Job(Scene.seed(), what, values={"x": number})
 
 
-@pytest.mark.parametrize("keep", quick(("kitti",), ["kitti", "nuscenes"]))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("kitti",))
+@pytest.mark.parametrize("keep", ["kitti", "nuscenes"])
 def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
     names = {40: "road", 10: "car"}
     sensor = Sensor.grid(360, 20, step_deg=4)
@@ -125,9 +137,24 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
     assert again.done == 2, "all files are known as the data set's own"
 
 
+def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
+    def make_named(number: int, rng: np.random.Generator) -> Job:
+        sensor = Sensor.grid(360, 20, step_deg=4)
+        roof = Mounted(sensor, name="roof" if number else "LIDAR_TOP")
+        what = Survey(sensors=[roof], poses=[(number, 0, 1)], steps=45)
+        return Job(Scene.seed(), what, values={"x": number})
+
+    run = Campaign(make_named, 3, keep="nuscenes").run(tmp_path / "ds", client=client)
+    (note,) = run.notes
+    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
+    assert {sweep.sensor for sweep in sweeps(tmp_path / "ds")} == {"roof", "LIDAR_TOP"}
+    assert [path.name for path in (tmp_path / "ds/samples").iterdir()] == ["LIDAR_TOP"]
+
+
 # -- each job alone -------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
     out = files / "job-5"
@@ -136,6 +163,7 @@ def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, s
     assert (out / "cloud.ply").read_bytes() == whole["jobs/0005/cloud.ply"]
 
 
+@pytest.mark.extended
 def test_any_number_of_workers_gives_the_same_bytes(files, whole):
     many = ({"GPU": 1}, {"GPU": 2, "A": 1}, {"LIDAR": 6}, {"LIDAR": 2, "A": 1})
     with thread_cluster(*many) as cluster, Client(cluster, set_as_default=False) as client:
@@ -159,7 +187,8 @@ def failing(*numbers: int) -> Callable[[int, np.random.Generator], Job]:
     return make_or_fail
 
 
-@pytest.mark.parametrize("numbers", quick([(0,)], [(0,), (2,), (0, 1, 2)]), ids=str)
+@pytest.mark.slow(keep=("(0,)",))
+@pytest.mark.parametrize("numbers", [(0,), (2,), (0, 1, 2)], ids=str)
 def test_jobs_that_cannot_be_made(client, tmp_path, numbers):
     campaign = Campaign(failing(*numbers), 3, keep="folder")
     run = campaign.run(tmp_path / "ds", client=client)
@@ -201,7 +230,8 @@ def breaking(where: str) -> Callable[[int, np.random.Generator], Job]:
 WORDS = {"cast": "no direction", "describe": "ZeroDivisionError: no such step"}
 
 
-@pytest.mark.parametrize("where", quick(("cast",), WORDS))
+@pytest.mark.slow(keep=("cast",))
+@pytest.mark.parametrize("where", WORDS)
 def test_a_sensor_that_raises_in_a_worker_fails_its_job_only(client, tmp_path, where, left_over):
     run = Campaign(breaking(where), 4, keep="folder").run(tmp_path / "ds", client=client)
     assert [row.name for row in run.failed] == ["0001"] and run.done == 3
@@ -220,6 +250,7 @@ class Unpicklable(Sensor):
         raise TypeError("cannot pickle a laser")
 
 
+@pytest.mark.extended
 def test_jobs_that_cannot_be_sent_to_workers_fail_alone(client, tmp_path, left_over):
     kinds = (Unpicklable, Sensor, Unpicklable, Unpicklable, Sensor)
 
@@ -334,7 +365,8 @@ HARM = {
 }
 
 
-@pytest.mark.parametrize("harm", quick(("manifest flipped",), HARM))
+@pytest.mark.slow(keep=("manifest flipped",))
+@pytest.mark.parametrize("harm", HARM)
 def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool, slots, harm):
     change, name = HARM[harm]
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
@@ -380,6 +412,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
 
 
+@pytest.mark.extended
 def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
@@ -407,6 +440,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     assert "bit for bit" in lidarpool(*run, "--job", 1).out
 
 
+@pytest.mark.extended
 def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds", "--resume"]
     for count in (2, 6):
@@ -530,9 +564,9 @@ def three(slots, full_disk, tmp_path_factory):
     return bytes_of(folder)
 
 
-@pytest.mark.parametrize(
-    "where", quick(("run", "jobs/0001"), ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
-)
+@pytest.mark.extended
+@pytest.mark.slow(keep=("run", "jobs/0001"))
+@pytest.mark.parametrize("where", ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
 def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
     link = here / "ds" / where
     stranger = here / "stranger"
@@ -551,7 +585,9 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     assert bytes_of(here / "ds") == three
 
 
-@pytest.mark.parametrize("harm", quick((".jobs/*.json",), ["jobs/*/cloud.ply", ".jobs/*.json"]))
+@pytest.mark.extended
+@pytest.mark.slow(keep=(".jobs/*.json",))
+@pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
 def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, monkeypatch, harm):
     for path in (here / "ds").glob(harm):
         path.unlink()
@@ -576,7 +612,8 @@ LOST = {
 }
 
 
-@pytest.mark.parametrize("lost", quick(("half of it",), LOST))
+@pytest.mark.slow(keep=("half of it",))
+@pytest.mark.parametrize("lost", LOST)
 def test_finished_jobs_are_known_without_the_database(client, here, unwritten, lost):
     ds = here / "ds"
     before = bytes_of(ds)
@@ -614,8 +651,9 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
+@pytest.mark.slow(keep=("kitti",))
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.parametrize("kept", quick(("kitti",), DATA_SETS))
+@pytest.mark.parametrize("kept", DATA_SETS)
 def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept):
     ds = tmp_path / "ds"
     Campaign(make, 2, keep=kept, splits={"a": 0.5, "b": 0.5}).run(ds, client=client)
@@ -660,6 +698,7 @@ def test_options_that_do_not_go_together(files, lidarpool, options, words, slots
     assert not (files / "ds").exists()
 
 
+@pytest.mark.extended
 def test_several_scenarios_are_a_campaign(files, lidarpool, slots):
     (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
     two = [files / "base.yaml", files / "other.yaml"]
@@ -711,6 +750,7 @@ def test_killed_drivers_leave_the_same_bytes_and_no_remains(
     assert left_over(client) == ([], [], [])
 
 
+@pytest.mark.extended
 def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
     (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 100"))
     command = ["run", "c.yaml", "-q", "--scheduler", slots, "--out", "ds"]
@@ -799,6 +839,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
     assert run.done == 6 and bytes_of(files / "ds") == whole
 
 
+@pytest.mark.extended
 def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client):
     monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
     run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)

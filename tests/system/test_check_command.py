@@ -16,7 +16,6 @@ import yaml
 from distributed import Client
 from tests.clusters import thread_cluster
 from tests.meshes import PLY
-from tests.rows import quick
 
 import lidarpool.run.forecast
 from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
@@ -93,7 +92,9 @@ SURVEYS = {
 }
 
 
-@pytest.mark.parametrize("name", quick(("dense", "two sensors", "of channels"), SURVEYS))
+@pytest.mark.extended(keep=("dense",))
+@pytest.mark.slow(keep=("dense", "two sensors", "of channels"))
+@pytest.mark.parametrize("name", SURVEYS)
 def test_an_estimate_is_near_what_a_run_gives(name):
     """Of a thing that fills some scans and is in few of them."""
     survey = SURVEYS[name]
@@ -177,6 +178,24 @@ def test_objects_with_masks_are_named(check, tmp_path):
     assert "have masks" not in check("--no-plan", text=json.dumps(scenario)).out
 
 
+def test_objects_that_sensors_do_not_see_are_named(check):
+    names = list(Scene.seed().names)
+    seats = {"front": {"unseen": [names[0], names[1]]}, "rear": {}, "blind": {"unseen": "*"}}
+    scenario = SHORT | {"sensors": {k: SHORT.get("sensor", {}) | v for k, v in seats.items()}}
+    scenario.pop("sensor", None)
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert f"unseen      by front, 2 objects: {names[0]}, {names[1]}\n" in told
+    assert f"unseen      by blind, 6 objects: {', '.join(names[:3])} and 3 more\n" in told
+    said = json.loads(check("--json", "--no-plan", text=json.dumps(scenario)).out)
+    assert said["unseen"] == {"front": names[:2], "blind": names}
+    scenario["sensors"]["rear"]["unseen"] = "Nobody"
+    outcome = check(text=json.dumps(scenario))
+    assert outcome.code == 2 and "unseen of sensor 'rear' names 'Nobody'" in outcome.err
+    assert f"There are {names[0]}, " in outcome.err
+    told = check(text=json.dumps(SHORT | {"sensor": {"unseen": "*"}})).out
+    assert "no ray hit anything at any distance: check unseen, poses and units" in told
+
+
 def test_a_disk_without_room(check, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 1_000_000))
     outcome = check()
@@ -255,6 +274,7 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     )
 
 
+@pytest.mark.extended
 def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     mesh = trimesh.creation.box((8000, 3000, 6000))
     (tmp_path / "there").mkdir()
@@ -298,6 +318,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     assert "holds an unfinished run: --resume continues it" in outcome.out
 
 
+@pytest.mark.extended
 def test_the_command_that_is_named_runs_where_another_result_is(
     check, cluster, tmp_path, lidarpool
 ):

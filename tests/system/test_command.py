@@ -82,6 +82,7 @@ def listened_on(pid: int) -> list[str]:
     return found
 
 
+@pytest.mark.extended
 def test_the_demo_makes_all_files_and_says_so(demo):
     out = demo.out
     ended = demo.ended
@@ -97,6 +98,7 @@ def test_the_demo_makes_all_files_and_says_so(demo):
     assert ended.stdout.splitlines()[-1] == f"results in {out}: {', '.join(MADE)}"
 
 
+@pytest.mark.extended
 def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
     ended = demo.ended
     lines = ended.stderr.splitlines()
@@ -109,6 +111,7 @@ def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
     assert any("writing the cloud" in line for line in lines)
 
 
+@pytest.mark.extended
 def test_the_report_has_all_that_is_promised(demo):
     out = demo.out
     text = (out / "report.json").read_text()
@@ -133,6 +136,7 @@ def test_the_report_has_all_that_is_promised(demo):
     assert planning["best_length"] <= 1.01 * planning["shortest_possible"]
 
 
+@pytest.mark.extended
 def test_the_demo_listens_on_loopback_only(demo):
     # Scheduler and dashboard, and of each of three partitions at least a nanny and a worker.
     assert max(map(len, demo.sockets)) >= 2 + 3 * 2
@@ -151,6 +155,7 @@ def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
     return run
 
 
+@pytest.mark.extended
 def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("path.png", "mine.txt"):
@@ -230,6 +235,7 @@ def test_doctor_tells_what_is_here(lidarpool):
     assert lidarpool("--version").out.startswith("lidarpool, version ")
 
 
+@pytest.mark.extended
 @pytest.mark.usefixtures("pictures")
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
     out = demo.out
@@ -305,6 +311,7 @@ def processes_with(variable: str) -> list[str]:
     return commands
 
 
+@pytest.mark.extended
 def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
     mark = f"LIDARPOOL_TEST_{os.getpid()}"
     (tmp_path / "scenario.yaml").write_text(SHORT)

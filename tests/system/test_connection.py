@@ -19,6 +19,7 @@ from lidarpool.run.cluster.connection import connected, local_client
 from lidarpool.run.cluster.watch import Waiting
 
 
+@pytest.mark.extended
 def test_workers_are_forked_from_one_process_also_in_place_of_others():
     others = set(psutil.Process().children(recursive=True))  # of the tests' own cluster
     preload = forkserver._forkserver._preload_modules
@@ -60,6 +61,7 @@ def waiting_run(tmp_path, address):
     run.close()
 
 
+@pytest.mark.extended
 def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_path):
     workers = {name: {"resources": {name: slots}} for name, slots in (("GPU", 1), ("LIDAR", 4))}
     with cluster_of(workers, {"port": int(address.rpartition(":")[2])}, host="127.0.0.1"):
@@ -67,6 +69,7 @@ def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_p
     assert (tmp_path / "out" / "cloud.ply").exists()
 
 
+@pytest.mark.extended
 def test_waiting_for_a_scheduler_ends_with_an_interrupt(waiting_run):
     assert waiting_run.signal(signal.SIGINT) == 130
     assert waiting_run.said.splitlines()[-1].startswith("lidarpool: interrupted")

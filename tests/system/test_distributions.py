@@ -133,8 +133,7 @@ def built(tmp_path_factory) -> Path:
     return place
 
 
-@pytest.mark.slow
-@pytest.mark.sample
+@pytest.mark.extended
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_they_hold_the_files_that_git_has_and_no_others(built, name):
     tracked = subprocess.run(
@@ -163,8 +162,7 @@ def test_they_hold_the_files_that_git_has_and_no_others(built, name):
     assert f"{stem}.dist-info/licenses/LICENSE" in about
 
 
-@pytest.mark.slow
-@pytest.mark.sample
+@pytest.mark.extended
 def test_a_package_index_would_take_them(built):
     files = sorted(built.iterdir())
     assert len(files) == 2 * len(DISTRIBUTIONS)
@@ -239,14 +237,9 @@ class Environment:
         return self.run("python", "-I", "example.py", cwd=folder)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.sample if name == "poolpart" else ())
-        for name in DISTRIBUTIONS
-    ],
-)
+@pytest.mark.extended
+@pytest.mark.slow(keep=("poolpart",))
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
     alone = Environment(tmp_path / "venv", built, name)
     distribution = DISTRIBUTIONS[name]

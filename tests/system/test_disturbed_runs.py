@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from distributed import Client, Worker
 from tests.clusters import thread_cluster
-from tests.rows import quick
 
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.cluster.watch import WATCH_EVERY_S
@@ -54,6 +53,7 @@ def test_frames_come_in_order_and_every_scan_once(
     assert left_over(client) == ([], [], [])
 
 
+@pytest.mark.extended
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "lidarpool.run.pipeline.policies.MAX_BATCHES_PER_TASK", 1
@@ -107,7 +107,8 @@ def test_a_worker_that_dask_pauses_gets_no_more_batches(
     assert placement_violations(result.records) == []
 
 
-@pytest.mark.parametrize("kind", quick((KeyboardInterrupt,), [OSError, KeyboardInterrupt]))
+@pytest.mark.slow(keep=("KeyboardInterrupt",))
+@pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
 def test_an_error_in_the_callback_passes_through_and_stops_the_run(
     cluster_client, undisturbed, same_cloud, kind, left_over
 ):
@@ -123,7 +124,8 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(
         assert same_cloud(again.cloud, undisturbed.cloud)
 
 
-@pytest.mark.parametrize("pump", quick((Pipeline,), [Pipeline, TrialPump]))
+@pytest.mark.slow(keep=("Pipeline",))
+@pytest.mark.parametrize("pump", [Pipeline, TrialPump])
 def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
     method = "open" if pump is Pipeline else "step"
     original = getattr(pump, method)

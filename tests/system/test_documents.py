@@ -121,6 +121,7 @@ def in_threads(monkeypatch, cluster_client):
     monkeypatch.setattr(lidarpool.run.cluster.cluster, "local_client", lambda *_, **__: ours)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
 def test_python_runs(tmp_path, block, in_threads, capsys):
     compile(block.code, block.where, "exec")
@@ -303,6 +304,7 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize(
     ("page", "package"),
     [

@@ -56,6 +56,7 @@ def warnings(outcome: Any) -> list[str]:
     return [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
 
 
+@pytest.mark.extended
 def test_a_warning_is_on_stderr_and_strict_exits_with_1(run):
     outcome = run("--quiet")
     assert outcome.code == 0
@@ -74,7 +75,8 @@ def test_json_has_the_warning_as_a_note(run):
     assert warning in json.loads(outcome.out)["notes"]
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.extended(every=6)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
@@ -111,6 +113,7 @@ def test_check_gives_the_same_reason(tmp_path, lidarpool):
     assert lidarpool("check", tmp_path / "s.yaml", "--strict").code == 1
 
 
+@pytest.mark.extended
 def test_shards_of_a_survey_and_what_is_merged_of_them(run, lidarpool, tmp_path):
     for number in (1, 2):
         outcome = run("--quiet", "--shard", f"{number}/2", "--strict", out=f"part-{number}")
@@ -152,6 +155,7 @@ def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tm
     assert outcome.code == 1 and [warning] == warnings(outcome)
 
 
+@pytest.mark.extended
 def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, slots, tmp_path):
     for number, jobs in ((1, ""), (2, "2 jobs have no points: 0001, 0003; in job 0001 no ray hit")):
         out = tmp_path / f"part-{number}"

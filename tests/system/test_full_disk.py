@@ -71,6 +71,7 @@ def disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
             pytest.fail(f"files of it are still open: {done.stderr}")
 
 
+@pytest.mark.extended
 def test_the_disk_of_the_run_is_full(disk, run, expected):
     folder = disk(100) / "run"
     for kilobytes in (160, 4000):  # some more room, and it is full again

@@ -14,7 +14,6 @@ from fsspec.registry import _registry
 from tests.clusters import thread_cluster
 from tests.drives import the_scene, the_sweeps, write_set
 from tests.killed_drivers import drive
-from tests.rows import quick
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of
 from tests.system.test_resume import SCANS
@@ -194,7 +193,9 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
         package.sweeps(url)
 
 
-@pytest.mark.parametrize("format", quick(("parquet",), ("kitti", "parquet")))  # pyarrow reads it
+@pytest.mark.extended
+@pytest.mark.slow(keep=("parquet",))
+@pytest.mark.parametrize("format", ("kitti", "parquet"))  # pyarrow reads it
 def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format):  # noqa: A002
     scene = the_scene()
     url = f"{BUCKET}/forks/{format}"

@@ -15,6 +15,7 @@ SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0,
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
 
 
+@pytest.mark.extended
 def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, all_records):
     cluster = outside()
     cluster.add(("GPU", 1))

@@ -77,6 +77,7 @@ def result(local_client):
     return simulate(Scene.seed(), wanted, client=local_client)
 
 
+@pytest.mark.extended
 def test_points_lie_where_the_sensors_own_geometry_says(result):
     """Its rays are made again here, and end at the ranges that were found."""
     cloud = result.cloud

@@ -102,6 +102,7 @@ def test_a_run_writes_laser_scans_beside_points(folder, lidarpool, slots):
             assert points.width == there.sum()
 
 
+@pytest.mark.extended
 def test_a_campaign_of_bags_has_laser_scans(folder, lidarpool, slots):
     (folder / "base.yaml").write_text(json.dumps(SCANNER))
     campaign = {"base": "base.yaml", "count": 1, "vary": {}, "keep": "mcap"}

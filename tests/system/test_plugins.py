@@ -50,6 +50,7 @@ def test_the_page_shows_the_package():
     assert max(text.count("\n") for text in shown.values()) <= 30
 
 
+@pytest.mark.extended
 def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
     """Mesh, sensor, importer, cloud format and command; processes of a cluster write the cloud."""
     environment = os.environ | {"PYTHONPATH": f"{installed}:{os.environ['PYTHONPATH']}"}
@@ -129,6 +130,7 @@ class Files(Pieces):
 """
 
 
+@pytest.mark.extended
 def test_a_worker_that_cannot_import_the_plugin_is_named(tmp_path, monkeypatch, client, lidarpool):
     folder = write_distribution(
         tmp_path / "installed",

@@ -16,7 +16,6 @@ import pytest
 from distributed import Client
 from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
-from tests.rows import quick
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, merge, sweeps
 from lidarpool.base.sealed import sealed, unsealed
@@ -128,7 +127,8 @@ def content(folder: Path) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("kept", quick(("folder",), DATA_SETS))
+@pytest.mark.slow(keep=("folder",))
+@pytest.mark.parametrize("kept", DATA_SETS)
 def test_shards_of_a_campaign_have_the_files_of_one_run(campaigns, tmp_path, kept):
     folder = campaigns(kept)
     out = tmp_path / "ds"
@@ -192,7 +192,9 @@ DAMAGE = {
 NAMED = {"manifest": ".jobs/0001.json"}
 
 
-@pytest.mark.parametrize("damage", quick(("changed", "manifest"), DAMAGE))
+@pytest.mark.extended(keep=("changed",))
+@pytest.mark.slow(keep=("changed", "manifest"))
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_files_are_named_and_the_next_merge_takes_them(
     parts, campaigns, tmp_path, damage, slots
 ):
@@ -254,7 +256,8 @@ TABLE_EDITS = {
 }
 
 
-@pytest.mark.parametrize("edit", quick(("a foreign number", "seconds"), TABLE_EDITS))
+@pytest.mark.slow(keep=("a foreign number", "seconds"))
+@pytest.mark.parametrize("edit", TABLE_EDITS)
 def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slots):
     table = parts[1] / "jobs.csv"
     out = tmp_path / "ds"
@@ -334,7 +337,8 @@ STRANGE_ENTRIES = {
 }
 
 
-@pytest.mark.parametrize("edit", quick(("no points", "no files"), STRANGE_ENTRIES))
+@pytest.mark.slow(keep=("no points", "no files"))
+@pytest.mark.parametrize("edit", STRANGE_ENTRIES)
 def test_a_manifest_with_other_entries_is_damaged(parts, tmp_path, edit):
     path = parts[1] / ".jobs/0001.json"
     manifest = json.loads(path.read_text())
@@ -430,6 +434,7 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
     assert content(out) == whole
 
 
+@pytest.mark.extended
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
     out = tmp_path / "ds"
     file = parts[0].parent / "c.yaml"
@@ -555,6 +560,7 @@ def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED, *arguments], check=True)
 
 
+@pytest.mark.extended
 def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     out = tmp_path / "ds"
     killed(out, parts, ("take", 5), ("take", 5), ("write_table", 1), ("finish", 1))
@@ -566,7 +572,9 @@ def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
 
 
-@pytest.mark.parametrize("moment", quick(("finish",), ("write_table", "finish")))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("finish",))
+@pytest.mark.parametrize("moment", ("write_table", "finish"))
 def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path, moment):
     out = tmp_path / "ds"
     merge(parts[:2], out, partial=True)
@@ -589,6 +597,7 @@ def survey(slots, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.extended
 def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, small_batches):
     run = ["run", survey / "s.yaml", "-q", "--scheduler", slots, "--out"]
     assert lidarpool(*run, survey / "one").code == 0

@@ -48,6 +48,7 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     assert np.array_equal(cloud.channel, rays)
 
 
+@pytest.mark.extended
 def test_a_scene_comes_to_workers_that_see_the_drivers_memory_and_to_others(monkeypatch):
     load = SharedHandle.load
     seen: list[object] = []
@@ -161,7 +162,7 @@ def test_another_client_watches_the_queues_and_variables_of_the_default_survey(c
     assert not Pool.from_client(plain).pipes()
 
 
-@pytest.mark.every_nth(3)
+@pytest.mark.slow(every=3)
 @pytest.mark.parametrize("kind", ["scans", "news", "generate-0", "sort-1", "collect-0-2"])
 def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, plain, kind):
     closed = []

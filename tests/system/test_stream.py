@@ -18,7 +18,6 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 from tests.drives import SCANS, TURNS, the_scene
-from tests.rows import quick
 
 import lidarpool as lp
 from lidarpool import Campaign, Job, LidarError, Mounted, Noise, Pose, Sensor, Survey, Sweep
@@ -63,7 +62,9 @@ def expected(local_client: Client) -> list[Sweep]:
     return list(campaign().stream(client=local_client))
 
 
-@pytest.mark.parametrize("keep", quick(("kitti",), ["parquet", "kitti", "webdataset"]))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("kitti",))
+@pytest.mark.parametrize("keep", ["parquet", "kitti", "webdataset"])
 def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, torch, keep):
     splits = {"train": 0.5, "test": 0.5}
     varied = campaign(keep=keep, splits=splits)
@@ -110,6 +111,7 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(client):
         np.testing.assert_allclose(cosine, expected, atol=2e-3)
 
 
+@pytest.mark.extended
 def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
     armed = sabotage("intersect.cast", SCANS)
     pids = set(client.run(os.getpid).values())
@@ -241,6 +243,7 @@ def test_a_cluster_that_is_lost_ends_it():
 # -- PyTorch ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_torch_divides_jobs_between_ranks(cluster_client, torch):
     stream = campaign(5).stream(client=cluster_client, ahead=4)
     torch.distributed.is_available = torch.distributed.is_initialized = lambda: True

@@ -51,7 +51,7 @@ class Follower:
     static
         Meshes and instances that stand, in world coordinates; `step` needs at least one.
     options
-        Options of `Scanner`, such as columns, noise and threads.
+        Options of `Scanner`, such as columns, noise, threads, and the names of `unseen` bodies.
 
     Raises
     ------

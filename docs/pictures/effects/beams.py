@@ -46,7 +46,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
     starts, directions = pattern_rays(beams, np.arange(len(beams)), (0, 0, 0))
-    hits = rig.scene_caster.caster.cast(starts, directions)
+    hits = rig.scene_casters[0].caster.cast(starts, directions)
     points = starts + hits.distance[:, None] * directions
     return np.asarray(points[:, 1:])
 

@@ -14,7 +14,7 @@ from distributed import Client
 
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
+from lidarsim.base.words import listed, plural
 
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
@@ -78,7 +78,9 @@ def forecast_scenario(
         figures["warnings"] += implausibilities(built)
         figures["sources"] = dict(built.findings.sources)
         if campaign is not None:
-            figures["notes"] += campaign.keep.of_jobs.contradictions(scenario.cloud.coordinates)
+            file_format = campaign.keep.of_jobs
+            figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
+            figures["notes"] += file_format.renamed([*scenario.sensors])
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 
@@ -226,6 +228,9 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         path = "along a trajectory"
     scans = plural(figures["scans"], "scan")
     yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
+    for name, unseen in figures["unseen"].items():
+        by_sensor = f"by {name}, " * bool(name)
+        yield f"unseen      {by_sensor}{plural(len(unseen), 'object')}: {listed(unseen)}"
 
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:

@@ -219,12 +219,14 @@ def export(
 @options.flag("--no-browser", help="Only print the address.")
 @options.new_file("--film", help="Write a .gif or .webp instead: along a drive, or all around.")
 @options.new_file("--export", help="Write the page as one .html instead, of at most 25 MB.")
+@options.flag("--keep-noise", help="Show withheld points and noise of a .las or .laz, too.")
 def view(
     results: Sequence[Path | Storage],
     port: int,
     no_browser: bool,
     film: Path | None,
     export: Path | None,
+    keep_noise: bool,
 ) -> None:
     """Show a file or folder in the browser, or write a file to share.
 
@@ -268,10 +270,14 @@ def view(
 
             from .terminal import Terminal
 
-            share(open_views(folders), film, export, Terminal().writing)
+            shared = open_views(folders, keep_noise=keep_noise)
+            share(shared, film, export, Terminal().writing)
         else:
-            growing = growing_view(folders[0]) if len(folders) == 1 else None
-            show_view(growing or open_views(folders), port=port, browser=not no_browser)
+            growing = None
+            if len(folders) == 1:
+                growing = growing_view(folders[0], keep_noise=keep_noise)
+            shown = growing or open_views(folders, keep_noise=keep_noise)
+            show_view(shown, port=port, browser=not no_browser)
 
 
 @click.command()
@@ -302,6 +308,7 @@ def view(
     help="Unit of A; by default that of a .las or .laz, else m.",
 )
 @click.option("--unit-b", type=click.Choice([*UNITS_M]), help="The same of B.")
+@options.flag("--keep-noise", help="Compare withheld points and noise of a .las or .laz, too.")
 @click.option("--azimuth-deg", type=float, help="Width of a cell; by default the step of pulses.")
 @click.option(
     "--distance",

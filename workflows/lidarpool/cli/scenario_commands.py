@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -352,6 +352,14 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     help="Unit of x, y and z; by default that of a .las or .laz, else m.",
 )
 @click.option(
+    "--epsg",
+    type=click.IntRange(1024, 32767),
+    metavar="CODE",
+    help="EPSG code of a system in metres, to which a cloud is brought from the system that it "
+    "states: from degrees, or from Web Mercator.",
+)
+@options.flag("--keep-noise", help="Make surfaces of withheld points and noise, too.")
+@click.option(
     "--colour",
     type=click.Choice(["rgb", "intensity"]),
     help="What colours the surfels; by default rgb, else intensity, as the cloud has them.",
@@ -359,15 +367,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 @overwrite
 @click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD")
 @_out
-def points(
-    cloud: Path,
-    out: Path,
-    voxel_m: float | None,
-    size: float,
-    unit: str | None,
-    colour: Literal["rgb", "intensity"] | None,
-    overwrite: bool,
-) -> None:
+def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
 
     CLOUD: .ply, .pcd, .las, .laz, .e57, text (.xyz, .txt, .asc, .csv), .pts or .ptx of Leica, .npy,
@@ -378,6 +378,7 @@ def points(
       lidarpool scene points scan.ply place.glb
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
       lidarpool scene points scan.xyz place.glb --unit mm
+      lidarpool scene points tile.laz place.glb --epsg 32618
       lidarpool scene points stations.e57 place.glb --colour intensity
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import scene_of_points
@@ -386,9 +387,7 @@ def points(
         click.echo(f"note: {note}", err=True)
 
     def make() -> Scene:
-        place = scene_of_points(
-            cloud, voxel_m=voxel_m, size=size, unit=unit, colour=colour, tell=tell
-        )
+        place = scene_of_points(cloud, tell=tell, **settings)
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
             tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
         return place

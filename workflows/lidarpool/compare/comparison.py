@@ -120,6 +120,7 @@ def compare(
     intensity_b: str | None = None,
     unit_a: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     unit_b: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    keep_noise: bool = False,
     azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     most_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
@@ -148,6 +149,9 @@ def compare(
     unit_a, unit_b
         Unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text (um, mm, cm, dm, m, km, in, ft,
         yd or mi), in place of metres or of the units that a .las, a .laz or a header states.
+    keep_noise
+        Whether points are compared that a .las or .laz withholds or classifies as noise (classes 7
+        and 18), and those of such columns of other clouds; by default they are left out.
     azimuth_deg
         Width of a cell; by default the step from pulse to pulse, the coarser one.
     distances_m
@@ -159,12 +163,17 @@ def compare(
     Raises
     ------
     LidarError
-        If A or B cannot be read or is empty, or A and B share no quantity to compare.
+        If A or B cannot be read or is empty, has lengths that are not true, as in Web Mercator, or
+        A and B share no quantity to compare.
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
-    first = open_recording(a, sensor_a, intensity_a, name="cloud A", unit=unit_a)
-    second = open_recording(b, sensor_b, intensity_b, name="cloud B", unit=unit_b)
+    first = open_recording(
+        a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
+    )
+    second = open_recording(
+        b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
+    )
     comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
     if not first.is_cloud and not second.is_cloud:
         pairs = _pair_sweeps(first, second, match, comparing.notes)
@@ -356,7 +365,10 @@ class _Comparing:
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
-                raise LidarError(f"{recording.name} has no points: there is nothing to compare.")
+                listed = "".join(f" {note}." for note in recording.left_out_notes)
+                raise LidarError(
+                    f"{recording.name} has no points: there is nothing to compare.{listed}"
+                )
         if not self.measured_points:
             raise LidarError("No pair of sweeps has points in both: choose others.")
         from_a, from_b = (
@@ -381,7 +393,7 @@ class _Comparing:
             "versions": {"lidarpool": __version__},
             **self._source_figures(),
             "pairs": pair_count,
-            "notes": self.notes,
+            "notes": self.notes + [note for r in self.recordings for note in r.left_out_notes],
             "range_image": image_figures,
             "intensity": _intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),

@@ -200,10 +200,9 @@ class _OpenJob:
         if self.sweeps.actors:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(storage.path(name), partial(storage.read, name)) as arrays:
-                # (a, 3), or for each sweep (a, n, 3) if any actor deforms
-                sizes = np.diff(self.sweeps.actor_bounds, axis=-2)[..., 0, :]
-                sizes = sizes if sizes.ndim == 2 else sizes.swapaxes(0, 1)
-                sizes = np.broadcast_to(sizes, arrays["centres"].shape)
+                sizes = np.broadcast_to(
+                    np.ptp(self.sweeps.actor_bounds, axis=1), arrays["centres"].shape
+                )
                 boxes = Boxes(
                     arrays["centres"],
                     arrays["quaternions"],

@@ -57,6 +57,8 @@ class FormatRow:
         Whether readers expect all points in one coordinate system.
     compensates
         Whether its points are always compensated for motion.
+    first_sensor
+        Name that the first sensor has there, whatever its own name, because readers expect it.
     laser_scans
         Whether it has a LaserScan of 2D scanners.
     with_scene
@@ -90,6 +92,7 @@ class FormatRow:
     raw_or_compensated: bool = False
     one_system: bool = False
     compensates: bool = False
+    first_sensor: str = ""
     laser_scans: bool = False
     with_scene: bool = False
     inside: str = ""
@@ -267,6 +270,7 @@ FORMATS = {
         holds=_RINGS,
         named=("class",),
         compensates=True,
+        first_sensor="LIDAR_TOP",
         inside=_NUSCENES_FILES,
         data_set="nuscenes",
         boxes=True,

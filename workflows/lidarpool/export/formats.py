@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -125,7 +125,17 @@ class Format:
         """Return notes for the user on the cloud in this format."""
         left_out = ", ".join(self.left_out(cloud, sweeps))
         notes = [f"{self.format} does not hold {left_out}"] if left_out else []
-        return [*notes, *self.contradictions(sweeps.coordinates)]
+        return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
+
+    def renamed(self, sensors: Sequence[str]) -> list[str]:
+        """Return a note if sensors of these names, "" without one, have others in the format."""
+        expected = self.row.first_sensor
+        if not expected or not sensors or sensors[0] in ("", expected):
+            return []
+        note = f"the first sensor, {sensors[0]!r}, is {expected} in {self.format}"
+        if expected in sensors[1:]:
+            note += f", and {expected!r} is {expected}_2"
+        return [f"{note}: its readers expect this name of the first"]
 
     def contradictions(self, coordinates: str) -> list[str]:
         """Return a note if readers of the format expect different coordinates than the cloud's."""

@@ -174,7 +174,7 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])
     alpha = np.angle(np.exp(1j * alpha))  # between -pi and pi
     lines = []
-    for actor in np.flatnonzero(boxes.points):
+    for actor in np.flatnonzero(boxes.present & (boxes.points > 0)):
         length, width, height = boxes.sizes[actor]
         values = (
             alpha[actor],

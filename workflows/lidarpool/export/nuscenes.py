@@ -21,9 +21,11 @@ from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names
 from ..base.fingerprint import fingerprint
 from . import pieces, reading
 from .boxes import Boxes
+from .format_table import FORMATS
 from .pieces import Data, Entry, as_data
 
 VERSION = "v1.0-lidarpool"
+FIRST_SENSOR = FORMATS["nuscenes"].first_sensor
 _SCENE = "scene-0001"
 _LOG = "survey"
 _DATE = "1980-01-06"  # surveys begin at time 0 of no date
@@ -41,12 +43,12 @@ class Pieces(pieces.Pieces):
     """A data set that nuscenes-devkit opens with `NuScenes("v1.0-lidarpool", path)`.
 
     Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor frame at the start of
-    the sweep, intensity (0 to 255), ring. NAME is the name of the sensor, or LIDAR_TOP without a
-    name. The first sensor's sweeps are the samples; of another sensor, the first sweep that begins
-    in a sample is its key frame, and further sweeps are in `sweeps/NAME`. The ego vehicle's pose is
-    the sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean
-    time of their points in its key frames. Classes with names, below 256, are labels of
-    nuScenes-lidarseg.
+    the sweep, intensity (0 to 255), ring. NAME is LIDAR_TOP for the first sensor, which functions
+    of the devkit expect, and the name of each further sensor. The first sensor's sweeps are the
+    samples; of another sensor, the first sweep that begins in a sample is its key frame, and
+    further sweeps are in `sweeps/NAME`. The ego vehicle's pose is the sensor's, at each sweep.
+    Actors are annotated in each sample, at their poses at its time. Classes with names, below 256,
+    are labels of nuScenes-lidarseg.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -56,7 +58,7 @@ class Pieces(pieces.Pieces):
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
-        self.channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
+        self.channels = _channels(sweeps)
         self.sample, self.first = _samples(sweeps)
         self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
@@ -116,8 +118,7 @@ class Reader(reading.Reader):
 
     @cached_property
     def _names(self) -> list[str]:
-        channels = plain_names(name or "LIDAR_TOP" for name in self.sweeps.sensors)
-        return _files(self.sweeps, channels, _samples(self.sweeps)[1], self.entry)
+        return _files(self.sweeps, _channels(self.sweeps), _samples(self.sweeps)[1], self.entry)
 
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files of points and, with names, classes."""
@@ -134,6 +135,11 @@ class Reader(reading.Reader):
         if labels:
             columns["class"] = self.rows(labels[0], np.dtype("u1"), len(rows)).astype("u2")
         return rows[:, :3], columns
+
+
+def _channels(sweeps: Sweeps) -> list[str]:
+    """Return the names of the channels of all sensors."""
+    return plain_names([FIRST_SENSOR, *(name or FIRST_SENSOR for name in sweeps.sensors[1:])])
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
@@ -267,6 +273,10 @@ class _Tables:
                 x, y, z, w = sweeps.pose.quaternions[sweep].tolist()
                 position = sweeps.pose.positions[sweep].tolist()
                 timestamp = times[sweep]
+                is_key_frame = names[sweep].startswith("samples/")
+                # A sweep between samples points to the sample that follows, from whose boxes and
+                # those before nuscenes-devkit interpolates.
+                number = min(sample[sweep] + (not is_key_frame), count - 1)
                 self._add(
                     "ego_pose",
                     sweep,
@@ -277,7 +287,7 @@ class _Tables:
                 self._add(
                     "sample_data",
                     sweep,
-                    sample_token=self._token("sample", sample[sweep]),
+                    sample_token=self._token("sample", number),
                     ego_pose_token=self._token("ego_pose", sweep),
                     calibrated_sensor_token=self._token("calibrated_sensor", channel),
                     timestamp=timestamp,
@@ -285,7 +295,7 @@ class _Tables:
                     height=0,
                     width=0,
                     filename=names[sweep],
-                    is_key_frame=names[sweep].startswith("samples/"),
+                    is_key_frame=is_key_frame,
                     **neighbours,
                 )
 
@@ -310,12 +320,9 @@ class _Tables:
             )
             chain = self._chain("sample_annotation", annotation_keys)
             for number, beside in zip(samples, chain, strict=True):
-                box = max(boxes[number], key=lambda candidate: candidate.points[actor])
-                counts = [key_boxes.points[actor] for key_boxes in boxes[number]]
-                centres = [key_boxes.centres[actor] for key_boxes in boxes[number]]
-                centre = np.average(centres, 0, counts) if any(counts) else box.centres[actor]
-                x, y, z, w = box.quaternions[actor].tolist()
-                length, width, height = box.sizes[actor].tolist()
+                at_stamp = boxes[number][0]  # of the first sensor, whose sweeps are the samples
+                x, y, z, w = at_stamp.quaternions[actor].tolist()
+                length, width, height = at_stamp.sizes[actor].tolist()
                 self._add(
                     "sample_annotation",
                     (actor, number),
@@ -323,10 +330,10 @@ class _Tables:
                     instance_token=self._token("instance", actor),
                     visibility_token="",
                     attribute_tokens=[],
-                    translation=centre.tolist(),
+                    translation=at_stamp.centres[actor].tolist(),
                     size=[width, length, height],
                     rotation=[w, x, y, z],
-                    num_lidar_pts=int(sum(counts)),
+                    num_lidar_pts=int(sum(keys.points[actor] for keys in boxes[number])),
                     num_radar_pts=0,
                     **beside,
                 )

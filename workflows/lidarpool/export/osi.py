@@ -171,7 +171,7 @@ class _Messages:
         return base
 
     def ground_truth(self, sweep: int, boxes: Boxes) -> Any:
-        """Return the poses of the host vehicle and the actors in the world."""
+        """Return the host vehicle and the actors at the start of a sweep, in the world."""
         osi = self._osi
         sweeps = self._sweeps
         carrier = sweeps.carrier
@@ -186,7 +186,7 @@ class _Messages:
         actors = []
         for actor in np.flatnonzero(boxes.present).tolist():
             base = self._base(boxes.centres[actor], boxes.quaternions[actor], boxes.sizes[actor])
-            base.velocity = _vector(osi, self._velocity(sweep, actor))
+            base.velocity = _vector(osi, sweeps.actor_velocities[actor, sweep])
             actors.append(
                 osi.MovingObject(
                     id=osi.Identifier(value=len(sweeps.objects) + actor),
@@ -201,15 +201,6 @@ class _Messages:
             host_vehicle_id=self._host,
             moving_object=[host, *actors],
         )
-
-    def _velocity(self, sweep: int, actor: int) -> Floats:
-        """Return the mean velocity of an actor during a sweep, world, m/s; 0 within one firing."""
-        sweeps = self._sweeps
-        positions = sweeps.actor_poses.positions[actor]
-        span_s = (sweeps.ends_ns[sweep] - sweeps.begins_ns[sweep]) / 1e9
-        travelled = positions[sweep + len(sweeps)] - positions[sweep]
-        velocity: Floats = travelled / span_s if span_s > 0 else 0 * travelled
-        return velocity
 
     def sensor_data(self, sweep: int, points: Cloud, boxes: Boxes, truth: Any) -> _EncodedMessage:
         """Return the detections and detected actors of a sweep, with the ground truth."""

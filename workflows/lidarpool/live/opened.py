@@ -7,6 +7,7 @@ view each; a data set is a list of jobs with a view each (`job_list.py`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from lidarscenes.files.formats import ROBOTS
@@ -35,16 +36,18 @@ def is_data_set(place: Path | Storage) -> bool:
     )
 
 
-def open_views(paths: Sequence[Path]) -> View:
+def open_views(paths: Sequence[Path], *, keep_noise: bool = False) -> View:
     """Open files and folders of the same place as a view of all their points.
+
+    Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
 
     LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
     others.
     """
-    return join_views(paths, [open_view(path) for path in paths])
+    return join_views(paths, [open_view(path, keep_noise=keep_noise) for path in paths])
 
 
-def open_view(path: Path) -> View:
+def open_view(path: Path, *, keep_noise: bool = False) -> View:
     """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
 
     LidarError if the path has an unfinished run, or nothing that is read.
@@ -56,7 +59,7 @@ def open_view(path: Path) -> View:
         if (path / CLOUD).exists():
             return open_result(path, downloads())
         refuse_unfinished(path)
-        return _recorded(path, title)
+        return _recorded(path, title, keep_noise)
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml"):
         return _preview(path)
@@ -64,7 +67,7 @@ def open_view(path: Path) -> View:
         try:
             view = open_result(path, downloads())
         except LidarError:  # text, or of another program
-            return _recorded(path, title)
+            return _recorded(path, title, keep_noise)
         if not len(view.points):
             raise LidarError(f"{path} has no points.")
         return view
@@ -73,21 +76,21 @@ def open_view(path: Path) -> View:
         is_cloud = suffix == ".asc" and not is_text_raster(path)
     if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice and not is_cloud):
         return _preview(path)
-    return _recorded(path, title)
+    return _recorded(path, title, keep_noise)
 
 
 # Modules of recordings, scenarios and runs are imported only when they are needed: the first points
 # of a result are shown two seconds earlier.
 
 
-def _recorded(path: Path, title: str) -> View:
+def _recorded(path: Path, title: str, keep_noise: bool) -> View:
     """Return the view of a recording."""
     from ..recordings.recordings import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
     may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
     try:
-        return recorded_view(open_sensors(path), title, downloads())
+        return recorded_view(open_sensors(path, keep_noise=keep_noise), title, downloads())
     except UnknownFormatError as error:
         advice = f"{_TRAJECTORY_ADVICE}, or " if may_be_trajectory else error.advice
         raise LidarError(
@@ -100,7 +103,7 @@ def _recorded(path: Path, title: str) -> View:
         raise LidarError(f"{error} If it is a trajectory, {_TRAJECTORY_ADVICE}.") from error
 
 
-def growing_view(path: Path) -> GrowingView | None:
+def growing_view(path: Path, *, keep_noise: bool = False) -> GrowingView | None:
     """Return the view of a sample of a large .las or .laz, until all its points are read.
 
     None for other files and folders. LidarError if the file cannot be read.
@@ -110,11 +113,12 @@ def growing_view(path: Path) -> GrowingView | None:
     from ..recordings.recordings import open_recording
     from .recorded import LARGE_POINTS, sampled_view
 
-    recording = open_recording(path)
+    recording = open_recording(path, keep_noise=keep_noise)
     if recording.sample is None or (recording.point_count or 0) < LARGE_POINTS:
         return None
     sampled = sampled_view(recording, f"{path.resolve().name} - lidarpool")
-    return GrowingView(sampled, recording.point_count or 0, lambda: open_view(path))
+    full = partial(open_view, path, keep_noise=keep_noise)
+    return GrowingView(sampled, recording.point_count or 0, full)
 
 
 def _preview(path: Path) -> View:

@@ -128,11 +128,13 @@ def recorded_view(
     if first.is_cloud:
         cloud = _cloud_of(first)
         sweeps = None
+        notes += first.left_out_notes
     else:
         cloud, sweeps, further_notes = _sweeps_of(sensors)
         notes += further_notes
     if not len(cloud):
-        raise LidarError(f"{first.name} has no points.")
+        left_out = "".join(f" {note}." for note in first.left_out_notes)
+        raise LidarError(f"{first.name} has no points.{left_out}")
     names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
     return View(
         OrderedPoints(cloud), None, sweeps, " ".join(notes), title, downloads=downloads, names=names
@@ -267,9 +269,11 @@ def recorded_sweeps(
         sensors=tuple(names),
         objects=(),
         actors=(),
-        actor_poses=SweepPoses(np.zeros((0, 2 * count, 3)), np.zeros((0, 2 * count, 4))),
+        actor_poses=SweepPoses(np.zeros((0, count, 3)), np.zeros((0, count, 4))),
+        actor_velocities=np.zeros((0, count, 3)),
         actor_bounds=np.zeros((0, 2, 3)),
         actor_there=np.zeros((0, count), np.bool_),
+        actor_comes=np.zeros((0, count), np.bool_),
         coordinates="sensor" if any(pose is None for pose in poses) else "world",
         precision_m=0.001,
     )

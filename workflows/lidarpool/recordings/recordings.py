@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -19,7 +19,6 @@ from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
 from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size, open_input, read_input
-from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import did_you_mean, natural
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
@@ -32,10 +31,12 @@ from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.cloud_scan import with_usual_names
-from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.las import las_system, noise_classes, open_las
+from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
 from lidarsim.scene.files.pcd import read_pcd
-from lidarsim.scene.files.polygon_files import read_ply_columns
+from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 from lidarsim.scene.files.ptx import read_ptx
+from lidarsim.scene.files.stated_system import Metres, StatedSystem, stated_metres
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.fingerprint import fingerprint
@@ -88,8 +89,8 @@ _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if
 # 50,000 points each, unless a program chooses otherwise.
 _SAMPLE_RUNS = 40
 _LAZ_CHUNK = 50_000
+_SYSTEM_POINTS = 5  # of a .las whose places say where it is
 
-Metres = tuple[float, float, float]  # of the units of x, y and z
 _METRES: Metres = (1.0, 1.0, 1.0)
 
 
@@ -143,6 +144,28 @@ class RecordedPoints:
         )
 
 
+@dataclass(eq=False)
+class NoiseFilter:
+    """Leaves out points that a file withholds or classifies as noise, and counts them."""
+
+    noise_classes: tuple[int, ...] = NOISE_CLASSES
+    counts: dict[int, LeftOut] = field(default_factory=dict)  # {number of a sweep or part: counts}
+
+    def usable(self, number: int, read: Read) -> Read:
+        """Return a sweep or part without these points."""
+        points, columns, pose = read
+        usable, self.counts[number] = usable_points(columns, self.noise_classes)
+        if usable is None:
+            return read
+        kept = {name: np.asarray(values)[usable] for name, values in columns.items()}
+        return points[usable], kept, pose
+
+    def note(self) -> str:
+        """Return a sentence on the points that were left out of what was read; empty for none."""
+        totals = np.sum([(0, 0), *self.counts.values()], axis=0).tolist()
+        return LeftOut(*totals).note()
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A recording of sweeps; or a cloud without sweeps (`is_cloud`), in parts instead."""
@@ -165,6 +188,29 @@ class Recording:
     # None if they are unknown; None if the recording has no frames.
     frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    noise_filter: NoiseFilter | None = None  # that `read` applies; None if it leaves out nothing
+
+    @property
+    def left_out_notes(self) -> list[str]:
+        """Notes on points that were left out of what has been read."""
+        note = "" if self.noise_filter is None else self.noise_filter.note()
+        return [f"{self.name}: {note}"] if note else []
+
+    def without_noise(self, noise_filter: NoiseFilter) -> Recording:
+        """Return the recording without points that it withholds or classifies as noise."""
+        read = self.read
+        sample = self.sample
+
+        def usable_sample(max_points: int) -> Read:
+            assert sample is not None
+            return NoiseFilter(noise_filter.noise_classes).usable(0, sample(max_points))
+
+        return replace(
+            self,
+            read=lambda number: noise_filter.usable(number, read(number)),
+            sample=None if sample is None else usable_sample,
+            noise_filter=noise_filter,
+        )
 
     def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
         """Read a sweep, or part of a cloud, in the sensor frame or in the world frame.
@@ -205,17 +251,18 @@ class Recording:
             )
 
 
-def open_sensors(source: str | Path) -> dict[str, Recording]:
+def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
     """Open all sensors, or topics, of a recording, {name: recording}; "" for a single one.
 
     Of several sequences with coordinates of their own, the first.
 
     LidarError as of `open_recording`.
     """
+    opened = partial(open_recording, source, keep_noise=keep_noise)
     try:
-        return {"": open_recording(source)}
+        return {"": opened()}
     except SeveralSensorsError as error:
-        recordings = {name: open_recording(source, sensor=name) for name in error.names}
+        recordings = {name: opened(sensor=name) for name in error.names}
     sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
     if len(sequences) == 1:
         return recordings
@@ -238,13 +285,15 @@ def open_recording(
     intensity: str | None = None,
     name: str = "the cloud",
     unit: str | None = None,
+    keep_noise: bool = False,
 ) -> Recording:
     """Open a cloud or recording: `KINDS`; or a cloud in memory, which has sweeps if of a result.
 
     `sensor` chooses one of several sensors, or the topic of a bag; `intensity` is the column of the
     intensity, if not one of the usual names; `name` is that of a cloud in memory; `unit` is that of
-    a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states. LidarError if
-    the source is none of these, or cannot be opened.
+    a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states; without
+    `keep_noise`, points that a file withholds or classifies as noise are left out. LidarError if
+    the source is none of these, cannot be opened, or has lengths that are not true.
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
@@ -252,27 +301,28 @@ def open_recording(
         return _open_cloud(name, source, source.sweeps, sensor, intensity)
     path = Path(source)
     name = str(source)
-    if unit is None:
-        return _open_path(path, name, sensor, intensity, None)
-    if path.suffix.lower() not in _UNIT_SUFFIXES:
+    if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
         raise LidarError(
             f"{name} is in metres: leave out its unit, {unit!r}, which is for a file "
             f"{' '.join(_UNIT_SUFFIXES)}."
         )
-    metre = UNITS_M[unit]
-    return _open_path(path, name, sensor, intensity, (metre, metre, metre))
+    recording = _open_path(path, name, sensor, intensity, unit)
+    noise_filter = recording.noise_filter
+    if keep_noise or noise_filter is None:
+        return replace(recording, noise_filter=None)
+    return recording.without_noise(noise_filter)
 
 
 def _open_path(
-    path: Path, name: str, sensor: str | None, intensity: str | None, metres: Metres | None
+    path: Path, name: str, sensor: str | None, intensity: str | None, unit: str | None
 ) -> Recording:
-    """Open a file or folder; `metres` replace the units that a file states."""
+    """Open a file or folder; `unit` replaces the units that a file states."""
     if not path.exists() or (path.is_file() and not path.stat().st_size):
         raise LidarError(f"{name} does not exist, or is empty: give {KINDS}.")
     if path.is_dir():
         recording = _open_folder(path, name, sensor, intensity)
     else:
-        recording = _open_file(path, name, sensor, intensity, metres)
+        recording = _open_file(path, name, sensor, intensity, unit)
     if recording is not None:
         return recording
     suffix = path.suffix.lower()
@@ -337,25 +387,27 @@ def _open_sweep_files(
         is_cloud,
         files.point_count,
         times=times,
+        notes=tuple(f"{name} {note}" for note in files.notes),
         sequence=files.sequence,
     )
 
 
 def _open_file(
-    path: Path, name: str, sensor: str | None, intensity: str | None, metres: Metres | None
+    path: Path, name: str, sensor: str | None, intensity: str | None, unit: str | None
 ) -> Recording | None:
     """Open a file by its suffix; None if its format is not read."""
     suffix = path.suffix.lower()
     if suffix == ".ply":
-        return replace(_open_ply(path, name, sensor, intensity), metres=metres or _METRES)
+        return _open_ply(path, name, sensor, intensity, unit)
     if suffix == ".pcd":
-        return replace(_open_pcd([path], name, intensity), metres=metres or _METRES)
+        metres, _ = stated_metres(None, np.zeros((0, 3)), unit)
+        return replace(_open_pcd([path], name, intensity), metres=metres)
     if suffix in (".las", ".laz"):
-        return _open_las(path, name, intensity, metres)
+        return _open_las(path, name, intensity, unit)
     if suffix == ".ptx":
-        return _open_ptx(path, name, intensity, metres)
+        return _open_ptx(path, name, intensity, unit)
     if suffix in SCAN_READERS and suffix != ".bin":
-        return _open_scans(path, name, intensity, metres)
+        return _open_scans(path, name, intensity, unit)
     if suffix == ".mcap":
         return _open_bag(path, name, sensor, intensity)
     if suffix in (".osf", ".pcap"):
@@ -439,17 +491,51 @@ def _ray_keys(columns: Columns) -> Ints:
     return rays << 8 | columns.get("return_number", order)
 
 
-def _open_ply(path: Path, name: str, sensor: str | None, intensity: str | None) -> Recording:
+def _open_ply(
+    path: Path, name: str, sensor: str | None, intensity: str | None, unit: str | None = None
+) -> Recording:
     """Open a .ply, with the file of sweeps beside the .ply of a result."""
     try:
         cloud = CloudFile(path)
     except LidarError:  # text, or of another program
+        return _open_foreign_ply(path, name, intensity, unit)
+    metres, _ = stated_metres(None, np.zeros((0, 3)), unit)
+    return replace(_open_ply_cloud(path, name, cloud, sensor, intensity), metres=metres)
 
-        def read(_: int) -> Read:
-            columns = with_usual_names(read_ply_columns(read_input(path)))
-            return _positions(columns), columns, None
 
-        return Recording(name, 1, read, intensity, is_cloud=True)
+def _open_foreign_ply(path: Path, name: str, intensity: str | None, unit: str | None) -> Recording:
+    """Open a .ply of another program, or of text, in the units of the system that it states."""
+
+    def read(_: int) -> Read:
+        columns = with_usual_names(read_ply_columns(read_input(path)))
+        return _positions(columns), columns, None
+
+    system = None
+    with reading(name):
+        data = read_input(path)
+        system = StatedSystem.of_comments(ply_comments(data))
+        positions = (
+            np.zeros((0, 3))
+            if system is None
+            else _positions(with_usual_names(read_ply_columns(data)))
+        )
+        metres, notes = stated_metres(system, positions, unit)
+    return Recording(
+        name,
+        1,
+        read,
+        intensity,
+        is_cloud=True,
+        notes=tuple(f"{name} {note}" for note in notes),
+        metres=metres,
+        noise_filter=NoiseFilter(),
+    )
+
+
+def _open_ply_cloud(
+    path: Path, name: str, cloud: CloudFile, sensor: str | None, intensity: str | None
+) -> Recording:
+    """Open a .ply of lidarpool, with the file of sweeps beside the .ply of a result."""
     if not (sweeps_path := path.with_name(SWEEPS_FILE)).exists():
         return _open_cloud(name, cloud, None, sensor, intensity)
     try:
@@ -485,10 +571,10 @@ def _open_pcd(files: list[Path], name: str, intensity: str | None) -> Recording:
             (scan,) = read_pcd(path)
         return scan.positions, scan.columns, scan.pose
 
-    return Recording(name, len(files), read, intensity)
+    return Recording(name, len(files), read, intensity, noise_filter=NoiseFilter())
 
 
-def _open_ptx(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
+def _open_ptx(path: Path, name: str, intensity: str | None, unit: str | None) -> Recording:
     """Open the scans of a .ptx, each in the frame of its scanner."""
     with reading(name):
         scans = read_ptx(path)
@@ -497,18 +583,20 @@ def _open_ptx(path: Path, name: str, intensity: str | None, metres: Metres | Non
         scan = scans[number]
         return scan.positions, scan.columns, scan.pose
 
-    return Recording(name, len(scans), read, intensity, metres=metres or _METRES)
+    metres, _ = stated_metres(None, np.zeros((0, 3)), unit)
+    return Recording(name, len(scans), read, intensity, metres=metres)
 
 
-def _open_scans(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
-    """Open a cloud whose file is read at once; `metres` replace the units that its header states.
+def _open_scans(path: Path, name: str, intensity: str | None, unit: str | None) -> Recording:
+    """Open a cloud whose file is read at once; `unit` replaces the units that its header names.
 
     Of several clouds in a file, the columns that all have are read.
     """
+    metres, _ = stated_metres(None, np.zeros((0, 3)), unit)
 
     def read(_: int) -> Read:
         scans = SCAN_READERS[path.suffix.lower()](path)
-        units_m = _METRES if metres is not None else scans[0].units_m or _METRES
+        units_m = _METRES if unit is not None else scans[0].units_m or _METRES
         shared = set.intersection(*(set(scan.columns) for scan in scans))
         columns = {
             column: np.concatenate([scan.columns[column] for scan in scans])
@@ -517,18 +605,20 @@ def _open_scans(path: Path, name: str, intensity: str | None, metres: Metres | N
         }
         return np.concatenate([scan.positions for scan in scans]) * units_m, columns, None
 
-    return Recording(name, 1, read, intensity, is_cloud=True, metres=metres or _METRES)
+    return Recording(
+        name, 1, read, intensity, is_cloud=True, metres=metres, noise_filter=NoiseFilter()
+    )
 
 
-def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | None) -> Recording:
-    """Open the points of a .las or .laz; `metres` replace the units that the file states."""
-    notes = []
+def _open_las(path: Path, name: str, intensity: str | None, unit: str | None) -> Recording:
+    """Open the points of a .las or .laz; `unit` replaces the units that the file states."""
     with reading(name):
+        system = las_system(path)
         with open_las(path) as reader:
             count = reader.header.point_count
-        if metres is None and (units := las_units(path)) is not None:
-            metres = units.factors
-            notes = [f"{name} {note}" for note in [units.note()] if note]
+            classes = noise_classes(reader.header)
+            places = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
+        metres, notes = stated_metres(system, places, unit)
 
     def read_run(reader: LasReader, start: int, length: int) -> Read:
         reader.seek(start)
@@ -552,7 +642,6 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
         return np.concatenate([run[0] for run in runs]), columns, None
 
     parts = -(-count // CHUNK_POINTS)
-    metres = metres or _METRES
     return Recording(
         name,
         parts,
@@ -560,10 +649,22 @@ def _open_las(path: Path, name: str, intensity: str | None, metres: Metres | Non
         intensity,
         True,
         count,
-        notes=tuple(notes),
+        notes=tuple(f"{name} {note}" for note in notes),
         metres=metres,
         sample=sample,
+        noise_filter=NoiseFilter(classes),
     )
+
+
+def _some_positions(reader: LasReader, count: int) -> Floats:
+    """Return the positions (k, 3) of a few points, evenly in a file."""
+    positions = []
+    for number in np.unique(np.linspace(0, count - 1, _SYSTEM_POINTS).astype(int)).tolist():
+        if 0 <= number < count:
+            reader.seek(number)
+            point = reader.read_points(1)
+            positions.append([point.x[0], point.y[0], point.z[0]])
+    return np.reshape(np.array(positions, np.float64), (-1, 3))
 
 
 def _open_bag(path: Path, name: str, topic: str | None, intensity: str | None) -> Recording:
@@ -631,8 +732,8 @@ def _open_ouster(path: Path, name: str, sensor: str | None, intensity: str | Non
     def points(scan: Any) -> Read:
         ring, column = np.nonzero(scan.field("RANGE"))
         columns = {"ring": ring}
-        for field in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(scan.fields):
-            columns[field.lower()] = scan.field(field)[ring, column]
+        for field_name in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(scan.fields):
+            columns[field_name.lower()] = scan.field(field_name)[ring, column]
         return compute_positions(scan)[ring, column], columns, None
 
     def times() -> Iterator[float]:

@@ -23,7 +23,9 @@ from lidarsim.base.extras import need
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.words import natural
 from lidarsim.columns.table import TABLE
+from lidarsim.scene.files.e57_system import e57_system
 from lidarsim.scene.files.float_rows import NUSCENES, columns_by_name, read_float_columns
+from lidarsim.scene.files.stated_system import check_metric_format
 from lidarsim.scene.transform import affine
 from lidarsim.sensor.trajectory import matrices
 
@@ -50,6 +52,7 @@ class SweepFiles(NamedTuple):
     times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
     point_count: int | None = None  # of a cloud in parts; None of sweeps
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
 
 
 def open_e57(path: Path, name: str) -> SweepFiles:
@@ -58,7 +61,7 @@ def open_e57(path: Path, name: str) -> SweepFiles:
     input_size(path)
     file = import_module("pye57").E57(str(path))
 
-    def read(number: int) -> Read:
+    def read(number: int) -> tuple[AnyArray, Columns, Floats]:
         header = file.get_header(number)
         data = file.read_scan_raw(number, ignore_unsupported_fields=True)
         if "cartesianX" in data:
@@ -75,7 +78,12 @@ def open_e57(path: Path, name: str) -> SweepFiles:
             pose = affine(header.rotation_matrix, header.translation)
         return points[valid], columns, pose
 
-    return SweepFiles(file.scan_count, read)
+    system = e57_system(file)
+    if system is None or not file.scan_count:
+        return SweepFiles(file.scan_count, read)
+    points, _, pose = read(0)
+    positions = points @ pose[:3, :3].T + pose[:3, 3]
+    return SweepFiles(file.scan_count, read, notes=tuple(check_metric_format(system, positions)))
 
 
 def _from_spherical(data: dict[str, AnyArray]) -> Floats:

@@ -22,6 +22,8 @@ from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
+from ..export.format_table import DATA_SETS
+from ..export.formats import Format
 from ..run.run_result import CampaignRun
 from ..run.runner import Output, Run
 from ..run.store.database import FILE
@@ -293,11 +295,22 @@ def write_shared(
     write_table(storage, campaign["names"], rows)
     write_record(storage, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())
+    sums = replace(sums, notes=(*sums.notes, *_renamed_sensors(dataset)))
     saved = sweeps(storage.url)
     picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
     sums = replace(sums, classes=saved.classes)
     versions = record["casting"] or software()
     return sums, write_card(storage, campaign, sums, rows(), versions, picture)
+
+
+def _renamed_sensors(dataset: DataSet) -> list[str]:
+    """Return notes on the sensors of finished jobs that have other names in the data set."""
+    file_format = Format(DATA_SETS[dataset.format])
+    if not file_format.row.first_sensor:
+        return []
+    sensors_of_jobs = read_index(dataset.storage)["jobs"].values()
+    notes = (note for sensors in sensors_of_jobs for note in file_format.renamed([*sensors]))
+    return list(dict.fromkeys(notes))
 
 
 def _check_jobs(

@@ -135,6 +135,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     sensors = [
         _sensor(mounted.sensor)
         | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}
+        | ({"unseen": list(mounted.unseen)} if mounted.unseen else {})
         for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
     ]
     return {

@@ -32,6 +32,7 @@ from lidarsim.simulator.memory import (
 )
 from lidarsim.simulator.sampling import sample_survey
 from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.simulator.visibility import unseen_objects
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
@@ -129,6 +130,7 @@ def forecast(
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
+        "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
         "bounds": (job.scene.bounds + job.scene.origin).tolist(),
         "poses": job.survey.path.stations,
         "drive": _drive(job.survey),
@@ -258,6 +260,18 @@ def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
         f"{format_bytes(required_bytes)}: take a smaller scene, fewer casting workers (pool.gpu), "
         "a smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
     ]
+
+
+def _unseen(job: Job) -> dict[str, list[str]]:
+    """Return the names of the objects that sensors do not see; sensors that see all are missing."""
+    scene = job.scene
+    pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
+    names = scene.all_names
+    return {
+        carried.name: [names[row] for row in np.flatnonzero(mask)]
+        for carried, mask in pairs
+        if mask is not None
+    }
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:

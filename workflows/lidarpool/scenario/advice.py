@@ -136,6 +136,7 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
     """Yield notes on settings without effect, and on contradictions between settings."""
     for entry in scenario.output.write:
         yield from entry.contradictions(scenario.cloud.coordinates)
+        yield from entry.renamed([*scenario.sensors])
     written = {entry.format for entry in scenario.output.write}
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (

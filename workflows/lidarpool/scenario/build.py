@@ -18,6 +18,7 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.coordinate_systems import target_problem
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
@@ -33,6 +34,7 @@ from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
 from lidarsim.simulator.static_bodies import warn_of_reach
 from lidarsim.simulator.surfaces import warn_of_grey
+from lidarsim.simulator.visibility import unseen_objects
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.format_table import check_whole
@@ -106,7 +108,8 @@ class Job:
     ------
     LidarError
         If a field has another type, the survey's precision is too fine for the scene, a
-        material is for no object, or an object lacks a material while others have one.
+        material is for no object, an object lacks a material while others have one, or the
+        survey's coordinate system is not in metres that are true where the scene is.
     """
 
     scene: Scene
@@ -123,6 +126,7 @@ class Job:
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
         # Largest local coordinate, also of actors; over the precision it must fit 32-bit integers.
         reach_m = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:  # vehicles on a wet road raise spray
@@ -130,13 +134,15 @@ class Job:
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
             positions, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-            mesh_bounds = (actor.mesh.animation or actor.mesh).bounds
-            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(mesh_bounds).max()))
+            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(actor.bounds).max()))
         if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
                 f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}."
+                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}"
+                f"{_outlier_advice(scene)}."
             )
+        if survey.epsg is not None:
+            check_epsg(survey.epsg, scene)
         warn_of_grey(scene, survey)
         warn_of_reach(scene, survey)
 
@@ -149,6 +155,17 @@ class Job:
     def sweeps(self) -> Sweeps:
         """Sweeps with poses and boxes of actors; takes seconds for thousands of poses."""
         return Sweeps.from_survey(self.survey, self.scene)
+
+
+def _outlier_advice(scene: Scene) -> str:
+    """Return advice to leave out the object that is far from all others, or an empty string."""
+    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
+        middles = scene.object_bounds.mean(axis=1)
+    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
+    order = np.argsort(np.nan_to_num(distances_m))
+    if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
+        return ""
+    return f", or leave out {scene.names[order[-1]]!r}, which is far from all else"
 
 
 def build(
@@ -180,6 +197,8 @@ def build(
     shapes = Shapes(scenario, findings)
     epsg = _common_epsg(scenario, findings)
     with prefixed(scenario.source):  # errors begin with the scenario's name
+        if scenario.cloud.epsg is not None:
+            check_epsg(scenario.cloud.epsg, scene)
         track = _carrier_track(shapes, static.standing)
         sensors = _mounted_sensors(shapes)
     placing: Placing | None = None
@@ -198,6 +217,7 @@ def build(
     with mistakes.noted():
         with prefixed(scenario.source):
             survey = _build_survey(parts, _materials(scenario, findings, scene, vehicles), columns)
+            unseen_objects(scene, survey)
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     if plans:
         with mistakes.noted(), prefixed(scenario.source):
@@ -291,7 +311,7 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
         landscape=bool(findings.rasters) or any(map(_has_roads, scenario.scene.files)),
         buildings=findings.named(BUILDING),
         roads=findings.named(ROAD_SURFACE),
-        narrow=is_unmounted and not scenario.sensor.model_fields_set,
+        narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
 
 
@@ -318,6 +338,22 @@ def _build_traffic(
         # of the survey, by the clock of the carrier's trajectory
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
         return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
+
+
+def check_epsg(epsg: int, scene: Scene) -> None:
+    """Check that a coordinate system is in metres that are true where a scene is.
+
+    Raises
+    ------
+    LidarError
+        If lengths in the system are wrong by more than 1 % in the middle of the scene, or not in
+        metres. Without rasterio, only systems for maps of the world are refused.
+    """
+    lower, upper = scene.bounds + scene.origin
+    x, y, _ = ((lower + upper) / 2).tolist()
+    why_there = ", where the scene is (translation moves it)"
+    if problem := target_problem(epsg, x, y, why_there=why_there):
+        raise LidarError(f"cloud.epsg (in Python epsg=) is {problem}.")
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
@@ -573,7 +609,8 @@ def _build_survey(
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else scenario.poses or track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
-    needs_no_mounting = not scenario.sensors and scenario.mount is None and sensors[0].noise is None
+    mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
+    needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None
     survey = Survey(
         poses=[replace(p, position=tuple(np.subtract(p.position, parts.origin))) for p in poses],
         trajectory=track,

@@ -37,9 +37,10 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     ranges = sample_ranges(scene, survey, scans)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
+        unseen = "unseen, " * any(carried.unseen for carried in survey.carried)
         poses_note = seen_from(scene, survey.carried[0])
         return (
-            f"no ray hit anything at any distance: check {faults}poses and units; "
+            f"no ray hit anything at any distance: check {unseen}{faults}poses and units; "
             f"{_start(scene, survey)}; {poses_note}"
         )
     limits = [*dict.fromkeys(_limits(survey, ranges))]

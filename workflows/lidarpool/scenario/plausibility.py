@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, velocities
+from lidarsim.simulator.visibility import static_key, unseen_objects, without_objects
 
 from .build import Built
 from .placing import seen_from, surroundings_of
@@ -68,6 +69,7 @@ class _SensorPosition(NamedTuple):
 
     time_ns: float
     position: Floats  # (3,), local coordinates
+    sensor: int  # number of the sensor
 
 
 def implausibilities(built: Built) -> list[str]:
@@ -99,7 +101,7 @@ def implausibilities(built: Built) -> list[str]:
 def _sample_positions(survey: Survey) -> list[_SensorPosition]:
     """Return sampled positions of the sensors, in local coordinates."""
     path = survey.path
-    mounts = [carried.mount for carried in survey.carried]
+    mounts = [*enumerate(carried.mount for carried in survey.carried)]
     if path.moves:
         times = np.linspace(0, min(path.duration_ns, survey.duration_ns), _POSITIONS)
         stations = [(0, time) for time in times.tolist()]
@@ -107,19 +109,22 @@ def _sample_positions(survey: Survey) -> list[_SensorPosition]:
         stations = [(n, 0.0) for n in even_indices(path.stations, _POSITIONS).tolist()]
     stations = [stations[i] for i in even_indices(len(stations), max(1, _POSITIONS // len(mounts)))]
     return [
-        _SensorPosition(time, np.array(path.pose(station, time).compose(mount).position))
+        _SensorPosition(time, np.array(path.pose(station, time).compose(mount).position), sensor)
         for station, time in stations
-        for mount in mounts
+        for sensor, mount in mounts
     ]
 
 
 def _position_warnings(
     scene: Scene, survey: Survey, surroundings: Surroundings | None, samples: list[_SensorPosition]
 ) -> Iterator[str]:
-    """Warn of positions under the scene, or inside its bodies or actors."""
+    """Warn of positions under the scene, or inside its bodies or actors that the sensor sees."""
+    unseen = unseen_objects(scene, survey)
     if surroundings is not None:
-        under = np.array([surroundings.is_covered(sample.position) for sample in samples])
-        inside = np.array([surroundings.in_a_body(sample.position) for sample in samples])
+        seen_by = _surroundings_of_sensors(scene, surroundings, samples, unseen)
+        pairs = [(seen_by[sample.sensor], sample.position) for sample in samples]
+        under = np.array([seen is not None and seen.is_covered(xyz) for seen, xyz in pairs])
+        inside = np.array([seen is not None and seen.in_a_body(xyz) for seen, xyz in pairs])
         poses_note = seen_from(scene, survey.carried[0]) if (under | inside).any() else ""
         if under.any():
             yield (
@@ -130,15 +135,38 @@ def _position_warnings(
         if inside.any():
             yield (
                 f"the sensor is inside a closed body{_bad_positions(scene, samples, inside)}, and "
-                f"hits only the backs of its surfaces; {poses_note}"
+                f"hits only the backs of its surfaces; {poses_note}; if it is the sensor's "
+                "housing, give its name as unseen of the sensor"
             )
-    for actor in scene.actors:
-        inside = _inside_actor(actor, samples)
+    for actor, name in enumerate(scene.all_names[len(scene.names) :]):
+        masks = (unseen[sample.sensor] for sample in samples)
+        is_seen = [mask is None or not mask[len(scene.names) + actor] for mask in masks]
+        inside = _inside_actor(scene.actors[actor], samples) & is_seen
         if inside.any():
             yield (
-                f"the sensor is inside {actor.name}{_bad_positions(scene, samples, inside)}: check "
-                "its mount, and the trajectories"
+                f"the sensor is inside {name}{_bad_positions(scene, samples, inside)}: check "
+                "its mount, and the trajectories, or give the name as unseen of the sensor"
             )
+
+
+def _surroundings_of_sensors(
+    scene: Scene,
+    surroundings: Surroundings,
+    samples: list[_SensorPosition],
+    unseen: Sequence[Bools | None],
+) -> list[Surroundings | None]:
+    """Return the surroundings that each sensor sees; None if a sensor sees nothing.
+
+    `surroundings` are those of all objects, and `unseen` the masks of the sensors.
+    """
+    known: dict[bytes, Surroundings | None] = {b"": surroundings}
+    keys = [static_key(scene, mask) for mask in unseen]
+    for key, mask in zip(keys, unseen, strict=True):
+        if mask is not None and key not in known:
+            seen = without_objects(scene, mask)
+            positions = np.array([sample.position for sample in samples])
+            known[key] = None if seen is None else surroundings_of(seen, positions)
+    return [known[key] for key in keys]
 
 
 def _bad_positions(scene: Scene, samples: list[_SensorPosition], is_bad: Bools) -> str:

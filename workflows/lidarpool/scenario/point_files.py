@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,26 @@ from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError, explained, prefixed, unreadable
 from lidarsim.base.extras import need
 from lidarsim.base.input_files import check_input, input_size, read_input
-from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, printable
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.cloud_scan import CloudScan, with_usual_names
-from lidarsim.scene.files.las import las_units, open_las
+from lidarsim.scene.files.e57_system import e57_system
+from lidarsim.scene.files.las import las_system, noise_classes, open_las
 from lidarsim.scene.files.mesh_formats import advice_on
-from lidarsim.scene.files.polygon_files import read_ply_columns
+from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
+from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
+from lidarsim.scene.files.stated_system import (
+    Reprojection,
+    StatedSystem,
+    check_metric_format,
+    stated_metres,
+)
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.transform import affine
 
 MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
+_SAMPLE = 1000  # points that tell whether another system has true metres there
 _E57_BYTES = 24  # of the coordinates of a point, at least
 # Names of columns in files of various programs; the first name that a file has is read.
 _CLASSES = (
@@ -88,12 +97,23 @@ class _FileContent:
     columns: Columns
     scanners: Floats | None = None  # (n, 3): NaN where unknown
     ignored: list[str] = field(default_factory=list)
+    system: StatedSystem | None = None  # that the file states
+    in_metres: bool = False  # whether the format has true metres, whatever the system says
+    units_m: tuple[float, float, float] | None = None  # of x, y and z, if a header names them
+    noise_classes: tuple[int, ...] = NOISE_CLASSES
+    left_out: LeftOut = field(default_factory=LeftOut)  # withheld points and noise
     no_returns: int = 0  # points at zero that are left out
-    units_m: tuple[float, float, float] | None = None  # of x, y and z, if the file states them
 
 
-def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> ScannedPoints:
-    """Return the finite points of a file.
+def read_points(
+    path: Path,
+    unit: str | None,
+    tell: Callable[[str], None],
+    *,
+    epsg: int | None = None,
+    keep_noise: bool = False,
+) -> ScannedPoints:
+    """Return the finite points of a file, in true metres.
 
     Parameters
     ----------
@@ -102,12 +122,18 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
     tell
-        Called with a line on converted units, and a line on the columns that are left out.
+        Called with lines on converted units, on points that are left out, and on the columns that
+        are left out.
+    epsg
+        Code of the system that points are brought to; by default coordinates are kept.
+    keep_noise
+        Whether points are kept that the file withholds or classifies as noise.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, is too large, or has fewer than `MIN_POINTS` points.
+        If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
+        that are not true; see `stated_metres` and `Reprojection`.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -121,18 +147,15 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
         with explained(f"{path} cannot be read"), prefixed(path):
             if not check_input(path):
                 raise LidarError("it is empty (0 bytes).")
-            metres = _unit_lengths_m(path, unit, tell)
             content = _READERS[suffix](path)
-            if content.units_m is not None and unit is None:
-                metres = np.array(content.units_m)
-                lengths = ", ".join(f"{length:g}" for length in content.units_m)
-                tell(f"{path} is converted: its header states units of {lengths} m for x, y and z")
-            points = _scanned_points(content, metres)
+            if not keep_noise:
+                content = _without_noise(path, content, tell)
+            points = _scanned_points(content, _to_metres(path, content, unit, epsg, tell))
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
         raise LidarError(unreadable(path, error)) from error
-    _check_points(path, points)
+    _check_points(path, points, content.left_out)
     if content.no_returns:
         tell(
             f"{path}: {content.no_returns:,} points at zero are left out, as pulses without a "
@@ -143,8 +166,13 @@ def read_points(path: Path, unit: str | None, tell: Callable[[str], None]) -> Sc
     return points
 
 
-def _check_points(path: Path, points: ScannedPoints) -> None:
+def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
     """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
+    if len(points) < MIN_POINTS and (note := left_out.note()):
+        raise LidarError(
+            f"{path} has {plural(len(points), 'point')} to use, and at least {MIN_POINTS} are "
+            f"needed: {note}."
+        )
     if len(points) < MIN_POINTS:
         raise LidarError(
             f"{path} has {plural(len(points), 'point')}, and at least {MIN_POINTS} are needed."
@@ -156,17 +184,68 @@ def _check_points(path: Path, points: ScannedPoints) -> None:
         )
 
 
-def _scanned_points(content: _FileContent, metres: Floats) -> ScannedPoints:
+def _without_noise(path: Path, content: _FileContent, tell: Callable[[str], None]) -> _FileContent:
+    """Return content without withheld points and noise; call `tell` with their number."""
+    usable, left_out = usable_points(content.columns, content.noise_classes)
+    if usable is None:
+        return content
+    tell(f"{path}: {left_out.note()}")
+    return replace(
+        content,
+        positions=content.positions[usable],
+        columns={name: values[usable] for name, values in content.columns.items()},
+        scanners=None if content.scanners is None else content.scanners[usable],
+        left_out=left_out,
+    )
+
+
+def _to_metres(
+    path: Path,
+    content: _FileContent,
+    unit: str | None,
+    epsg: int | None,
+    tell: Callable[[str], None],
+) -> Callable[[Floats], Floats]:
+    """Return a function from positions (n, 3) of a file to true metres; tells what it does."""
+    finite = content.positions[np.isfinite(content.positions).all(axis=1)]
+    if epsg is not None:
+        if unit is not None:
+            raise LidarError("epsg takes the units of the file's system: leave out unit.")
+        reprojection = Reprojection(content.system, epsg)
+        reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
+        notes = reprojection.notes
+        convert = reprojection.apply
+    else:
+        if content.in_metres and unit is None:
+            notes = check_metric_format(content.system, finite)
+            metres = (1.0, 1.0, 1.0)
+        elif content.units_m is not None and unit is None:
+            metres = content.units_m
+            lengths = ", ".join(f"{length:g}" for length in metres)
+            notes = [f"was converted to metres: its header names units of {lengths} m"]
+        else:
+            metres, notes = stated_metres(content.system, finite, unit)
+        convert = partial(np.multiply, metres)
+    for note in notes:
+        tell(f"{path} {note}")
+    return convert
+
+
+def _scanned_points(content: _FileContent, to_metres: Callable[[Floats], Floats]) -> ScannedPoints:
     """Return the finite points of a file's content in metres, with the columns that are kept."""
     columns = content.columns
-    positions = content.positions * metres
+    positions = to_metres(content.positions)
     colours = _first_vectors(columns, _COLOURS)
     outward = _first_vectors(columns, _NORMALS)
     scanners = content.scanners
     if scanners is None:
         scanners = _first_vectors(columns, _ORIGINS)
     if scanners is not None:
-        outward = scanners * metres - positions
+        try:
+            outward = to_metres(scanners) - positions
+        except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
+            outward = None
+            content.ignored.append("positions of scanners without a place in that system")
     classes = _first(columns, _CLASSES)
     intensities = _first(columns, _INTENSITIES)
     points = ScannedPoints(
@@ -233,18 +312,6 @@ def _left_out(content: _FileContent) -> list[str]:
     return [printable(name) for name in [*remaining, *content.ignored]]
 
 
-def _unit_lengths_m(path: Path, unit: str | None, tell: Callable[[str], None]) -> Floats:
-    """Return the metres in the units of x, y and z of a file, (3,)."""
-    if unit is not None:
-        return np.full(3, UNITS_M[unit])
-    units = las_units(path) if path.suffix.lower() in (".las", ".laz") else None
-    if units is None:
-        return np.ones(3)
-    if note := units.note():
-        tell(f"{path} {note}")
-    return np.array(units.factors)
-
-
 def _from_columns(columns: Columns) -> _FileContent:
     """Return the content of columns that include x, y and z; ValueError if an axis is missing."""
     if missing := [axis for axis in "xyz" if axis not in columns]:
@@ -255,16 +322,16 @@ def _from_columns(columns: Columns) -> _FileContent:
 
 def _read_ply(path: Path) -> _FileContent:
     """Read the vertices of a .ply."""
-    return _from_columns(with_usual_names(read_ply_columns(read_input(path))))
+    data = read_input(path)
+    content = _from_columns(with_usual_names(read_ply_columns(data)))
+    return replace(content, system=StatedSystem.of_comments(ply_comments(data)))
 
 
 def _read_scans(path: Path) -> _FileContent:
     """Read a cloud of a format whose reader returns scans, joined in the frame of the file."""
     scans = SCAN_READERS[path.suffix.lower()](path)
     _check_count(sum(len(scan.positions) for scan in scans))
-    content = _joined([_placed(scan) for scan in scans])
-    content.units_m = scans[0].units_m
-    return content
+    return replace(_joined([_placed(scan) for scan in scans]), units_m=scans[0].units_m)
 
 
 def _placed(scan: CloudScan) -> _FileContent:
@@ -343,13 +410,16 @@ def _check_count(count: int) -> None:
 
 def _read_las(path: Path) -> _FileContent:
     """Read the points of a .las or .laz; LidarError if they exceed the memory."""
+    system = las_system(path)
     with open_las(path) as reader:
         _check_count(reader.header.point_count)
         points = reader.read_points(-1)
+        classes = noise_classes(reader.header)
     names = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
     positions = np.stack([points.x, points.y, points.z], axis=1)
     columns = {name: np.asarray(points[name]) for name in names}
-    return _FileContent(positions, {n: c for n, c in columns.items() if c.ndim == 1})
+    columns = {name: values for name, values in columns.items() if values.ndim == 1}
+    return _FileContent(positions, columns, system=system, noise_classes=classes)
 
 
 def _read_e57(path: Path) -> _FileContent:
@@ -362,11 +432,12 @@ def _read_e57(path: Path) -> _FileContent:
         _check_count(count)
         Allowance(input_size(path), "thin it first").take(_E57_BYTES * count)
         scans = [_read_scan(file, number, header) for number, header in enumerate(headers)]
+        system = e57_system(file)
     finally:
         file.close()
     if not scans:
         raise ValueError("it has no scans")
-    return _joined(scans)
+    return replace(_joined(scans), system=system, in_metres=True)
 
 
 def _read_scan(file: Any, number: int, header: Any) -> _FileContent:

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from lidarsim.base.allowance import bytes_of, memory
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
@@ -46,6 +47,8 @@ def scene_of_points(
     voxel_m: float | None = None,
     size: float = 1.0,
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    epsg: Annotated[int, Field(ge=1024, le=32767)] | None = None,
+    keep_noise: bool = False,
     colour: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Scene:
@@ -72,12 +75,19 @@ def scene_of_points(
         A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+    epsg
+        Code of a projected system in true metres, to which points are brought from the system that
+        the file states, such as the code of a UTM zone; needs rasterio. Heights are converted to
+        metres and stay as in the file otherwise. By default coordinates are kept.
+    keep_noise
+        Whether points become surfaces that a file withholds or classifies as noise (class 7, in
+        point formats 6 to 10 of LAS also 18); by default they are left out.
     colour
         What colours surfels: red, green and blue, or mean intensities as greys, of which the 99th
         percentile is white. By default red, green and blue if the file has them.
     tell
-        Called with a line on converted units, and on what a scene does not keep; by default this
-        package's logger warns.
+        Called with a line on converted units, on points that are left out, and on what a scene does
+        not keep; by default this package's logger warns.
 
     Returns
     -------
@@ -87,13 +97,15 @@ def scene_of_points(
     ------
     LidarError
         If the file cannot be read, has fewer than 12 points, lacks what `colour` names, has a
-        coordinate system without lengths, or needs too much memory.
+        coordinate system without lengths or with lengths that are not true, as Web Mercator, cannot
+        be brought to `epsg`, or needs too much memory.
     """
     path = Path(path)
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} is {value}; it must be a positive number.")
-    points = _coloured(path, read_points(path, unit, tell), colour, tell)
+    points = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
+    points = _coloured(path, points, colour, tell)
     return Scene.from_meshes([_surfels_of(path, points, voxel_m, size)])
 
 

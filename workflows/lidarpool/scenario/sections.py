@@ -446,6 +446,14 @@ class SensorSection(Section):
         ),
     ] = None
 
+    unseen: Annotated[
+        TextOrTexts,
+        about(
+            "names of the objects that it does not see, with * and ?: its rays pass through them",
+            ["housing*"],
+        ),
+    ] = ()
+
     packets: Annotated[
         PacketSection | None,
         about(
@@ -504,10 +512,12 @@ class SensorSection(Section):
         if self.packets is not None and (self.packets.ports or self.packets.identifiers):
             sensor = _with_packets(sensor, self.packets.model_dump_json())
         if sensor.noise is None or sensor.returns is None:
-            return Mounted(sensor, mount, name)
+            return Mounted(sensor, mount, name, unseen=self.unseen)
         sheet_returns = replace(sensor.returns, **returns.model_dump(exclude_unset=True))
         sheet_noise = replace(sensor.noise, **noise.model_dump(exclude_unset=True))
-        return Mounted(sensor, mount, name, returns=sheet_returns, noise=sheet_noise)
+        return Mounted(
+            sensor, mount, name, returns=sheet_returns, noise=sheet_noise, unseen=self.unseen
+        )
 
 
 def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:

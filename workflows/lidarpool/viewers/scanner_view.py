@@ -196,10 +196,10 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
 
 
 def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) -> ActorBoxes:
-    """Return the boxes of the actors of a scanner's scene at their poses, (a,)."""
+    """Return the boxes of the actors of a scanner's scene at their poses, as of `Boxes`."""
     scene = scanner.scene
     actors = scene.actors
-    bounds = np.array([_bounds_at(actor, time_ns) for actor in actors])
+    bounds = np.array([actor.bounds for actor in actors])
     rotations = np.array([pose.rotation_matrix for pose in poses])
     middles = (rotations @ bounds.mean(axis=1)[..., None])[..., 0]
     positions = np.array([pose.position for pose in poses]) + scene.origin
@@ -215,12 +215,6 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
         points=counts.tolist(),
         present=[is_present(actor, time_ns) for actor in actors],
     )
-
-
-def _bounds_at(actor: Actor, time_ns: float) -> Floats:
-    """Return the corners (2, 3) of an actor's box in the actor's axes, metres."""
-    times_ns = np.array([time_ns])
-    return actor.bounds_between(times_ns, times_ns)[0]
 
 
 def is_present(actor: Actor, time_ns: float) -> bool:

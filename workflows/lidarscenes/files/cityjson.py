@@ -10,6 +10,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +19,17 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import message_of
+from lidarsim.base.vectors import matmul
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.files.coordinate_systems import (
+    crs_of_text,
+    has_registry,
+    horizontal_part,
+    is_geocentric,
+    scale_problem,
+    suggested_epsg,
+)
 from lidarsim.scene.files.polygons import check_corners, triangulated, with_holes
 from lidarsim.scene.files.scene_graph import (
     Content,
@@ -70,6 +80,7 @@ _GEOGRAPHIC_SYSTEMS = {
     4167, 4171, 4258, 4267, 4269, 4283, 4326, 4490, 4612, 4617, 4674, 4937, 4939, 4979,
     6667, 6668, 6697, 7789, 7843, 7844, 7912, 9518, 9755, 9989,
 }  # fmt: skip
+_CODES = re.compile(r"(?i)\b(EPSG|ESRI)[:/]+(?:[\d.]*[:/]+)?(\d{4,6})\b")
 _MAX_SLOPE = 100  # largest ratio of a city's height to its width, unless in degrees
 _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or export it in parts"
 
@@ -133,6 +144,7 @@ class _CityFile:
         self._allowance = allowance
         self._colours = options.colours
         self._names_materials = options.materials
+        self._unit = options.raster.unit  # that the user gives
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -304,25 +316,20 @@ class _CityFile:
 
     def content(self) -> Content:
         """Return all objects, in metres."""
-        reference = (self._head.get("metadata") or {}).get("referenceSystem")
-        match = re.search(r"EPSG\b.*?(\d+)$", str(reference))
-        epsg = int(match[1]) if match else None
         bounds = [
             np.zeros((1, 3)),
             *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
         ]
         corners = np.concatenate(bounds)[bool(self._placed) :]
-        width, depth, height = np.ptp(corners, axis=0)
-        in_degrees_range = np.abs(corners[:, :2]).max() <= 360
-        if epsg in _GEOGRAPHIC_SYSTEMS or (
-            in_degrees_range and height > _MAX_SLOPE * max(width, depth)
-        ):
-            raise MeshFileError(
-                f"has coordinates in degrees{f' (EPSG:{epsg})' if epsg else ''}, and metres are "
-                "needed: reproject it, for example by cjio FILE crs_reproject EPSG save NEW"
-            )
+        system = _System.of_head(self._head, corners)
+        system.check(corners)
+        if system.height_units != 1 and self._unit is None:
+            matrix = np.diag([1.0, 1.0, system.height_units, 1.0])
+            self._placed = [
+                node._replace(matrix=matmul(matrix, node.matrix)) for node in self._placed
+            ]
         content = placed_content(self._placed)
-        content.unit_m = 1.0
+        content.unit_m = system.unit_m
         content.up_axis = "z"
         content.classes = CLASSES
         levels = [
@@ -331,14 +338,79 @@ class _CityFile:
         ]
         if self._unscaled:
             content.notes.append("lacks its transform: its coordinates are taken as metres")
-        if epsg:
-            content.notes.append(f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS")
+        content.notes += system.notes(unit_given=self._unit is not None)
         if len(levels) > 1:
             content.notes.append(f"has {', '.join(levels)}, which is the highest of each")
         if self._unread:
             listed = ", ".join(f"{n} {kind}" for kind, n in self._unread.items())
             content.notes.append(f"is read without {listed}")
         return content
+
+
+@dataclass(frozen=True)
+class _System:
+    """The reference system of a file, by rasterio if it is installed."""
+
+    name: str  # code, or empty
+    epsg: int | None
+    crs: Any  # None without rasterio, and if PROJ does not know the code
+    is_of_angles: bool
+    unit_m: float = 1.0  # of x and y, metres
+    height_units: float = 1.0  # units of x and y in the unit of heights
+
+    @classmethod
+    def of_head(cls, head: _Json, corners: Floats) -> _System:
+        """Return the system of a file, or of the first line of a sequence, with its corners."""
+        text = str((head.get("metadata") or {}).get("referenceSystem") or "")
+        looks_like_angles = _looks_like_angles(corners)
+        codes = _CODES.findall(text)  # of a compound system, the first is horizontal
+        if not codes:
+            return cls("", None, None, looks_like_angles or "CRS84" in text)
+        authority, number = codes[0]
+        name = f"{authority.upper()}:{number}"
+        epsg = int(number) if authority.upper() == "EPSG" else None
+        is_of_angles = looks_like_angles or epsg in _GEOGRAPHIC_SYSTEMS
+        crs = None
+        if has_registry():
+            heights = f"+{codes[1][1]}" if len(codes) > 1 else ""
+            crs = crs_of_text(name + heights) or crs_of_text(name)
+        if crs is None:
+            return cls(name, epsg, None, is_of_angles)
+        horizontal, up_m = horizontal_part(crs)
+        is_of_angles |= horizontal.is_geographic or is_geocentric(crs)
+        unit_m = float(horizontal.linear_units_factor[1]) if horizontal.is_projected else 1.0
+        return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
+
+    def check(self, corners: Floats) -> None:
+        """Raise MeshFileError if coordinates (n, 3) are angles, or lengths that are not true."""
+        reproject = "reproject it, for example by cjio FILE crs_reproject {} save NEW"
+        if self.is_of_angles:
+            raise MeshFileError(
+                f"has coordinates in degrees{f' ({self.name})' if self.name else ''}, and metres "
+                f"are needed: {reproject.format('EPSG')}"
+            )
+        x, y = (corners[:, :2].min(axis=0) + corners[:, :2].max(axis=0)).tolist()
+        problem = scale_problem(self.name, x / 2, y / 2, in_system=False) if self.name else ""
+        if problem:
+            code = None if self.crs is None else suggested_epsg(self.crs, x / 2, y / 2)
+            raise MeshFileError(f"is in {self.name}, {problem}: {reproject.format(code or 'EPSG')}")
+
+    def notes(self, *, unit_given: bool) -> list[str]:
+        """Return notes on the system."""
+        if self.unit_m != 1 and not unit_given:
+            return [
+                f"is in {self.name}, of a unit of {self.unit_m:.9g} m, and was converted to metres"
+            ]
+        if self.epsg is None:
+            return [f"is in {self.name}, which is not used"] if self.name else []
+        return [f"is in EPSG:{self.epsg}: <cloud.epsg={self.epsg}> writes that to LAS"]
+
+
+def _looks_like_angles(corners: Floats) -> bool:
+    """Return True if the corners (n, 3) of a city are those of degrees with heights in metres."""
+    width, depth, height = np.ptp(corners, axis=0)
+    is_small = np.abs(corners[:, :2]).max() <= 360
+    return bool(is_small and height > _MAX_SLOPE * max(width, depth))
 
 
 def _points(rows: Any) -> Floats:

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
-from lidarsim.base.arrays import AnyArray
+from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.extras import install_command
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -191,7 +192,7 @@ def _content(
     content.unit_m = 1.0
     content.up_axis = "z"
     content.classes = _classes({row[1] for row in frame["elements"]}, frame["ancestors"])
-    content.notes = [*_reference_notes(building), *shapes.notes.lines()]
+    content.notes = [*_reference_notes(building, middle_of(content.meshes)), *shapes.notes.lines()]
     if missing:
         content.notes.append(missing)
     if building["errors"]:
@@ -220,8 +221,11 @@ def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, Obje
     }
 
 
-def _reference_notes(building: dict[str, Any]) -> list[str]:
-    """Return notes on the coordinate system that a file states."""
+def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
+    """Return notes on the coordinate system that a file states.
+
+    `middle` (2,) are x and y in the middle of the building.
+    """
     conversion = building["map"]
     if conversion is None:
         if building["site"] is None:
@@ -239,9 +243,13 @@ def _reference_notes(building: dict[str, Any]) -> list[str]:
     if not abs(scale - 1) < _MAX_SCALE_ERROR:
         return [f"has a map conversion into {where} whose scale, {scale:g}, does not fit its units"]
     turn = conversion["heading_deg"]
-    if not (any(conversion["offset"]) or turn or abs(scale - 1) > 1e-9):
-        return [f"is in EPSG:{epsg[1]}: <cloud.epsg={epsg[1]}> writes that to LAS"] if epsg else []
     x, y, z = conversion["offset"]
+    if not (any(conversion["offset"]) or turn or abs(scale - 1) > 1e-9):
+        if problem := scale_problem(system, *middle.tolist()) if epsg else "":
+            return [f"is in {system}, {problem}"]
+        return [f"is in EPSG:{epsg[1]}: <cloud.epsg={epsg[1]}> writes that to LAS"] if epsg else []
+    if problem := scale_problem(system, x, y, in_system=False) if epsg else "":
+        where += f", {problem}, unlike that of the building"
     moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
     if turn:
         moves.append(f"rotation_deg [0, 0, {turn:.9g}]")

@@ -6,11 +6,10 @@ could name other files are read from memory. So no file that a raster names is o
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
@@ -28,14 +27,30 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
+from lidarsim.scene.files.coordinate_systems import (
+    MAX_SCALE_ERROR,
+    POLAR_EPSG,
+    crs_key,
+    crs_name,
+    crs_of_code,
+    ground_scale,
+    horizontal_part,
+    longitude_latitude,
+    projjson,
+    target_problem,
+    transformed,
+    zone_in_metres,
+)
 from lidarsim.scene.files.scene_graph import (
     MAX_TRIANGLES,
     Content,
     MeshFileError,
     Raster,
+    RasterOptions,
     ReadOptions,
     Window,
 )
+from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
 
 DRIVERS = {  # {ending: GDAL's name of the driver}
@@ -74,52 +89,100 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
     Cells with a pixel without height are holes. Coordinates are of the system `epsg` in
-    `options.raster`; else the raster's own if they are in metres, or of the UTM zone of its middle.
-    The window has the pixels whose middles are within.
+    `options.raster`; else the raster's own if they are in metres that are true to scale in its
+    middle, or of the UTM zone of its middle. The window has the pixels whose middles are within.
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(
             f"is a raster, which rasterio reads: {install_command('lidarpool[geo]')}"
         )
     request = options.raster
+    with _open_raster(path) as file:
+        source = _source(file, path)
+        notes = _notes(source, path)
+        target_crs = _target_crs(source, request.epsg, notes)
+        mesh, summary = _raster_mesh(source, target_crs, path, request, notes)
+    raster = Raster(*crs_key(target_crs), summary)
+    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+
+
+def _raster_mesh(
+    source: _Source, target_crs: Any, path: Path, request: RasterOptions, notes: list[str]
+) -> tuple[SceneMesh, str]:
+    """Return the mesh of a raster in a coordinate system, and its summary; append notes."""
     window = request.window
     chosen = request.step_m is not None or window is not None
+    pixels = _RasterGrid(source.file, source.affine, source.crs, target_crs)
     with ExitStack() as stack:
-        source = _source(stack.enter_context(_open_raster(path)), path)
-        target_crs = _target_crs(source, request.epsg)
-        grid = _RasterGrid(source.file, source.affine, source.crs, target_crs)
+        grid = pixels
         if request.step_m is not None:
             grid = stack.enter_context(_coarser_grid(grid, request.step_m, window))
             window = None
         columns, rows = grid.pixels_in(window)
         _check_size(grid, columns, rows, path.name, chosen=chosen)
-        heights, valid = _read_heights(grid, columns, rows)
-        notes = _notes(source, path)
+        values, valid = _read_values(grid, columns, rows)
         unit_m = UNITS_M[request.unit] if request.unit else _height_unit_m(source, notes)
-        heights = (heights * source.file.scales[0] + source.file.offsets[0]) * unit_m
+        heights = source.heights_m(values, unit_m)
         mesh = _grid_mesh(path.stem, grid, columns, rows, heights, valid)
-        summary = _summary(source, grid, request.step_m, valid)
-    notes += _height_notes(mesh, unit_m)
-    raster = Raster(*_crs_key(target_crs), summary)
-    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+        no_data_m = float(source.heights_m(np.array(_NO_DATA), unit_m))
+        notes += _height_notes(pixels, grid, path, mesh, no_data_m)
+        return mesh, _summary(source, grid, request.step_m, valid)
 
 
-def _read_heights(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> tuple[Floats, Bools]:
+def _read_values(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> tuple[Floats, Bools]:
     """Return the values of the first band (rows, columns), and whether they are valid."""
     band = grid.file.read(1, window=(rows, columns), masked=True)
-    heights = np.ma.getdata(band).astype(np.float64)
-    return heights, ~np.ma.getmaskarray(band) & np.isfinite(heights)
+    values = np.ma.getdata(band).astype(np.float64)
+    return values, ~np.ma.getmaskarray(band) & np.isfinite(values)
 
 
-def _height_notes(mesh: SceneMesh, unit_m: float) -> list[str]:
-    """Return a note on heights that are not of the Earth's surface, or no note."""
+def _height_notes(
+    pixels: _RasterGrid, grid: _RasterGrid, path: Path, mesh: SceneMesh, no_data_m: float
+) -> list[str]:
+    """Return a note on heights that are not of the Earth's surface, or no note.
+
+    MeshFileError for heights beyond `MAX_COORDINATE_M`, which no scene may have.
+
+    Parameters
+    ----------
+    pixels, grid
+        The raster, and the grid of the mesh: the same, or a coarser one.
+    mesh
+        The mesh of the grid.
+    no_data_m
+        Height of the value that many programs write for no data.
+    """
     lowest_m, highest_m = mesh.bounds[:, 2]
-    if _LOWEST_M <= lowest_m <= highest_m <= _HIGHEST_M and lowest_m != _NO_DATA * unit_m:
+    if _LOWEST_M <= lowest_m <= highest_m <= _HIGHEST_M and lowest_m != no_data_m:
         return []
+    is_low = lowest_m < _LOWEST_M or lowest_m == no_data_m
+    heights = mesh.vertices[:, 2]
+    extreme = mesh.vertices[heights.argmin() if is_low else heights.argmax()]
+    value = _value_near(pixels, grid, extreme)
+    command = f"gdal_translate -a_nodata {value!r} {path.name} NEW.tif"
+    if DRIVERS[path.suffix.lower()] == "GTiff":
+        command = f"rio edit-info --nodata {value!r} {path.name}"
+    stated = pixels.file.nodata
+    state = "as its nodata" if stated is None else f"as its nodata, which is {float(stated)!r} now"
+    if max(-lowest_m, highest_m) > MAX_COORDINATE_M:
+        raise MeshFileError(
+            f"has the value {value!r}, which is no height: if it stands for no data, state it "
+            f"{state} ({command})"
+        )
     return [
-        f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m: if one of them stands for no "
-        "data, say so in the file (rio edit-info --nodata VALUE FILE)"
+        f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m: if {value!r} stands for no data, "
+        f"state it {state} ({command})"
     ]
+
+
+def _value_near(pixels: _RasterGrid, grid: _RasterGrid, vertex: Floats) -> float:
+    """Return the value of the first band farthest from zero, of the pixels that made a vertex."""
+    reach = 0.75 * grid.pixel_m + 2 * pixels.pixel_m
+    x, y, _ = vertex.tolist()
+    columns, rows = pixels.pixels_in((x - reach, y - reach, x + reach, y + reach))
+    values, valid = _read_values(pixels, columns, rows)
+    values = values[valid]
+    return float(values[np.abs(values).argmax()])
 
 
 @dataclass(frozen=True)
@@ -130,6 +193,10 @@ class _Source:
     affine: Any  # from columns and rows to x and y
     crs: Any  # horizontal coordinate system of x and y; None for none on Earth
     up_m: float | None  # unit of heights of the vertical system, metres
+
+    def heights_m(self, values: Floats, unit_m: float) -> Floats:
+        """Return the heights in metres of values of the first band, which has a unit."""
+        return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
 def _source(file: Any, path: Path) -> _Source:
@@ -212,59 +279,96 @@ def _check_kind(source: Any) -> None:
 
 def _systems(source: Any) -> tuple[Any, float | None]:
     """Return the horizontal system, None for none on Earth, and metres in its unit of heights."""
-    from rasterio.crs import CRS
-
     if source.crs is None or not (source.crs.is_projected or source.crs.is_geographic):
         return None, None
-    described = _projjson(source.crs)
-    parts = described.get("components", [described])
-    axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
-    units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
-    horizontal = CRS.from_user_input(json.dumps(parts[0])) if len(parts) > 1 else source.crs
-    if not units:
-        return horizontal, None
-    return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
+    return horizontal_part(source.crs)
 
 
-def _projjson(crs: Any) -> dict[str, Any]:
-    """Return the PROJJSON of a coordinate system, without a datum bound to the system."""
-    projjson: dict[str, Any] = crs.to_dict(projjson=True)
-    return projjson.get("source_crs", projjson)
+def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
+    """Return the coordinate system of the mesh, in true metres, or raise MeshFileError.
 
-
-def _target_crs(source: _Source, epsg: int | None) -> Any:
-    """Return the coordinate system of the mesh, in metres, or raise MeshFileError."""
-    from rasterio.crs import CRS
-    from rasterio.errors import CRSError
-    from rasterio.warp import transform
-
-    if epsg is not None:
-        try:
-            target = CRS.from_epsg(epsg)
-        except CRSError as error:
-            raise MeshFileError(
-                f"cannot be brought to EPSG:{epsg}, a code that rasterio does not know: check "
-                "cloud.epsg"
-            ) from error
-        if not target.is_projected or target.linear_units_factor[1] != 1:
-            raise MeshFileError(
-                f"cannot be brought to EPSG:{epsg} ({_projjson(target)['name']}), which "
-                "is not in metres: give cloud.epsg another code"
-            )
-        return target
+    Appends a note if the metres of the raster are not true to scale, and if those of the mesh are
+    not at its edges.
+    """
     crs = source.crs
-    if crs is None or (crs.is_projected and crs.linear_units_factor[1] == 1):
-        return crs
-    corners = _corners(source.file, source.affine)
-    if crs.is_geographic and (width_deg := np.ptp(corners[:, 0])) > _WIDEST_DEG:
+    middle = _corners(source.file, source.affine).mean(axis=0)
+    if epsg is not None:
+        target = _chosen_crs(crs, epsg, middle)
+    elif crs is None:
+        return None
+    elif crs.is_projected and crs.linear_units_factor[1] == 1:
+        scale = ground_scale(crs, *middle.tolist())
+        target = crs
+        if scale is not None and not scale.is_true:
+            target = _zone_crs(source, middle)
+            notes.append(
+                f"is in {crs_name(crs)}, whose metre is {scale} long on the ground here: brought "
+                f"to {crs_name(target)}"
+            )
+    else:
+        target = _zone_crs(source, middle)
+    if error := _scale_error_at_edges(source, target):
+        notes.append(
+            f"is so wide that lengths of {crs_name(target)} are wrong by {error:.1%} at its edges"
+        )
+    return target
+
+
+def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
+    """Return the system of a chosen code; MeshFileError if it is not in true metres."""
+    target = crs_of_code(epsg)
+    place = middle
+    if target is not None and crs is not None:
+        with suppress(Exception):  # errors of GDAL have classes that rasterio keeps private
+            place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
+    if problem := target_problem(epsg, *place.tolist()):
+        raise MeshFileError(f"cannot be brought to {problem} (cloud.epsg)")
+    return target
+
+
+def _zone_crs(source: _Source, middle: Floats) -> Any:
+    """Return the UTM zone of a place in a raster's system; MeshFileError if it is too wide."""
+    place = longitude_latitude(source.crs, *middle.tolist())
+    if place is None:
+        raise MeshFileError(
+            f"is in {crs_name(source.crs)}, and has no place on Earth by it: project it to metres "
+            "first (gdalwarp -t_srs SYSTEM IN OUT)"
+        )
+    code = zone_in_metres(*place)
+    width_deg = _width_deg(source)
+    if width_deg > _WIDEST_DEG and code not in POLAR_EPSG:
         raise MeshFileError(
             f"spans {width_deg:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of "
             "a projection in metres"
         )
-    x, y = corners.mean(axis=0)
-    (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [x], [y])
-    zone = math.floor((longitude + 180) / 6) % 60 + 1
-    return CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
+    return crs_of_code(code)
+
+
+def _width_deg(source: _Source) -> float:
+    """Return the width of a raster on Earth in degrees of longitude; infinite if it has none."""
+    corners = _corners(source.file, source.affine)
+    if source.crs.is_geographic:
+        return float(np.ptp(corners[:, 0]))
+    places = [longitude_latitude(source.crs, x, y) for x, y in corners.tolist()]
+    longitudes = sorted(place[0] for place in places if place is not None)
+    if len(longitudes) < len(places):
+        return math.inf
+    gaps = np.diff([*longitudes, longitudes[0] + 360])  # a raster may cross the date line
+    return 360 - float(gaps.max())
+
+
+def _scale_error_at_edges(source: _Source, target: Any) -> float:
+    """Return the largest error of lengths at the corners of a raster; 0 below the limit."""
+    corners = _corners(source.file, source.affine)
+    if source.crs is not None and source.crs != target:
+        try:
+            corners = transformed(source.crs, horizontal_part(target)[0], corners)
+        except Exception:  # errors of GDAL have classes that rasterio keeps private
+            return 0.0
+    horizontal, _ = horizontal_part(target)
+    scales = [ground_scale(horizontal, x, y) for x, y in corners.tolist()]
+    error = max((scale.error for scale in scales if scale is not None), default=0.0)
+    return error if error > MAX_SCALE_ERROR else 0.0
 
 
 def _affine(file: Any, path: Path) -> Any:
@@ -531,18 +635,10 @@ def _notes(source: _Source, path: Path) -> list[str]:
     return notes
 
 
-def _crs_key(crs: Any) -> tuple[str, int | None]:
-    """Return a text that identifies a coordinate system, and its EPSG code if that is certain."""
-    if crs is None:
-        return "", None
-    code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
-    return f"EPSG:{code}" if code else crs.to_wkt(), code
-
-
-def _crs_name(crs: Any) -> str:
-    """Return the name of a coordinate system for messages."""
-    key, code = _crs_key(crs)
-    return key if code else f"{_projjson(crs)['name'][:80]} (no EPSG code)"
+def _crs_label(crs: Any) -> str:
+    """Return the code or the name of a coordinate system for summaries."""
+    key, code = crs_key(crs)
+    return key if code else f"{projjson(crs)['name'][:80]} (no EPSG code)"
 
 
 def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bools) -> str:
@@ -552,8 +648,8 @@ def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bo
     if (rows, columns) != source.file.shape:
         words += f" out of {source.file.width:,} x {source.file.height:,} pixels"
     if grid.target_crs is not None:
-        words += f", {_crs_name(grid.target_crs)}"
+        words += f", {_crs_label(grid.target_crs)}"
     if source.crs is not None and source.crs != grid.target_crs:
-        words += f" from {_crs_name(source.crs)}"
+        words += f" from {_crs_label(source.crs)}"
     holes = valid.size - int(np.count_nonzero(valid))
     return words + (f", {plural(holes, 'pixel')} without height" if holes else "")

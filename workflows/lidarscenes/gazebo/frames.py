@@ -15,7 +15,8 @@ from lidarsim.base.words import did_you_mean, printable
 from lidarsim.scene.transform import affine, inverted
 from lidarsim.sensor.trajectory import matrices, rotations_of
 
-MAX_NUMBER = 1e8  # in a file
+MAX_NUMBER = 1e8  # in a file, but for poses
+_MAX_POSE = 1e12  # number of a pose, beyond which it is as if it were infinite
 _MIN_NORM = 1e-6  # of a quaternion
 
 
@@ -40,13 +41,24 @@ def numbers_of(
     return numbers_in(text, f"<{name}>", count, at_least=at_least)
 
 
-def numbers_in(text: str, subject: str, count: int, *, at_least: float | None = None) -> Floats:
-    """Return the numbers of a text; LidarError, which names `subject`, as `numbers_of`."""
+def numbers_in(
+    text: str,
+    subject: str,
+    count: int,
+    *,
+    at_least: float | None = None,
+    of_any_size: bool = False,
+) -> Floats:
+    """Return the numbers of a text; LidarError, which names `subject`, as `numbers_of`.
+
+    With `of_any_size`, numbers may also be infinite, NaN or very large.
+    """
     try:
         values = np.array(text.split(), np.float64)
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count or not (np.abs(values) <= MAX_NUMBER).all():  # nor NaN
+    is_small = np.abs(values) <= MAX_NUMBER  # also False for NaN
+    if len(values) != count or not (is_small.all() or of_any_size):
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         raise LidarError(f"{subject} is {shown(text)}; it must be {expected}.")
     if at_least is not None and (values < at_least).any():
@@ -66,23 +78,27 @@ def pose_of(element: Element) -> RelativePose:
 def matrix_of(pose: Element) -> Floats:
     """Return the matrix (4, 4) of a <pose>: x, y, z, and roll, pitch, yaw or a quaternion.
 
+    Physics may have thrown a model to a pose that is not finite, or has very large numbers: its
+    matrix is of NaN, apart from the last row.
+
     Raises
     ------
     LidarError
-        If the numbers are not finite, or as many as expected, or the quaternion has no length.
+        If there are not as many numbers as expected, or the quaternion has no length.
     """
     text = (pose.text or "").strip()
     is_quaternion = pose.get("rotation_format") == "quat_xyzw"
     if not text:
         return np.eye(4)
+    values = numbers_in(text, "<pose>", 7 if is_quaternion else 6, of_any_size=True)
+    if not (np.abs(values) <= _MAX_POSE).all():
+        return affine(np.full((3, 3), np.nan), np.full(3, np.nan))
     if is_quaternion:
-        values = numbers_in(text, "<pose>", 7)
         norm = length(values[3:])
         if not norm > _MIN_NORM:
             raise LidarError(f"<pose> is {shown(text)}, whose quaternion has no length.")
         x, y, z, w = values[3:] / norm
         return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
-    values = numbers_in(text, "<pose>", 6)
     angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])
     return affine(rotations_of(angles[::-1]) if angles.any() else np.eye(3), values[:3])
 

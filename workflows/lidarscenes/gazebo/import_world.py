@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from glob import escape
+from itertools import compress
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
-from lidarsim.scene.files.scene_graph import MeshFileError
+from lidarsim.base.words import printable
+from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
+from lidarsim.scene.object_names import unique_names
 
 from ..writers.lidar_scenario import write_scenario
 from .frames import numbers_of
-from .lidars import lidars_of
-from .world import World, load_world
+from .lidars import lidars_of, unknown_sensors
+from .visibility import ALL_BITS, flags_of
+from .world import World, content_of, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
@@ -42,13 +50,70 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         raise LidarError("it is of Gazebo: give one folder, --assets DIR.")
     loaded = _loaded(world, assets)
     lidars = [*lidars_of(loaded)]
+    left_out = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
     if not lidars:
+        reason = "".join(f" It {line}." for line in loaded.notes.remote_lines())
+        reason += "".join(f" {line}" for line in unknown_sensors(loaded))
         raise LidarError(
             f"it has no lidar (gpu_lidar, gpu_ray, lidar, ray): lidarpool init --mesh "
-            f"{world.name} makes a scenario for a sensor of yours."
+            f"{world.name} makes a scenario for a sensor of yours.{reason}"
         )
     entry = {"file": world, **({"assets": assets[0]} if assets else {})}
-    return write_scenario(folder, "Gazebo", entry, lidars, _materials(loaded))
+    unseen = _unseen_objects(loaded, [lidar.mask for lidar in lidars], _folders(world, assets))
+    seeing = [lidar.lidar._replace(unseen=tuple(unseen.get(lidar.mask, ()))) for lidar in lidars]
+    return write_scenario(folder, "Gazebo", entry, seeing, _materials(loaded), left_out)
+
+
+def _unseen_objects(
+    world: World, masks: Sequence[int], folders: tuple[Path, ...]
+) -> dict[int, list[str]]:
+    """Return the patterns of the objects that lidars do not see: {<visibility_mask>: patterns}.
+
+    Names are those of the scene of the world. Its meshes are read only if a lidar does not see a
+    visual.
+    """
+    visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]
+    flags = {flags_of(visual) for visual in visuals} - {0}
+    if all(mask and all(mask & value for value in flags) for mask in masks):
+        return {}
+    options = ReadOptions(masks=False, colours=False, folders=folders)
+    with np.errstate(all="ignore"):
+        content, placed = content_of(world, options)
+    # Objects without an area are not in the content, which is else in the same order.
+    rest = iter(placed)
+    objects = [item.name for item in content.meshes]
+    flags_of_objects = [
+        next(item.flags for item in rest if item.node.name == name) for name in objects
+    ]
+    moving = [part.name for part in content.moving]
+    names = unique_names([printable(name) for name in (*objects, *moving)])
+    flags_of_objects += [ALL_BITS] * len(moving)
+    return {
+        mask: _patterns(names, [not flags & mask for flags in flags_of_objects])
+        for mask in {*masks}
+    }
+
+
+def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
+    """Return patterns that fit the names that are unseen, and no other name.
+
+    All objects of a model, if there are several, are one pattern: MODEL/*.
+    """
+    if all(is_unseen):
+        return ["*"]
+    models = [name.partition("/")[0] for name in names]
+    counts = Counter(models)
+    unseen_counts = Counter(compress(models, is_unseen))
+    patterns: dict[str, None] = {}
+    for name, model in compress(zip(names, models, strict=True), is_unseen):
+        is_whole = 1 < counts[model] == unseen_counts[model]
+        patterns[f"{escape(model)}/*" if is_whole else escape(name)] = None
+    return [*patterns]
+
+
+def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the folders of a world, resolved: its own first."""
+    return world.parent.resolve(), *(folder.resolve() for folder in assets)
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
@@ -56,7 +121,7 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
     with explained("it cannot be read"):
         data = read_input(world)
     try:
-        return load_world(data, world, (world.parent.resolve(), *(f.resolve() for f in assets)))
+        return load_world(data, world, _folders(world, assets))
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:

@@ -11,43 +11,89 @@ import numpy as np
 
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.vectors import matmul
-from lidarsim.base.words import printable
+from lidarsim.base.words import did_you_mean, listed, printable
 
 from ..writers.lidar_scenario import Lidar, clean
 from .bodies import scoped
 from .frames import numbers_in, numbers_of, pose_of
+from .notes import unknown_children
+from .visibility import LIDARS, figures_of, lidar_elements, mask_of
 from .world import PlacedLink, World
 
-LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")
 _COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
+# Types of sensors of SDFormat 1.0 to 1.12 that are no lidars.
+_OTHER_SENSORS = (
+    *("air_pressure", "air_speed", "altimeter", "contact", "custom", "force_torque", "gps", "imu"),
+    *("magnetometer", "navsat", "rfid", "rfidtag", "sonar"),
+    *("wireless_receiver", "wireless_transmitter"),
+    *("boundingbox", "boundingbox_camera", "camera", "depth", "depth_camera", "logical_camera"),
+    *("multicamera", "rgbd", "rgbd_camera", "segmentation", "segmentation_camera", "thermal"),
+    *("thermal_camera", "wide_angle_camera", "wideanglecamera"),
+)
+_SCANS = ("horizontal", "vertical")
+_NOISE_LEFT_OUT = {
+    "mean": "a mean",
+    "bias_mean": "a bias",
+    "bias_stddev": "a random bias",
+    "dynamic_bias_stddev": "a bias that drifts",
+    "precision": "a step",
+}
+_MAX_NAMES = 12  # that a line lists
 _RATE_HZ = 10.0  # of sensors that state none
 _FULL_TURN = 360.0
 _SLACK_DEG = 1e-3
 _MAX_SAMPLES = 1_000_000
 
 
-def lidars_of(world: World) -> Iterator[Lidar]:
+class GazeboLidar(NamedTuple):
+    """A lidar, and its <visibility_mask>."""
+
+    lidar: Lidar
+    mask: int
+
+
+def lidars_of(world: World) -> Iterator[GazeboLidar]:
     """Yield the lidars of a world; LidarError if figures of a lidar are impossible."""
     for link in world.links:
+        for element in lidar_elements(link.link.element):
+            name = printable(element.get("name", "")) or "lidar"
+            full_name = scoped((*link.path, name))
+            with prefixed(f"sensor {full_name!r}"):
+                yield GazeboLidar(_lidar(element, link, name, full_name), mask_of(element))
+
+
+def unknown_sensors(world: World) -> Iterator[str]:
+    """Yield clauses on the sensors of a world whose type SDFormat does not define."""
+    for link in world.links:
         for element in link.link.element.findall("sensor"):
-            if element.get("type") in LIDARS:
-                name = printable(element.get("name", "")) or "lidar"
-                full_name = scoped((*link.path, name))
-                with prefixed(f"sensor {full_name!r}"):
-                    yield _lidar(element, link, name, full_name)
+            kind = element.get("type") or ""
+            if kind not in (*LIDARS, *_OTHER_SENSORS):
+                name = scoped((*link.path, printable(element.get("name", ""))))
+                hint = did_you_mean(kind, LIDARS)
+                yield f"sensor {name!r} is of the unknown type {printable(kind)[:40]!r}.{hint}"
+
+
+def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
+    """Yield a clause on elements of a lidar that SDFormat does not define, if any."""
+    scans = figures.findall("scan")
+    parents = [element, figures, *scans]
+    parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
+    parents += [*figures.findall("range"), *figures.findall("noise"), *element.findall("noise")]
+    if unknown := dict.fromkeys(tag for parent in parents for tag in unknown_children(parent)):
+        yield f"elements that are not read: {listed([*unknown], _MAX_NAMES)}"
 
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
     """Return the lidar of a <sensor>."""
-    figures = element.find("lidar")
-    figures = element.find("ray") if figures is None else figures
+    figures = figures_of(element)
     if figures is None:
-        raise LidarError("it has neither <lidar> nor <ray>.")
+        hint = did_you_mean("lidar", [printable(child.tag) for child in element])
+        raise LidarError(f"it has neither <lidar> nor <ray>.{hint}")
     pose = pose_of(element)
     matrix = pose.matrix
     if pose.frame and pose.frame != link.link.name:
         matrix = matmul(link.body.frames.between(pose.frame, link.link.name), matrix)
-    left_out: list[str] = []
+    left_out = [*_unknown_elements(element, figures)]
     rate_hz = numbers_of(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
@@ -147,7 +193,9 @@ def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str,
     if kind not in ("gaussian", "gaussian_quantized", "none"):
         left_out.append(f"noise of type {printable(kind)[:30]!r}")
         return {}
-    if numbers_of(noise, "mean", 1, "0").item():
-        left_out.append("a mean of its noise")
+    for name, words in _NOISE_LEFT_OUT.items():
+        is_used = name != "precision" or kind == "gaussian_quantized"
+        if is_used and numbers_of(noise, name, 1, "0").item():
+            left_out.append(f"{words} of its noise")
     sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
     return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}

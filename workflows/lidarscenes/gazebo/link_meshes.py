@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -30,41 +31,79 @@ from .frames import numbers_of, pose_of
 from .notes import Notes
 from .resources import MissingFileError, Resources, Source
 from .shapes import height_map_mesh, polyline_mesh, shape_mesh
+from .visibility import ALL_BITS, flags_of
 
 # Formats that Gazebo reads; worlds would be read without end.
 MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")
 
 
+class LinkMesh(NamedTuple):
+    """Shapes of a link that the same lidars see."""
+
+    mesh: SceneMesh
+    flags: int  # <visibility_flags> of the first shape
+    suffix: str  # of the object's name: empty for the first mesh of a link
+
+
 @dataclass(eq=False)
 class LinkMeshes:
-    """Reader of the visuals, or the collision shapes, of links; each file is read once."""
+    """Reader of the visuals, or the collision shapes, of links; each file is read once.
+
+    `masks` are the <visibility_mask>s of the world's lidars.
+    """
 
     resources: Resources
     options: ReadOptions
     notes: Notes
     allowance: Allowance
+    masks: tuple[int, ...] = ()
     # {(path, name of the function that reads it): meshes}
     _files: dict[tuple[Path, str], list[SceneMesh]] = field(default_factory=dict)
-    _links: dict[tuple[int, tuple[float, ...]], SceneMesh | None] = field(default_factory=dict)
+    _links: dict[tuple[int, tuple[float, ...]], list[LinkMesh]] = field(default_factory=dict)
 
-    def mesh_of(
+    def meshes_of(
         self, body: Body, link: Link, name: str, scale: tuple[float, ...]
-    ) -> SceneMesh | None:
-        """Return the mesh of a link, which instances of the model share; None without shapes.
+    ) -> list[LinkMesh]:
+        """Return the mesh of a link, which instances of the model share; empty without shapes.
 
+        A link has several meshes if a lidar of the world sees some of its visuals and not others.
         `name` is that of the link in the world, for notes; `scale` are three factors for all
         shapes.
         """
         key = (id(link.element), scale)
         if key not in self._links:
             with prefixed(f"link {link.name!r}"):
-                parts = [
-                    part
-                    for shape in self._shapes(link, name)
-                    for part in self._shape_meshes(body, link, shape, name, scale)
-                ]
-                self._links[key] = join_meshes(link.name or "link", parts) if parts else None
+                self._links[key] = self._read_link(body, link, name, scale)
         return self._links[key]
+
+    def _read_link(
+        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+    ) -> list[LinkMesh]:
+        """Return the meshes of a link, see `meshes_of`."""
+        # {whether each mask sees a shape: the first shape, its flags, and meshes of all shapes}
+        groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
+        for shape in self._shapes(link, name):
+            flags = ALL_BITS if self.options.collisions else self._flags_of(shape, name)
+            parts = self._shape_meshes(body, link, shape, name, scale) if flags else []
+            if parts:
+                seen_by = tuple(flags & mask != 0 for mask in self.masks)
+                groups.setdefault(seen_by, (shape, flags, []))[2].extend(parts)
+        return [
+            LinkMesh(
+                join_meshes(link.name or "link", parts),
+                flags,
+                f"/{printable(shape.get('name', '')) or 'visual'}" if number else "",
+            )
+            for number, (shape, flags, parts) in enumerate(groups.values())
+        ]
+
+    def _flags_of(self, shape: Element, name: str) -> int:
+        """Return the flags of a visual; a visual that nothing sees is noted."""
+        with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
+            flags = flags_of(shape)
+        if not flags:
+            self.notes.invisible[name] = None
+        return flags
 
     def _shapes(self, link: Link, name: str) -> list[Element]:
         """Return the shapes of a link that are read."""

@@ -31,9 +31,34 @@ _KNOWN: dict[str, frozenset[str]] = {
         "mesh": "scale submesh uri",
         "heightmap": "blend pos sampling size texture uri use_terrain_paging",
         "road": "material point width",
+        "sensor": "air_pressure air_speed altimeter always_on camera contact enable_metrics "
+        "force_torque frame_id gps gz_frame_id ignition_frame_id imu lidar logical_camera "
+        "magnetometer navsat noise ray rfid rfidtag sonar topic transceiver update_rate visualize",
+        "lidar": "noise range scan visibility_mask",
+        "ray": "noise range scan visibility_mask",
+        "scan": "horizontal vertical",
+        "horizontal": "max_angle min_angle resolution samples",
+        "vertical": "max_angle min_angle resolution samples",
+        "range": "max min resolution",
+        "noise": "bias_mean bias_stddev dynamic_bias_correlation_time dynamic_bias_stddev mean "
+        "precision stddev type",
         "actor": "animation joint link plugin pose script skin",
     }.items()
 }
+
+
+def unknown_children(element: Element) -> list[str]:
+    """Return the children of an element that SDFormat does not define, as PARENT/TAG.
+
+    Tags with a prefix are free.
+    """
+    defined_tags = _KNOWN[element.tag]
+    tags = dict.fromkeys(child.tag for child in element)
+    return [
+        f"{element.tag}/{printable(tag)[:40]}"
+        for tag in tags
+        if tag not in defined_tags and ":" not in tag and tag not in _POSED
+    ]
 
 
 class Notes:
@@ -46,16 +71,21 @@ class Notes:
         self.unknown: dict[str, None] = {}  # elements, as PARENT/TAG
         self.without_visuals: dict[str, None] = {}  # links with collision shapes only
         self.hidden: dict[str, None] = {}  # links with visuals that are transparent altogether
+        self.invisible: dict[str, None] = {}  # links with visuals that nothing sees
+        self.remote: dict[str, None] = {}  # models that are too far away
         self.bright: dict[str, None] = {}  # links whose <laser_retro> is above that of white
         self.further: dict[str, None] = {}  # clauses
         self.of_meshes: dict[str, None] = {}  # lines on mesh files
 
     def check_children(self, element: Element) -> None:
         """Note the children of an element that SDFormat does not define; prefixes are free."""
-        defined_tags = _KNOWN[element.tag]
-        for child in element:
-            if child.tag not in defined_tags and ":" not in child.tag and child.tag not in _POSED:
-                self.unknown[f"{element.tag}/{printable(child.tag)[:40]}"] = None
+        self.unknown |= dict.fromkeys(unknown_children(element))
+
+    def remote_lines(self) -> Iterator[str]:
+        """Yield a clause on models that are too far away, if any."""
+        if self.remote:
+            names = listed([*self.remote], _MAX_NAMES)
+            yield f"has models that are 1,000 km and more away, or nowhere: left out are {names}"
 
     def lines(self) -> Iterator[str]:
         """Yield clauses that follow the file's name."""
@@ -68,10 +98,12 @@ class Notes:
         for links, reason in (
             (self.without_visuals, "collision shapes and no visuals, and are left out"),
             (self.hidden, "transparent visuals, which are left out"),
+            (self.invisible, "visuals with <visibility_flags> of 0, which are left out"),
             (self.bright, "a <laser_retro> above 255, which counts as 255"),
         ):
             if links:
                 yield f"has links that have {reason}: {listed([*links])}"
+        yield from self.remote_lines()
         yield from self.further
         yield from _first_lines([*self.of_meshes])
 

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import prefixed
@@ -37,9 +39,15 @@ from .notes import Notes
 from .resources import Resources, Source
 from .shapes import road_mesh
 from .state import NO_SCALE, State, state_of
+from .visibility import ALL_BITS, masks_of
 
 _ADVICE = "simplify its meshes, or export them in parts"
 _OLD_ROOT = "gazebo"  # of Gazebo before 1.9
+
+
+# A model that is farther along x, y or z from the origin of its world has fallen, or physics has
+# thrown it there: northings of maps reach 10,000 km, and no world is 1,000 km high.
+_REACH_M = np.array([1e7, 1e7, 1e6])
 
 
 class PlacedLink(NamedTuple):
@@ -67,8 +75,14 @@ class World:
 
     @cached_property
     def links(self) -> list[PlacedLink]:
-        """All links."""
-        return [*self._placed_links()]
+        """All links, but those that are too far away, whose models are noted."""
+        links = []
+        for link in self._placed_links():
+            if is_in_reach(link.matrix):
+                links.append(link)
+            else:
+                self.notes.remote[scoped(link.path[:-1])] = None
+        return links
 
     def _placed_links(self) -> Iterator[PlacedLink]:
         """Yield the links of all models, the state's poses first."""
@@ -100,28 +114,53 @@ class World:
             ]
 
 
+class PlacedObject(NamedTuple):
+    """An object that stands in the world."""
+
+    node: PlacedNode
+    flags: int  # <visibility_flags> of its visuals
+
+
+def is_in_reach(matrix: Floats) -> bool:
+    """Return True if a matrix (4, 4) is of a position that a world may have."""
+    return bool(np.isfinite(matrix).all() and (np.abs(matrix[:3, 3]) < _REACH_M).all())
+
+
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the visuals, or the collision shapes, of all links; actors move."""
     world = load_world(data, path, options.folders)
-    meshes = LinkMeshes(world.resources, options, world.notes, world.allowance)
-    placed = []
-    for link in world.links:
-        mesh = meshes.mesh_of(link.body, link.link, scoped(link.path), link.scale)
-        if mesh is not None:
-            placed.append(PlacedNode(mesh, link.matrix, "/".join(link.path)))
-    actors = actors_of(world.element, world.source, meshes, world.notes)
-    content = placed_content([*placed, *_roads(world, meshes), *actors.standing])
-    content.moving = actors.moving
-    content.unit_m = 1.0
-    content.up_axis = "z"
-    content.notes = [*world.notes.lines()]
+    content = content_of(world, options)[0]
     if not content.meshes and not content.moving:
         missing = [*world.notes.missing_models, *world.notes.missing_files]
         reason = f": it lacks {listed(missing, 12)}" if missing else ""
         if world.notes.without_visuals:
             reason += "; give geometry: collision, since links have collision shapes"
+        reason += "".join(f"; it {line}" for line in world.notes.remote_lines())
         raise MeshFileError(f"has nothing that a lidar sees{reason}")
     return content
+
+
+def content_of(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
+    """Return the content of a world, and its objects that stand, also those without an area."""
+    notes = world.notes
+    masks = masks_of(link.link.element for link in world.links)
+    meshes = LinkMeshes(world.resources, options, notes, world.allowance, masks)
+    objects = []
+    for link in world.links:
+        parts = meshes.meshes_of(link.body, link.link, scoped(link.path), link.scale)
+        for part in parts:
+            name = "/".join(link.path) + part.suffix
+            objects.append(PlacedObject(PlacedNode(part.mesh, link.matrix, name), part.flags))
+    actors = actors_of(world.element, world.source, meshes, notes)
+    standing = [node for node in actors.standing if is_in_reach(node.matrix)]
+    notes.remote |= {node.name: None for node in actors.standing if not is_in_reach(node.matrix)}
+    objects += [PlacedObject(node, ALL_BITS) for node in (*_roads(world, meshes), *standing)]
+    content = placed_content([item.node for item in objects])
+    content.moving = actors.moving
+    content.unit_m = 1.0
+    content.up_axis = "z"
+    content.notes = [*notes.lines()]
+    return content, objects
 
 
 def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from glob import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
 
 from ..writers.lidar_scenario import Lidar, clean, write_scenario
-from .model_file import body_matrix, load_model
+from .model_file import body_matrix, load_model, objects_of_bodies
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
@@ -82,22 +83,31 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
         _lidar(model, name, group, sites)
         for name, (group, sites) in zip(names, groups.items(), strict=True)
     ]
-    carriers = [body for body in dict.fromkeys(group.body for group in groups) if body]
-    bodies = names_of(model, "body")
     entry: dict[str, Any] = {"file": path, **({"assets": assets[0]} if assets else {})}
-    if carriers:
-        entry["exclude"] = [bodies[body] for body in carriers]
+    carriers = [body for body in dict.fromkeys(group.body for group in groups) if body]
+    objects = objects_of_bodies(model, _options(path, assets)) if len(carriers) > 1 else {}
+    lidars = [
+        lidar._replace(unseen=(escape(objects[group.body]),)) if group.body in objects else lidar
+        for lidar, group in zip(lidars, groups, strict=True)
+    ]
+    if excluded := [body for body in carriers if body not in objects]:
+        bodies = names_of(model, "body")
+        entry["exclude"] = [bodies[body] for body in excluded]
     return write_scenario(folder, "MuJoCo", entry, lidars, {}, left_out)
+
+
+def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
+    """Return the options of reading a model without its images."""
+    folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
+    return ReadOptions(masks=False, colours=False, folders=folders)
 
 
 def _loaded(path: Path, assets: Sequence[Path]) -> Any:
     """Return the arrays of a model; LidarError if the file cannot be read."""
     with explained("it cannot be read"):
         data = read_input(path)
-    folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
-    options = ReadOptions(masks=False, colours=False, folders=folders)
     try:
-        return load_model(data, path, options)
+        return load_model(data, path, _options(path, assets))
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
@@ -246,7 +256,4 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
             f"rangefinders also meet geoms of {'groups' if len(further) > 1 else 'group'} "
             f"{numbers}: groups of scene.files"
         )
-    carriers = {group.body for group in groups} - {0}
-    if len(carriers) > 1:
-        lines.append("no sensor sees any body that carries a sensor: exclude of scene.files")
     return lines

@@ -21,7 +21,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
-from lidarsim.base.words import did_you_mean, listed
+from lidarsim.base.words import did_you_mean, listed, printable
 from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
 from lidarsim.mujoco.model_bodies import (
     Choice,
@@ -41,6 +41,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
 )
 from lidarsim.scene.masks import MaskNotes
+from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine
 
@@ -109,6 +110,22 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
     if not options.colours:  # without the pixels of textures
         fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)
     return SimpleNamespace(**frame, **fields)
+
+
+def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
+    """Return the names of the objects of a model's bodies in its scene: {body: name}.
+
+    Bodies without an object, and the world itself, are missing.
+    """
+    bodies, geoms = excluded(model, options.model.exclude)
+    seen = seen_geoms(model, _choice(model, options.model, bodies, geoms))
+    content = placed_content(_placed(model, options))
+    names = [printable(item.name) for item in content.meshes]
+    # The last object of a name is that of a body: geoms of the world come first.
+    unique = dict(zip(names, unique_names(names), strict=True))
+    body_names = [printable(name) for name in names_of(model, "body")]
+    with_geoms = {int(body) for body in np.asarray(model.geom_bodyid)[seen]} - {0}
+    return {body: unique[body_names[body]] for body in with_geoms if body_names[body] in unique}
 
 
 def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
+from lidarsim.base.arrays import Floats
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colours import Colours
+from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -22,6 +25,7 @@ from lidarsim.scene.files.scene_graph import (
     ReadOptions,
     join_pieces,
 )
+from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from .elements import UnreadElements, number
@@ -68,7 +72,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.unit_m = 1.0
     content.up_axis = "z"
     content.classes = CLASSES
-    content.notes = _notes(header, unread)
+    content.notes = _notes(header, content.meshes, unread)
     return content
 
 
@@ -172,19 +176,26 @@ def _material(lane: Lane) -> str:
     return material_of_lane(lane.type, None if stated is None else stated.get("surface"))
 
 
-def _notes(header: Element | None, unread: UnreadElements) -> list[str]:
+def _notes(
+    header: Element | None,
+    meshes: Sequence[SceneMesh | SceneInstance],
+    unread: UnreadElements,
+) -> list[str]:
     """Return notes on the coordinate system of a file, and on the elements that are not read."""
     notes = []
     if header is not None:
-        notes = _reference_notes(header)
+        notes = _reference_notes(header, middle_of(meshes))
     listed = str(unread)
     if listed:
         notes.append(f"is read without {listed}")
     return notes
 
 
-def _reference_notes(header: Element) -> list[str]:
-    """Return notes on the coordinate system and the offset that a header states."""
+def _reference_notes(header: Element, middle: Floats) -> list[str]:
+    """Return notes on the coordinate system and the offset that a header states.
+
+    `middle` (2,) are x and y in the middle of the roads.
+    """
     text = " ".join((header.findtext("geoReference") or "").split())
     epsg = _epsg(text)
     offset = header.find("offset")
@@ -192,6 +203,10 @@ def _reference_notes(header: Element) -> list[str]:
     if offset is not None:
         shift = [number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
+    place = middle + shift[:2]  # a heading turns roads about their zero, which is near
+    problem = scale_problem(f"EPSG:{epsg}" if epsg else text, *place.tolist()) if text else ""
+    if problem:
+        system += f", {problem}"
     if any(shift):
         x, y, z, heading = shift
         moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
@@ -202,6 +217,8 @@ def _reference_notes(header: Element) -> list[str]:
         return [
             f"has an offset, which is not applied: {' and '.join(moves)} {verb} it into {where}"
         ]
+    if problem:
+        return [f"is in {system}"]
     if epsg:
         return [f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS"]
     if text:

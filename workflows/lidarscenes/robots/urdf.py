@@ -40,6 +40,7 @@ from .robot import HELD, MOVING, Joint, Robot
 _MAX_LINKS = 1000  # humanoids with hands have 150
 _MAX_FOLDERS_UP = 5  # folders above a robot's file in which its packages are looked for
 _MAX_NUMBER = 1e8  # in a file
+_NO_FOLDERS = ("", ".", "..")  # parts of a path that name no folder
 
 
 @checked
@@ -386,7 +387,9 @@ class _LinkMeshes:
                 f"its mesh {name[:200]!r} must be a file's name, package://NAME/FILE or file://."
             )
         package, _, file = location.partition("/")
-        for folder in self._folders_above if package not in ("", ".", "..") else ():
+        if package in _NO_FOLDERS:
+            raise LidarError(self._without_package(name, scheme, location))
+        for folder in self._folders_above:
             if folder.name == package or _package_name(folder) == package:
                 return folder / file, folder
             if (folder / package).is_dir():
@@ -394,6 +397,21 @@ class _LinkMeshes:
         raise LidarError(
             f"its mesh {name[:200]!r} is of a package that is not there: put the .urdf into the "
             f"folder {package[:80]!r} of that package, or beside it."
+        )
+
+    def _without_package(self, name: str, scheme: str, location: str) -> str:
+        """Return the error of a URI without the name of a package: package:///my_robot/leg.dae."""
+        parts = [part for part in location.split("/") if part not in _NO_FOLDERS]
+        start = f"its mesh {name[:200]!r} names no package: write"
+        if len(parts) < 2:
+            folder = self.path.resolve().parent.name
+            return (
+                f"{start} {scheme}://NAME/FILE, or the path of the file from the folder "
+                f"{folder[:80]!r} of the .urdf."
+            )
+        return (
+            f"{start} {scheme}://{'/'.join(parts)[:200]}, and put the .urdf into the folder "
+            f"{parts[0][:80]!r} of that package, or beside it."
         )
 
 

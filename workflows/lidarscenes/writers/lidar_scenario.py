@@ -42,6 +42,8 @@ class Lidar(NamedTuple):
         From the frames of the lidar and of the model to the world, (4, 4).
     left_out
         What is not as in the other program, a clause each.
+    unseen
+        Patterns of the names of the objects that the lidar does not see.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Lidar(NamedTuple):
     matrix: Floats
     model_matrix: Floats
     left_out: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
 
 
 def write_scenario(
@@ -133,6 +136,7 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
             **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
             **({"max_range_m": clean(max_range_m)} if math.isfinite(max_range_m) else {}),
             "mount": _pose(mount),
+            **({"unseen": list(lidar.unseen)} if lidar.unseen else {}),
         }
     pose = _pose(lidars[0].model_matrix) if of_one_model else {"position": [0.0, 0.0, 0.0]}
     return {"sensors": sensors, "poses": [pose], "steps": 1}

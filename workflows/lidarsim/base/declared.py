@@ -7,7 +7,7 @@ scenario; other sections inherit its fields (`lidarpool.scenario.sections`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from math import inf
 from typing import Annotated, Any, TypeVar
@@ -121,3 +121,5 @@ def is_text(value: Any) -> bool:
 # A list of texts, or a single text.
 Texts = Several[Text]
 TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]
+# The same as an argument in Python.
+Names = Annotated[str | Sequence[Text], written_as(TextOrTexts)]

@@ -25,3 +25,10 @@ UNITS_M = {
 WAIT_S = 10.0  # wait for partitions that are empty at the start of a run
 QUEUE_S = 3600.0  # for both waits, if workers are jobs in a queue
 PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few seconds
+
+# EPSG codes of systems for maps of the whole Earth, whose metres are true along a line at most:
+# Mercator and cylindrical projections, of which EPSG:3857 is Web Mercator.
+WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004})
+OF_THE_WORLD = (
+    "for maps of the world, whose metres are not true: choose a UTM zone or a national grid"
+)

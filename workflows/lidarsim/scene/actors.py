@@ -104,6 +104,11 @@ class Actor:
         """Name of the actor, which is the name of its mesh."""
         return self.mesh.name
 
+    @property
+    def bounds(self) -> Floats:
+        """Corners of the actor's box in its frame, (2, 3), metres; of all poses if it deforms."""
+        return (self.mesh.animation or self.mesh).bounds
+
     def placed(self, time_ns: float) -> SceneMesh:
         """Return the mesh at a time, in the scene's local coordinates; a point while absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
@@ -126,14 +131,6 @@ class Actor:
         if not animation.repeat:
             rates = rates * ((seconds >= 0) & (seconds < animation.duration_s))
         return animation.frames(seconds), rates / animation.step_s
-
-    def bounds_between(self, starts_ns: Floats, stops_ns: Floats) -> Floats:
-        """Return boxes of all poses between times (k,), ns, in the actor's frame: (k, 2, 3)."""
-        if (animation := self.mesh.animation) is None:
-            return self.mesh.bounds[None].repeat(len(starts_ns), axis=0)
-        times_ns = np.linspace(starts_ns, stops_ns, 5)  # the actor may drive forward and back
-        seconds = self.seconds(times_ns.reshape(-1))[0].reshape(times_ns.shape)
-        return animation.bounds_between(seconds.min(axis=0), seconds.max(axis=0))
 
     def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
         """Return times (k,) in the animation, seconds, at times (k,), ns, and their rates (k,).

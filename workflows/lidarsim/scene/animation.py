@@ -102,25 +102,6 @@ class Animation:
         """Lowest and highest corner of all poses, metres: (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def bounds_between(self, first_s: Floats, last_s: Floats) -> Floats:
-        """Return boxes of all poses between seconds (n,) since the first pose: (n, 2, 3)."""
-        last = len(self.vertices) - 1
-        limits = np.stack([first_s, last_s]) / self.step_s
-        limits = limits if self.repeat else limits.clip(0, last)
-        first = np.floor(limits[0]).astype(np.int64)
-        steps = np.ceil(limits[1]).astype(np.int64) - first  # 0 while the animation keeps a pose
-        pose_lower = self.vertices.min(axis=1)
-        pose_upper = self.vertices.max(axis=1)
-        lower = np.full((len(first), 3), np.inf)
-        upper = np.full((len(first), 3), -np.inf)
-        for step in range(max(1, min(int(steps.max(initial=0)), last))):
-            pose = first + np.minimum(step, (steps - 1).clip(0))
-            pose = pose % last if self.repeat else pose
-            for frame in (pose, pose + (steps > 0)):
-                lower = np.minimum(lower, pose_lower[frame])
-                upper = np.maximum(upper, pose_upper[frame])
-        return np.stack([lower, upper], axis=1)
-
     def moved(self, linear: Floats, offset: Floats) -> Animation:
         """Return the animation with all vertices at p -> linear @ p + offset."""
         points = turned(self.vertices.reshape(-1, 3), linear) + offset

@@ -420,7 +420,10 @@ def _matching_kinds(
     """
     matches: Indices | None = None
     if entry.objects is not None:
-        rows = [_matching_rows(pattern, kinds.names, object_rows) for pattern in entry.objects]
+        rows = [
+            matching_rows(pattern, kinds.names, object_rows, "materials")
+            for pattern in entry.objects
+        ]
         matches = kinds.of_rows(np.concatenate(rows))
     if entry.material is None:
         assert matches is not None, "a material applies to objects, or to materials"
@@ -452,15 +455,32 @@ def _matching_kinds(
     return common
 
 
-def _matching_rows(pattern: str, names: Sequence[str], object_rows: Mapping[str, int]) -> Indices:
-    """Return the rows of the objects that fit a pattern; LidarError if no object fits."""
+def matching_rows(
+    pattern: str, names: Sequence[str], object_rows: Mapping[str, int], subject: str
+) -> Indices:
+    """Return the rows of the objects that fit a pattern.
+
+    Parameters
+    ----------
+    pattern
+        Name of an object, or a pattern with * and ?.
+    names, object_rows
+        Names of all objects, and {name: row}.
+    subject
+        What names the objects, for the error: «materials».
+
+    Raises
+    ------
+    LidarError
+        If no object fits.
+    """
     if pattern in object_rows and not any(sign in pattern for sign in "*?["):
         return np.array([object_rows[pattern]])
     rows = rows_named(pattern, names)
     if not len(rows):
         listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
         raise LidarError(
-            f"materials names {pattern!r}, but no object has that name."
+            f"{subject} names {pattern!r}, but no object has that name."
             + (did_you_mean(pattern, names) or listed)
         )
     return rows

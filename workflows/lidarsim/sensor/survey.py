@@ -15,11 +15,12 @@ import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import FILLED_IN, Several, about, written_as
+from ..base.declared import FILLED_IN, Names, Several, about, written_as
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields, shown
+from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..base.words import listed, plural
 from ..columns.table import (
     COORDINATES,
@@ -73,6 +74,9 @@ class Mounted:
         Time steps from each station; by default the survey's.
     returns, noise
         Instead of the survey's, which by default are the sensor's.
+    unseen
+        Names of objects that the sensor does not see, with * and ?: its rays pass through these
+        objects, such as the sensor's own housing.
     """
 
     sensor: Sensor
@@ -81,6 +85,11 @@ class Mounted:
     steps: StepCount | None = None
     returns: Returns | None = None
     noise: Noise | None = None
+    unseen: Names = ()
+
+    def __post_init__(self) -> None:
+        names = (self.unseen,) if isinstance(self.unseen, str) else tuple(self.unseen)
+        object.__setattr__(self, "unseen", names)
 
 
 @dataclass(frozen=True)
@@ -358,6 +367,8 @@ class Survey(CloudOptions, Weather):
 
     def _check_values(self) -> None:
         """Check that options fit together and to the sensors."""
+        if self.epsg in WORLD_EPSG:
+            raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
         if self.navigation is not None:
             check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):

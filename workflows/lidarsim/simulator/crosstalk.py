@@ -250,7 +250,7 @@ class CrosstalkStep(PulseStep):
         fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
         origins, directions = self._fired_rays(number, spec.station, firings, firing_starts)
         trajectories = poses.actor_trajectories
-        hits = self.caster.scan(
+        hits = self.caster.of_sensors[number].scan(
             Pattern(directions, origins),
             CastPoses(np.zeros(3), clock=Clock(fired + spec.start_ns, np.zeros(1), trajectories)),
             t_min=sensor.min_range_m,
@@ -258,12 +258,18 @@ class CrosstalkStep(PulseStep):
         )
         ray = hits.ray.astype(np.int64)
         distance = hits.distance
+        triangle = hits.triangle
+        if self.caster.unseen is not None:  # spots on objects that this sensor does not see
+            seen = np.flatnonzero(~self.caster.unseen[self.surfaces.objects(triangle)])
+            ray = ray[seen]
+            distance = distance[seen]
+            triangle = triangle[seen]
         times = fired[ray] + spec.start_ns
         return _Spots(
             fired[ray] + distance / LIGHT_M_NS,
             origins[ray] + distance[:, None] * directions[ray],
-            self.surfaces.normals(hits.triangle, times, trajectories),
-            hits.triangle,
+            self.surfaces.normals(triangle, times, trajectories),
+            triangle,
             distance,
         )
 

@@ -10,6 +10,7 @@ actors, and the device merges them with its hits.
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,7 +24,7 @@ from raybeam.device import filled, host_array, to_device
 from ..base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
-from ..sensor import ScanSpec, Sensor, Survey
+from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
 from .motion import CastPoses
 from .points import BatchPoints
@@ -109,16 +110,28 @@ class DevicePoints:
         return cells * self.survey.precision_m
 
 
+class SeenBodies:
+    """Bodies that a sensor sees, numbered as its caster numbers them."""
+
+    def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
+        self.caster = caster
+        self.rows = caster.body_rows  # rows in `Surfaces.bodies`
+        self.table = bodies[self.rows]  # as in `Surfaces.bodies`; all actors are the last body
+        self.counters = caster.counters()
+        self.device_table: Any = None
+        self.device_normal_matrices: Any = None
+
+
 class DeviceColumns:
     """Casts surveys whose rays have a single return, and computes columns on the device.
 
-    NumPy computes the columns that the device cannot compute, see the module.
+    NumPy computes the columns that the device cannot compute, see the module. `casters` are those
+    of the sensors, by their numbers.
     """
 
     def __init__(
-        self, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
+        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
-        self._caster = caster
         self._scene = scene
         self._surfaces = surfaces
         self.survey = survey
@@ -133,17 +146,18 @@ class DeviceColumns:
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
         # Whether NumPy computes energies of hits on actors, which the device computes of others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
-        self.bodies, _ = surfaces.bodies()
-        self._counters = caster.counters()
+        bodies, _ = surfaces.bodies()
+        seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
+        self._seen_bodies = [seen[caster] for caster in casters]  # by sensors
         self._surface_tables: tuple[Any, ...] | None = None
-        self._normal_matrices: Any = None
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
         """Return a copy for a scene with moved instances; unchanged tables stay on the device."""
         moved_columns = copy(self)
         moved_columns._scene = scene
         moved_columns._surfaces = surfaces
-        moved_columns._normal_matrices = None
+        for seen in self._seen_bodies:
+            seen.device_normal_matrices = None
         return moved_columns
 
     def returns(
@@ -161,6 +175,7 @@ class DeviceColumns:
         """
         survey = self.survey
         sensor = survey.carried[specs[0].sensor].sensor
+        seen = self._seen_bodies[specs[0].sensor]
         keep_every = survey.keep_every
         scan = check_scan(
             pattern,
@@ -172,10 +187,12 @@ class DeviceColumns:
             groups=groups,
             tally=True,
         )
-        actor_hits = self._actor_hits(scan, poses)
-        transfer = _ColumnTransfer(self, specs, groups, -(-len(scan) // keep_every) + len(groups))
+        actor_hits = _actor_hits(seen, scan, poses)
+        transfer = _ColumnTransfer(
+            self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
+        )
         try:
-            hits, tally = self._caster.caster.visit(scan, transfer.make, self._counters, actor_hits)
+            hits, tally = seen.caster.caster.visit(scan, transfer.make, seen.counters, actor_hits)
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
@@ -204,23 +221,16 @@ class DeviceColumns:
             returns if self.needs_all_hits else None,
         )
 
-    def _actor_hits(self, scan: Scan, poses: CastPoses) -> OtherHits | None:
-        """Find the hits of a scan on actors; None without actors.
-
-        All actors are the last body: its triangles count from 0.
-        """
-        if not poses.actor_trajectories:
-            return None
-        hits = self._caster.on_actors(scan, poses)
-        return replace(hits, triangle=hits.triangle - np.int32(self.bodies[-1, 0]))
-
     def write_ranges(
-        self, sensor: Sensor, pattern: Pattern, poses: CastPoses, image: Floats32
+        self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges of rays to `image` (n,), metres, which are inf before.
+        """Write the ranges of rays of sensor `number` to `image` (n,), metres.
 
-        Ray i is row ``i % len(pattern)`` of the pattern. A ray without a return keeps inf.
+        Ray i is row ``i % len(pattern)`` of the pattern. `image` has inf before; a ray without a
+        return keeps inf.
         """
+        sensor = self.survey.carried[number].sensor
+        seen = self._seen_bodies[number]
         scan = check_scan(
             pattern,
             **poses.caster_arguments,
@@ -235,18 +245,17 @@ class DeviceColumns:
                 images.append(hits.cupy.full(len(image), np.inf, np.float32))
             images[0][hits.ray] = hits.distance
 
-        self._caster.caster.visit(scan, take, other_hits=self._actor_hits(scan, poses))
+        seen.caster.caster.visit(scan, take, other_hits=_actor_hits(seen, scan, poses))
         for device_image in images:
             device_image.get(out=image)
 
-    def tables(self, cupy: Any) -> tuple[Any, ...]:
+    def tables(self, cupy: Any, seen: SeenBodies) -> tuple[Any, ...]:
         """Return the tables of surfaces that columns.cu reads, on the caster's device."""
         if self._surface_tables is None:
             surfaces = self._surfaces
             materials = self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
-                self.bodies,
                 surfaces.owners,
                 normals,
                 materials.reflectance,
@@ -254,22 +263,42 @@ class DeviceColumns:
                 materials.semantic_class,
             )
             self._surface_tables = tuple(to_device(cupy, table) for table in tables)
-        if self._normal_matrices is None:
-            self._normal_matrices = to_device(cupy, self._surfaces.bodies()[1])
-        return *self._surface_tables, self._normal_matrices
+        if seen.device_table is None:
+            seen.device_table = to_device(cupy, seen.table)
+        if seen.device_normal_matrices is None:
+            normal_matrices = self._surfaces.bodies()[1][seen.rows]
+            seen.device_normal_matrices = to_device(cupy, normal_matrices)
+        return seen.device_table, *self._surface_tables, seen.device_normal_matrices
+
+
+def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
+    """Find the hits of a scan on actors that are seen; None without actors.
+
+    All actors are the last body: its triangles count from 0.
+    """
+    if not poses.actor_trajectories:
+        return None
+    hits = seen.caster.on_actors(scan, poses)
+    return replace(hits, triangle=hits.triangle - np.int32(seen.table[-1, 0]))
 
 
 class _ColumnTransfer:
     """Computes columns of a batch on the device, and sends the values to the host.
 
-    `maker` names the columns and has the tables of surfaces. The caster passes the hits of the
-    batch to `make` in parts; `finish` returns the columns of all hits.
+    `maker` names the columns and has the tables of surfaces. The caster of the bodies `seen` passes
+    the hits of the batch to `make` in parts; `finish` returns the columns of all hits.
     """
 
     def __init__(
-        self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, max_points: int
+        self,
+        maker: DeviceColumns,
+        seen: SeenBodies,
+        specs: list[ScanSpec],
+        groups: Ints,
+        max_points: int,
     ) -> None:
         self._maker = maker
+        self._seen = seen
         self._specs = specs
         self._groups = groups
         self._max_points = max_points
@@ -319,7 +348,7 @@ class _ColumnTransfer:
 
     def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
         """Return the rows of the hits on actors, and their rays, distances and triangles."""
-        on_actors = hits.cupy.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
+        on_actors = hits.cupy.flatnonzero(hits.instance == len(self._seen.table) - 1)
         columns = (
             on_actors,
             hits.ray[on_actors],
@@ -327,7 +356,7 @@ class _ColumnTransfer:
             hits.triangle[on_actors],
         )
         rows, ray, distance, triangle = (array.get() for array in columns)
-        triangle += np.int32(self._maker.bodies[-1, 0])
+        triangle += np.int32(self._seen.table[-1, 0])
         return self._count + rows, ray, distance, triangle
 
     @property
@@ -374,7 +403,9 @@ class _ColumnTransfer:
         maker = self._maker
         specs = self._specs
         sensor = maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, reflectance, retro, classes, normal_matrices = maker.tables(cupy)
+        bodies, owners, normals, reflectance, retro, classes, normal_matrices = maker.tables(
+            cupy, self._seen
+        )
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         return (
             np.float64(maker.survey.precision_m),

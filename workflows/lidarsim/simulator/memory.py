@@ -17,6 +17,7 @@ from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
 from .step import Memory, Setup, Sizes
 from .steps import setup_of, steps_of
+from .visibility import static_key, unseen_objects
 
 MB = 1_000_000
 
@@ -64,7 +65,9 @@ PATTERN_RAY = 48  # of a ray of a period of the head, and of its pattern
 
 def rig_bytes(scene: Scene, survey: Survey) -> int:
     """Estimate the memory of a rig, in bytes: scene, tree of the caster, patterns of rays."""
-    triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE) * scene.kept_triangles
+    # Sensors that see different static objects have trees of their own.
+    trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
+    triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
     images = {id(image): image.nbytes for mesh in scene.coloured for image in mesh.images}
     colours = COLOURED_TRIANGLE * sum(map(len, scene.coloured)) + IMAGE_BYTE * sum(images.values())
     instances = INSTANCE * len(scene.instances or ())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -23,8 +23,7 @@ from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firing
 from .points import BatchPoints
 from .pulses import PulseCaster
 from .returns import required
-from .scene_caster import SceneCaster
-from .static_bodies import largest_range_m
+from .scene_caster import SceneCaster, casters_of_sensors, move_instances
 from .surfaces import Surfaces
 
 # Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
@@ -69,16 +68,16 @@ class Rig:
         device: int | None = None,
     ) -> None:
         options = {"backend": backend, "threads": threads, "device": device}
-        self._assemble(scene, survey, options, None)
+        self._assemble(scene, survey, options, ())
 
     def _assemble(
         self,
         scene: Scene,
         survey: Survey,
         options: dict[str, Any],
-        shared_caster: SceneCaster | None,
+        known_casters: Sequence[SceneCaster],
     ) -> None:
-        """Set all attributes; trees are built, unless `shared_caster` has those of the scene."""
+        """Set all attributes; trees are built, unless `known_casters` have those of the scene."""
         self.scene = scene
         self.survey = survey
         self.options = options
@@ -86,9 +85,9 @@ class Rig:
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         # The parts from which scans are cast, for other tools to look into.
         self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        range_m = largest_range_m(survey)
-        self.scene_caster = SceneCaster(
-            scene, self.surfaces, shared_caster, range_m=range_m, **options
+        # Casters of the sensors, by their numbers.
+        self.scene_casters = casters_of_sensors(
+            scene, survey, self.surfaces, known_casters, **options
         )
         self._prepare()
         check_trajectory(survey.path)
@@ -124,7 +123,7 @@ class Rig:
         The tree of static bodies is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self.options, self.scene_caster)
+        rig._assemble(scene, survey, self.options, self.scene_casters)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
@@ -160,7 +159,7 @@ class Rig:
         rig.scene = scene = self.scene.moved(rows, positions[index], rotations[index])
         assert scene.instances is not None
         rig.surfaces = surfaces = self.surfaces.moved(scene)
-        rig.scene_caster.move_instances(surfaces, scene.instances, rows)
+        move_instances(rig.scene_casters, surfaces, scene.instances, rows)
         rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
         rig._device = self._device and self._device.moved(scene, surfaces)
         return rig
@@ -170,27 +169,27 @@ class Rig:
 
         Columns are computed on a CUDA device if it casts the rays and no sensor has steps.
         """
-        caster = self.scene_caster
+        casters = self.scene_casters
         scene = self.scene
         survey = self.survey
         surfaces = self.surfaces
         self.pulse_casters = [
             PulseCaster(number, caster, scene, survey, surfaces)
-            for number in range(len(survey.carried))
+            for number, caster in enumerate(casters)
         ]
         self._device: DeviceColumns | None = None
-        if caster.on_device and not any(pulses.steps for pulses in self.pulse_casters):
-            self._device = DeviceColumns(caster, scene, survey, surfaces)
+        if casters[0].on_device and not any(pulses.steps for pulses in self.pulse_casters):
+            self._device = DeviceColumns(casters, scene, survey, surfaces)
 
     @property
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
-        return self.scene_caster.backend
+        return self.scene_casters[0].backend
 
     @property
     def device_lost(self) -> bool:
         """Whether a CUDA device answers no call of this process any more, after an error of it."""
-        return self.scene_caster.caster.device_lost
+        return self.scene_casters[0].caster.device_lost
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings `first` to `stop` of sensor `number`, in the carrier's frame.
@@ -242,7 +241,7 @@ class Rig:
         stop = specs[-1].firings[1]
         firings = Firings.from_scans(sensor, specs)
         poses = self._poses(firings, path, late_ns, by_head=by_head)
-        self.scene_caster.cover(poses.positions)
+        self.scene_casters[number].cover(poses.positions)
         if repeated is not None:
             pattern = repeated
             start = first * channels % len(repeated)  # row of the first ray in the pattern
@@ -310,10 +309,11 @@ class Rig:
         the carrier frame to the scene frame; they are not checked here. Ranges are those of the
         nearest reported returns, metres: float32 (k, firings, channels); inf without a return.
         """
-        sensor = self.survey.carried[specs[0].sensor].sensor
+        number = specs[0].sensor
+        sensor = self.survey.carried[number].sensor
         first = specs[0].firings[0]
-        self.scene_caster.cover(positions)
-        pattern = self._pattern_of_firings(specs[0].sensor, first, specs[-1].firings[1])
+        self.scene_casters[number].cover(positions)
+        pattern = self._pattern_of_firings(number, first, specs[-1].firings[1])
         rays = len(pattern)
         ranges_m = np.full((len(positions), rays), np.inf, np.float32)
         poses_per_block = max(1, IMAGE_RAYS // max(rays, 1))
@@ -346,7 +346,7 @@ class Rig:
         firings = Firings.from_scans(sensor, specs, count)
         poses = self._with_actor_clock(poses, firings)
         if self._device is not None:
-            self._device.write_ranges(sensor, pattern, poses, image)
+            self._device.write_ranges(specs[0].sensor, pattern, poses, image)
             return
         first = specs[0].firings[0]
         scan_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels

@@ -16,6 +16,7 @@ from pydantic import Field
 from raybeam.poses import check_poses
 
 from ..base.arrays import Floats, Floats32, Indices
+from ..base.declared import Names
 from ..base.errors import LidarError
 from ..base.validation import checked, shown
 from ..base.words import did_you_mean
@@ -69,6 +70,8 @@ class Scanner:
     name
         Name of the sensor, which is part of all random numbers: give the sensors of a robot
         different names. A `Mounted` has a name already.
+    unseen
+        Names of objects that the sensor does not see, with * and ?, as in `Mounted`.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
     fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
     spray_g_m3
@@ -102,6 +105,7 @@ class Scanner:
         sensor: Sensor | Mounted,
         *,
         name: str = "",
+        unseen: Names = (),
         columns: Sequence[str | Column] = (),
         precision_m: float | None = None,
         coordinates: str = "world",
@@ -124,8 +128,12 @@ class Scanner:
                 f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
                 f"Mounted(sensor, name={name!r})."
             )
+        mounted = sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)
+        if unseen:
+            names = (unseen,) if isinstance(unseen, str) else unseen
+            mounted = replace(mounted, unseen=(*mounted.unseen, *names))
         survey = Survey(
-            sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)],
+            sensors=[mounted],
             poses=[CENTRE],
             steps=1,
             precision_m=precision_m,  # type: ignore[arg-type]  # None: of the sensor, as below

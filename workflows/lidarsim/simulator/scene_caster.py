@@ -6,7 +6,9 @@ rebuilt: see `raybeam.moving`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,13 +35,16 @@ from ..base.words import did_you_mean
 from ..scene.actors import Actor, distinct_meshes
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, parts_of
+from ..sensor import Survey
 from .actor_trajectories import ActorTrajectories
 from .motion import CastPoses, Clock
-from .static_bodies import StaticBodies, mesh_of
+from .static_bodies import StaticBodies, largest_range_m, mesh_of
 from .surfaces import Surfaces
+from .visibility import static_key, unseen_objects
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 _MAX_ROOM_RAYS = 1 << 18  # rays that are stored for casts on static bodies and on actors: 13 MB
+_NEVER_NS = np.array([np.inf, -np.inf])  # first and last time of an actor that is never present
 REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
 
 
@@ -64,6 +69,14 @@ class _ActorShapes(NamedTuple):
     shape: Indices  # (a,): shape of each actor
 
 
+class CastBodies(NamedTuple):
+    """Trees of the static bodies of a scene, and shapes of its actors."""
+
+    static: StaticBodies
+    key: tuple[object, ...]  # static bodies of the same scene with the same key are the same
+    shapes: _ActorShapes | None  # None without actors
+
+
 def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
     """Raise LidarError if this machine lacks a backend of casting; `advice` ends the message."""
     # An interrupt during the import of an extension module would look like a missing module.
@@ -81,7 +94,7 @@ class SceneCaster:
 
     Triangles of instances are numbered after the faces of the scene, triangles of actors after
     both. Rays that touch no actor give the same bits as without actors. The poses of a scan have
-    the trajectories of the actors.
+    the trajectories of the actors. `casters_of_sensors` makes the casters of a survey.
 
     Parameters
     ----------
@@ -89,54 +102,51 @@ class SceneCaster:
         Faces, instances and actors to hit.
     surfaces
         Surfaces of the scene; a tally counts hits by `Surfaces.counter`.
-    shared_caster
-        Caster of the same scene, possibly with other actors. Its trees of static bodies are shared
-        if the same surfaces enclose media.
+    bodies
+        Trees of the static bodies and shapes of the actors.
     range_m
         Largest range of the sensors, metres: of a scene of hundreds of kilometres, what is far
         beyond the range is left out. Before scans, `cover` says where sensors are.
-    options
-        Arguments of `RayCaster`.
+    unseen
+        (objects,): True for objects that rays pass through, of which `bodies` lacks the static;
+        None for no object.
     """
 
     def __init__(
         self,
         scene: Scene,
         surfaces: Surfaces,
-        shared_caster: SceneCaster | None = None,
+        bodies: CastBodies,
         range_m: float = np.inf,
-        **options: Any,
+        unseen: Bools | None = None,
     ) -> None:
+        self.bodies = bodies
+        self.unseen = unseen
+        # Casters of all sensors of the survey, by their numbers; set by `casters_of_sensors`.
+        self.of_sensors: Sequence[SceneCaster] = ()
+        self.clear_m = _clear_m(scene)
         self._surfaces = surfaces
         self._instances = scene.instances
         self._face_count = static_triangles = len(scene.faces)
         if self._instances is not None:
             static_triangles += self._instances.triangles
-        # Distance behind a surface at which light continues, so as not to hit the surface again:
-        # Embree's rounding is up to a quarter of this distance.
-        reach = np.float32(np.abs(scene.bounds).max())
-        self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
         self._range_m = range_m
-        self._media = surfaces.media
-        if shared_caster is None or shared_caster._media != self._media:
-            # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
-            vertices = surfaces.spread_out(1.5 * self.clear_m)
-            # Media are searched beyond the range: their bodies stay whole.
-            cut_range_m = np.inf if self._media else range_m
-            self._static = StaticBodies(scene, vertices, cut_range_m, options)
-        else:
-            self._static = shared_caster._static
-        self._shapes = _shapes(scene.actors, options)
+        self._static = bodies.static
+        self._shapes = bodies.shapes
+        self._unseen_actors: Bools | None = None
+        if unseen is not None and unseen[len(scene.names) :].any():
+            self._unseen_actors = unseen[len(scene.names) :]
+            if self._unseen_actors.all():
+                self._shapes = None
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         # First triangle of each actor.
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def move_instances(self, surfaces: Surfaces, instances: Instances, rows: Indices) -> None:
-        """Move instances `rows` to their transforms in `instances`; no scan may be under way.
+    def with_moved_instances(self, surfaces: Surfaces, instances: Instances) -> None:
+        """Replace surfaces and instances by those of the scene with moved instances.
 
-        `surfaces` are the surfaces of the scene with the moved instances.
+        `move_instances` moves the trees.
         """
-        self._static.move(instances, rows)
         self._surfaces = surfaces
         self._instances = instances
 
@@ -156,13 +166,25 @@ class SceneCaster:
         ``table[i, 0] + table[i, 1] * t``, see `Scene.counters`. The bodies are the faces of the
         scene, if any, with a counter for each triangle; then each instance, with one counter; and
         last all actors as one body, whose triangles are numbered after the scene's faces alone.
+        Bodies that the caster leaves out have no row.
         """
         instance_count = 0 if self._instances is None else len(self._instances)
-        static_count = self.caster.instance_count - instance_count
-        table = [[0, 1]] * static_count + [
+        table = [[0, 1]] * bool(self._face_count) + [
             [self._face_count + number, 0] for number in range(instance_count)
         ]
-        return np.array([*table, [instance_count, 1]], np.int64), self._surfaces.counters
+        counters = np.array([*table, [instance_count, 1]], np.int64)
+        return counters[self.body_rows], self._surfaces.counters
+
+    @property
+    def body_rows(self) -> Indices:
+        """Rows in `Surfaces.bodies` of the caster's instances, and of all actors: (instances + 1,).
+
+        The static bodies that no ray hits are missing.
+        """
+        trees = self._static.trees
+        first_instance = min(1, self._face_count)
+        last = first_instance + (0 if self._instances is None else len(self._instances))
+        return np.concatenate([np.arange(trees.face_bodies), first_instance + trees.rows, [last]])
 
     @property
     def backend(self) -> str:
@@ -286,6 +308,8 @@ class SceneCaster:
 
     def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
+        if self._shapes is None:
+            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         moving, shapes = self._moving_actors(poses)
         ray, distance, actor, instance, triangle = listed_hits_on(moving, scan, poses.times)
         part_triangle = shapes.part_triangles[shapes.shape[actor], instance]
@@ -302,15 +326,111 @@ class SceneCaster:
             """Return the positions in the animations of actors at times, in animation frames."""
             return trajectories.played(actor, times)[0]
 
+        presence_ns = trajectories.presence_ns
+        if self._unseen_actors is not None:
+            presence_ns = np.where(self._unseen_actors[:, None], _NEVER_NS, presence_ns)
         moving = Moving(
             shapes.casters,
             shapes.boxes,
             shapes.shape,
-            trajectories.presence_ns,
+            presence_ns,
             trajectories.table,
             frames,
         )
         return moving, shapes
+
+
+def casters_of_sensors(
+    scene: Scene,
+    survey: Survey,
+    surfaces: Surfaces,
+    known: Iterable[SceneCaster] = (),
+    **options: Any,
+) -> tuple[SceneCaster, ...]:
+    """Return the casters of the sensors of a survey; sensors that see the same objects share one.
+
+    Parameters
+    ----------
+    scene
+        Faces, instances and actors to hit.
+    survey
+        The sensors.
+    surfaces
+        Surfaces of the scene.
+    known
+        Casters of the same scene, possibly with other actors. Their trees of static bodies are
+        shared if the same surfaces enclose media, and if the same static objects are unseen.
+    options
+        Arguments of `RayCaster`.
+
+    Raises
+    ------
+    LidarError
+        If a sensor does not see an object that is not in the scene.
+    """
+    range_m = largest_range_m(survey)
+    media = surfaces.media
+    shapes = _shapes(scene.actors, options)
+    static_bodies = {caster.bodies.key: caster.bodies.static for caster in known}
+
+    @cache
+    def vertices() -> Floats:
+        # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
+        return surfaces.spread_out(1.5 * _clear_m(scene))
+
+    def bodies_without(unseen: Bools | None) -> CastBodies:
+        """Return the bodies of the scene without the static objects of a mask (objects,)."""
+        objects = static_key(scene, unseen)
+        key = media, objects
+        if key not in static_bodies:
+            # Media are searched beyond the range: their bodies stay whole.
+            cut_range_m = np.inf if media else range_m
+            unseen_static = unseen[: len(scene.names)] if objects and unseen is not None else None
+            static_bodies[key] = StaticBodies(
+                scene, vertices(), cut_range_m, options, unseen_static
+            )
+        return CastBodies(static_bodies[key], key, shapes)
+
+    casters: dict[bytes, SceneCaster] = {}  # {unseen objects: caster}
+    of_sensors = []
+    for unseen in unseen_objects(scene, survey):
+        key = b"" if unseen is None else unseen.tobytes()
+        if key not in casters:
+            bodies = bodies_without(unseen)
+            casters[key] = SceneCaster(scene, surfaces, bodies, range_m, unseen)
+        of_sensors.append(casters[key])
+    for caster in casters.values():
+        caster.of_sensors = of_sensors
+    return tuple(of_sensors)
+
+
+def move_instances(
+    casters: Sequence[SceneCaster], surfaces: Surfaces, instances: Instances, rows: Indices
+) -> None:
+    """Move instances `rows` to their transforms in `instances`; no scan may be under way.
+
+    Parameters
+    ----------
+    casters
+        Casters of the sensors of a survey.
+    surfaces, instances
+        Of the scene with the moved instances.
+    rows
+        (m,): rows of the instances that have moved.
+    """
+    for static in dict.fromkeys(caster.bodies.static for caster in casters):
+        static.move(instances, rows)
+    for caster in dict.fromkeys(casters):
+        caster.with_moved_instances(surfaces, instances)
+
+
+def _clear_m(scene: Scene) -> float:
+    """Return the distance behind a surface at which light continues, metres.
+
+    At this distance a ray does not hit the surface again: Embree's rounding is up to a quarter.
+    """
+    reach = np.float32(np.abs(scene.bounds).max())
+    return max(1e-5, 4 * float(np.spacing(reach)))
 
 
 def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:

@@ -1,7 +1,7 @@
 """The ray caster of the static bodies of a scene: of its faces and instances.
 
-Bodies far beyond the range of all sensors are left out, and triangles that reach there are cut:
-see `clipping`. Triangles keep their numbers.
+Bodies that a sensor does not see are left out. Bodies far beyond the range of all sensors are left
+out as well, and triangles that reach there are cut: see `clipping`. Triangles keep their numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
 from raybeam.registry import choose
 
-from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
+from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart
 from ..sensor import Survey
@@ -75,6 +75,11 @@ class _Trees(NamedTuple):
     # {instance of the caster: the triangle of its mesh of which each triangle is a part}
     origins: dict[int, Indices]
 
+    @property
+    def face_bodies(self) -> int:
+        """Number of instances of the caster that are the scene's faces: 0 or 1."""
+        return self.caster.instance_count - len(self.rows)
+
     def numbered(self, hits: ScanReturns) -> Ints32:
         """Return the triangles of hits (k,), by the numbers of the scene."""
         triangle = hits.triangle
@@ -100,17 +105,34 @@ class StaticBodies:
     vertices
         (v, 3): vertices of the scene's faces, metres.
     range_m
-        Largest range of the sensors, metres; inf lets no body be left out.
+        Largest range of the sensors, metres; inf leaves out no body for its distance.
     options
         Arguments of `RayCaster`.
+    unseen
+        (objects,): True for the static objects that are left out; None for no object.
     """
 
     def __init__(
-        self, scene: Scene, vertices: Floats, range_m: float, options: dict[str, Any]
+        self,
+        scene: Scene,
+        vertices: Floats,
+        range_m: float,
+        options: dict[str, Any],
+        unseen: Bools | None = None,
     ) -> None:
-        self._faces = scene.faces
+        self._faces: Integers = scene.faces
         self._vertices = vertices
         self._instances = scene.instances
+        self._has_faces = len(scene.faces) > 0
+        self._sees_all_faces = unseen is None
+        # (n,): whether the instances are seen; None if all are.
+        self._instance_is_seen: Bools | None = None
+        if unseen is not None:
+            # A triangle without an area is never hit, and the other triangles keep their numbers.
+            self._faces = np.where(unseen[scene.face_object, None], 0, scene.faces)
+            self._has_faces = _have_area(vertices, self._faces)
+            if scene.instances is not None:
+                self._instance_is_seen = ~unseen[scene.instances.owner]
         self._options = options
         self._lock = threading.Lock()
         self._centre = scene.bounds.mean(axis=0)
@@ -172,8 +194,10 @@ class StaticBodies:
         falls for ever, if it comes from there, or if it was cut.
         """
         self._instances = instances
+        if self._instance_is_seen is not None:
+            rows = rows[self._instance_is_seen[rows]]
         trees = self._trees
-        if trees is None:
+        if trees is None or not len(rows):
             return
         offsets = instances.transforms[rows, :, 3] - self._centre
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
@@ -181,11 +205,14 @@ class StaticBodies:
             self._may_cut = True
             self._trees = None  # `cover` builds them
             return
-        first = trees.caster.instance_count - len(trees.rows)
-        if trees.region is None:  # all instances have a tree
+        first = trees.face_bodies
+        if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
             trees.caster.move(first + rows, instances.transforms[rows])
             return
         numbers = first + np.searchsorted(trees.rows, rows)
+        if trees.region is None:
+            trees.caster.move(numbers, instances.transforms[rows])
+            return
         has_tree = np.isin(rows, trees.rows)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
         comes = ~has_tree & _is_near(instances, trees.region)[rows]
@@ -199,9 +226,11 @@ class StaticBodies:
 
         If there is no body within the region, the trees are those of all bodies.
         """
-        faces = None if region is None else cut(self._vertices, self._faces, box_planes(region))
+        faces = None if region is None else self._cut_faces(region)
         if self._instances is not None:
             return self._build_nested(self._instances, region, faces)
+        if not self._has_faces:
+            return self._build_transparent()
         if faces is None:
             caster = RayCaster(self._vertices, self._faces, **self._options)
             return _Trees(caster, region, None, _NO_ROWS, {})
@@ -210,13 +239,34 @@ class StaticBodies:
         caster = RayCaster(faces.vertices, faces.faces, **self._options)
         return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
 
+    def _cut_faces(self, region: Floats) -> CutMesh | None:
+        """Return the parts of the seen faces within a region (2, 3); None if all are within."""
+        parts = cut(self._vertices, self._faces, box_planes(region))
+        if parts is None or self._sees_all_faces:
+            return parts
+        seen = np.flatnonzero((parts.faces != parts.faces[:, :1]).any(axis=1))
+        return parts._replace(faces=parts.faces[seen], origin=parts.origin[seen])
+
+    def _build_transparent(self) -> _Trees:
+        """Build the tree of a single triangle through which all rays pass: nothing is seen.
+
+        A caster needs a triangle with an area. The triangles are as many as the scene's faces.
+        """
+        count = max(1, len(self._faces))
+        faces = np.zeros((count, 3), np.int64)
+        faces[0] = 0, 1, 2
+        opacity = Opacity(np.zeros((1, 1), np.bool_), np.zeros((count, 3, 2), np.float32))
+        mesh = Mesh(np.eye(3), faces, opacity)
+        caster = RayCaster.from_instances([Instance(mesh)], **self._options)
+        return _Trees(caster, None, None, _NO_ROWS, {})
+
     def _build_nested(
         self, instances: Instances, region: Floats | None, faces: CutMesh | None
     ) -> _Trees:
         """Build the trees of faces, cut or not, and of instances."""
         bodies: list[Instance] = []
         origins: dict[int, Indices] = {}
-        if faces is None and len(self._faces):
+        if faces is None and self._has_faces:
             bodies.append(Instance(Mesh(self._vertices, self._faces)))
         elif faces is not None and len(faces.faces):
             origins[0] = faces.origin
@@ -224,7 +274,7 @@ class StaticBodies:
         face_bodies = len(bodies)
         meshes: dict[int, Mesh] = {}  # {index of the part: mesh}
         rows = []
-        for row, cut_part in _parts_in(instances, region):
+        for row, cut_part in _parts_in(instances, region, self._instance_is_seen):
             index = int(instances.part[row])
             if cut_part is None:
                 if index not in meshes:
@@ -236,7 +286,7 @@ class StaticBodies:
             bodies.append(Instance(mesh, instances.transforms[row]))
             rows.append(row)
         if not bodies:
-            return self._build(None)
+            return self._build_transparent() if region is None else self._build(None)
         caster = RayCaster.from_instances(bodies, **self._options)
         starts = len(self._faces) + np.cumsum(instances.sizes) - instances.sizes
         first_triangles = np.append(np.zeros(face_bodies, np.int64), starts[rows])
@@ -245,18 +295,24 @@ class StaticBodies:
         )
 
 
-def _parts_in(instances: Instances, region: Floats | None) -> Iterator[tuple[int, CutMesh | None]]:
-    """Yield the rows of the instances within a region (2, 3), and the parts of cut instances.
+def _parts_in(
+    instances: Instances, region: Floats | None, is_seen: Bools | None
+) -> Iterator[tuple[int, CutMesh | None]]:
+    """Yield the rows of the seen instances within a region (2, 3), and the parts of cut instances.
 
-    Parts with a mask are not cut: single precision of the corners' coordinates in the texture would
-    move the mask.
+    `is_seen` (n,) tells which instances are seen; None if all are. Parts with a mask are not cut:
+    single precision of the corners' coordinates in the texture would move the mask.
     """
     if region is None:
-        yield from ((row, None) for row in range(len(instances)))
+        rows = range(len(instances)) if is_seen is None else np.flatnonzero(is_seen).tolist()
+        yield from ((row, None) for row in rows)
         return
     lower, upper = instances.bounds.transpose(1, 0, 2)
     is_whole = ((region[0] <= lower) & (upper <= region[1])).all(axis=1)
-    for row in np.flatnonzero(_is_near(instances, region)).tolist():
+    is_near = _is_near(instances, region)
+    if is_seen is not None:
+        is_near &= is_seen
+    for row in np.flatnonzero(is_near).tolist():
         cut_part = None
         part = instances.parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
@@ -264,6 +320,12 @@ def _parts_in(instances: Instances, region: Floats | None) -> Iterator[tuple[int
             cut_part = cut(part.vertices, part.faces, planes)
         if cut_part is None or len(cut_part.faces):
             yield row, cut_part
+
+
+def _have_area(vertices: Floats, faces: Integers) -> bool:
+    """Return True if a triangle (f, 3) has an area."""
+    a, b, c = vertices[faces[(faces != faces[:, :1]).any(axis=1)]].transpose(1, 0, 2)
+    return bool(np.cross(b - a, c - a).any())
 
 
 def _is_near(instances: Instances, region: Floats) -> Bools:

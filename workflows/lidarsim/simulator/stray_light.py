@@ -45,7 +45,7 @@ class StrayLightStep(PulseStep):
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._light = light_of(setup.survey, setup.sensor)
-        self._clusters = [*_retro_clusters(setup.scene, surfaces)]
+        self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -185,10 +185,17 @@ class _RetroCluster:
         return _Bounds(((a + b) + c) / 3, centre, radius)
 
 
-def _retro_clusters(scene: Scene, surfaces: Surfaces) -> Iterator[_RetroCluster]:
-    """Yield the retro-reflectors of a scene, its instances and actors, in clusters."""
+def _retro_clusters(
+    scene: Scene, surfaces: Surfaces, unseen: Bools | None
+) -> Iterator[_RetroCluster]:
+    """Yield the retro-reflectors of a scene, its instances and actors, in clusters.
+
+    Objects of the mask `unseen` (objects,) are left out.
+    """
     retro = surfaces.materials.retro
     owners = surfaces.material_kinds.object
+    if unseen is not None:
+        retro = retro & ~unseen[owners]
     has_retro = np.zeros(len(scene.all_names), np.bool_)  # by objects
     has_retro[owners[retro]] = True
 

@@ -16,6 +16,7 @@ import numpy as np
 from ..base.archives import open_archive, packed
 from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints
 from ..base.errors import LidarError
+from ..base.vectors import applied, cross
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..scene.scene import Scene
@@ -24,7 +25,14 @@ from ..sensor import Fault, Sensor, Survey
 from ..sensor.optics import TWO_RETURNS
 from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import full_poses, matrices, presence_ns, quaternions_of
+from ..sensor.trajectory import (
+    CLOCK_S,
+    full_poses,
+    matrices,
+    presence_ns,
+    quaternions_of,
+    velocities,
+)
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
 from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
@@ -39,9 +47,12 @@ COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is 
 AS_FIRED = "points in the sensor's axes at the firing of each: motion is not compensated"
 IN_WORLD = "points in the axes of the world"
 _PIECE = 250_000  # points that a thread or task reads at a time; several may read
-_FORMAT = 7
+_FORMAT = 8
 # Fields of `Sweeps` in a file, by their names: as arrays, and as JSON.
-_ARRAY_FIELDS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there", "knots")
+_ARRAY_FIELDS = (
+    "scans", "begins_ns", "ends_ns", "sensor", "actor_velocities", "actor_bounds", "actor_there",
+    "actor_comes", "knots",
+)  # fmt: skip
 _JSON_FIELDS = (
     "sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns", "stations",
     "station_ns",
@@ -100,11 +111,13 @@ class Sweeps:
     sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]  # names
     actors: tuple[str, ...]  # names; actors follow the objects in the column `object`
-    actor_poses: SweepPoses  # of the actors (a, 2n): at starts of sweeps, then at their ends
-    # (a, 2, 3): corners of each actor's box in the actor's frame, metres; (a, n, 2, 3) if a mesh
+    actor_poses: SweepPoses  # of the actors (a, n)
+    actor_velocities: Floats  # (a, n, 3): of the middles of the actors' boxes, m/s, world
+    # (a, 2, 3): corners of each actor's box in the actor's frame, metres; of all poses if its mesh
     # deforms.
     actor_bounds: Floats
-    actor_there: Bools  # (a, n): whether each actor is in the scene
+    actor_there: Bools  # (a, n): whether each actor is in the scene when each sweep begins
+    actor_comes: Bools  # (a, n): whether each actor appears during each sweep
     coordinates: str  # of the cloud's points, "world" or "sensor"
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
@@ -211,13 +224,6 @@ class Sweeps:
                 smallest_distance = np.where(better, distance, smallest_distance)
         return np.asarray(since_begin, np.float64)
 
-    def bounds(self, sweep: int) -> Floats:
-        """Return the corners of each actor's box during a sweep, in the actor's frame, metres.
-
-        Array (a, 2, 3).
-        """
-        return self.actor_bounds if self.actor_bounds.ndim == 3 else self.actor_bounds[:, sweep]
-
     @cached_property
     def carrier(self) -> SweepPoses:
         """Poses of the carrier at the start of each sweep."""
@@ -256,7 +262,9 @@ class Sweeps:
             (),
             (),
             none,
+            np.empty((0, 0, 3)),
             np.empty((0, 2, 3)),
+            np.empty((0, 0), bool),
             np.empty((0, 0), bool),
             "world",
             0.001,
@@ -276,14 +284,16 @@ class Sweeps:
             LidarTraits.from_sensor(carried.sensor, returns.mode)
             for carried, returns in zip(survey.carried, survey.returns_each, strict=True)
         )
-        actors = _actor_sweeps(scene, begins_ns, ends_ns)
+        sensor = np.concatenate(
+            [np.full(len(first), n, np.uint8) for n, first in enumerate(firsts)]
+        )
+        firing_ns = np.array([lidar.firing_ns for lidar in traits])[sensor]
+        actors = _actor_sweeps(scene, begins_ns, ends_ns + firing_ns)
         return cls(
             scans=np.append(np.concatenate(firsts), survey.scan_count),
             begins_ns=begins_ns,
             ends_ns=ends_ns,
-            sensor=np.concatenate(
-                [np.full(len(first), n, np.uint8) for n, first in enumerate(firsts)]
-            ),
+            sensor=sensor,
             pose=_poses_of(positions + scene.origin, rotations),
             mounts=_poses_of(
                 np.array([mount.position for mount in mounts]),
@@ -293,8 +303,10 @@ class Sweeps:
             objects=tuple(scene.names),
             actors=tuple(actor.name for actor in scene.actors),
             actor_poses=actors.poses,
+            actor_velocities=actors.velocities,
             actor_bounds=actors.bounds,
             actor_there=actors.present,
+            actor_comes=actors.comes,
             coordinates=survey.coordinates,
             precision_m=survey.precision_m,
             epsg=survey.epsg,
@@ -465,11 +477,13 @@ class _SensorSweeps(NamedTuple):
 
 
 class _ActorSweeps(NamedTuple):
-    """Actors during n sweeps."""
+    """Actors during n sweeps; see the fields of `Sweeps`."""
 
-    poses: SweepPoses  # (a, 2n): at starts of sweeps, then at their ends
-    bounds: Floats  # see `Sweeps.actor_bounds`
+    poses: SweepPoses  # (a, n)
+    velocities: Floats  # (a, n, 3)
+    bounds: Floats  # (a, 2, 3)
     present: Bools  # (a, n)
+    comes: Bools  # (a, n)
 
 
 def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
@@ -490,28 +504,48 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     return _SensorSweeps(np.concatenate(positions), np.concatenate(rotations), first_steps)
 
 
-def _actor_sweeps(scene: Scene, begins_ns: Floats, ends_ns: Floats) -> _ActorSweeps:
-    """Return poses and boxes of the actors of a scene during sweeps, and their presence."""
+def _actor_sweeps(scene: Scene, starts_ns: Floats, stops_ns: Floats) -> _ActorSweeps:
+    """Return the actors of a scene at the starts of sweeps, and whether they are there.
+
+    An actor that appears after the start of a sweep, or that has left, has the pose that it would
+    have if it moved as fast as at that moment, with the same rotation: its boxes then move evenly
+    from sweep to sweep.
+    """
     poses = []
+    linear = []
     present = []
-    for actor in scene.actors:
-        positions, rotations = full_poses(actor.trajectory, 0, np.append(begins_ns, ends_ns))
-        poses.append(_poses_of(positions + scene.origin, rotations))
-        appears, leaves = presence_ns(actor.trajectory)
-        present.append((appears <= begins_ns) & (begins_ns <= leaves))
-    if any(actor.mesh.animation for actor in scene.actors):
-        bounds = [actor.bounds_between(begins_ns, ends_ns) for actor in scene.actors]
-    else:
-        bounds = [actor.mesh.bounds for actor in scene.actors]
-    count = len(begins_ns)
+    comes = []
+    bounds = [actor.bounds for actor in scene.actors]
+    for actor, (lower, upper) in zip(scene.actors, bounds, strict=True):
+        appears_ns, leaves_ns = presence_ns(actor.trajectory)
+        times_ns = _times_of_presence(starts_ns, appears_ns, leaves_ns)
+        positions, rotations = full_poses(actor.trajectory, 0, times_ns)
+        speeds, rates = velocities(actor.trajectory, 0, times_ns)
+        beyond_s = (starts_ns - times_ns)[:, None] / 1e9
+        poses.append(_poses_of(positions + speeds * beyond_s + scene.origin, rotations))
+        lever_arms = applied(rotations, (lower + upper) / 2)
+        linear.append(speeds + cross(rates.T, lever_arms.T).T)
+        present.append((appears_ns <= starts_ns) & (starts_ns <= leaves_ns))
+        comes.append((starts_ns < appears_ns) & (appears_ns <= stops_ns))
+    count = len(starts_ns)
     return _ActorSweeps(
         SweepPoses(
-            np.reshape([pose.positions for pose in poses], (-1, 2 * count, 3)),
-            np.reshape([pose.quaternions for pose in poses], (-1, 2 * count, 4)),
+            np.reshape([pose.positions for pose in poses], (-1, count, 3)),
+            np.reshape([pose.quaternions for pose in poses], (-1, count, 4)),
         ),
-        np.array(bounds) if bounds else np.empty((0, 2, 3)),
+        np.reshape(linear, (-1, count, 3)),
+        np.reshape(bounds, (-1, 2, 3)),
         np.array(present, bool).reshape(-1, count),
+        np.array(comes, bool).reshape(-1, count),
     )
+
+
+def _times_of_presence(times_ns: Floats, appears_ns: float, leaves_ns: float) -> Floats:
+    """Return the nearest times (n,) at which an actor is in the scene, within the rounding."""
+    # A trajectory may be said to end by a clock of seconds since 1970, in steps of 2.4e-7 s.
+    margin_ns = min(1e9 * CLOCK_S, (leaves_ns - appears_ns) / 2)
+    present = (appears_ns <= times_ns) & (times_ns <= leaves_ns)
+    return np.where(present, times_ns, times_ns.clip(appears_ns + margin_ns, leaves_ns - margin_ns))
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:

@@ -90,8 +90,7 @@ def write_mcap(
     of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
     `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
     names of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
-    without one. `/actors` has a MarkerArray of the boxes of actors where their points of the sweep
-    are.
+    without one. `/actors` has a MarkerArray of the boxes of actors at the start of each sweep.
 
     Of a 2D scanner (one beam in the plane of its x and y axes) `/NAME/scan`, or `/scan`, also has a
     LaserScan of each sweep, where the survey keeps every return and has the columns ray and range.

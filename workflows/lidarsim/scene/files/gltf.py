@@ -27,7 +27,7 @@ from ...base.arrays import AnyArray, Bytes, Floats, Ints
 from ...base.elementary_scalars import sin_cos_of
 from ...base.input_files import read_input
 from ...base.vectors import applied, length, matmul
-from ...base.words import plural
+from ...base.words import listed, plural, printable
 from ...sensor.trajectory import matrices
 from ..animation import RATE_HZ
 from ..colours import LINEAR, Colours, as_srgb
@@ -60,12 +60,19 @@ from .scene_graph import (
     placed_nodes,
 )
 
-# Extensions that do not change shapes, or that are supported here.
-_READ = re.compile(
-    r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization"
-)
 _DRACO = "KHR_draco_mesh_compression"
 _INSTANCING = "EXT_mesh_gpu_instancing"
+_VISIBILITY = "KHR_node_visibility"  # of nodes, and of all nodes below
+# Extensions that do not change shapes, or that are supported here.
+_READ = re.compile(
+    r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization|"
+    rf"({_DRACO}|{_INSTANCING}|{_VISIBILITY})$"
+)
+# Extensions that change neither shapes nor colours, and are not worth a note.
+_WITHOUT_SHAPE = re.compile(
+    r"(KHR_xmp(_json_ld)?|KHR_node_(selectability|hoverability)|KHR_audio_emitter|EXT_lights_\w+|"
+    r"EXT_(structural_metadata|mesh_features|instance_features)|CESIUM_primitive_outline)$"
+)
 _TRANSMISSION = "KHR_materials_transmission"
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
@@ -91,7 +98,10 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.unit_m = 1.0
     content.up_axis = "y"
     content.turned = "as glTF asks"
-    content.notes = [*reader.notes.lines(), *reader.motion_notes()]
+    notes = [*reader.visibility_notes(), *_extension_notes(header)]
+    if notes and not content.meshes:
+        raise MeshFileError(f"holds no triangles that can be read: it {'; it '.join(notes)}")
+    content.notes = [*notes, *reader.notes.lines(), *reader.motion_notes()]
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
 
@@ -129,8 +139,15 @@ def _check(header: dict[str, Any]) -> None:
     ):
         raise MeshFileError(_OLD)
     for name in map(str, header.get("extensionsRequired", ())):
-        if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
+        if not _READ.match(name):
             raise MeshFileError(f"needs {name}, which cannot be read: export without it")
+
+
+def _extension_notes(header: dict[str, Any]) -> list[str]:
+    """Return a note on the extensions that a file uses and does not require, if any is unknown."""
+    names = dict.fromkeys(printable(str(name))[:60] for name in header.get("extensionsUsed", ()))
+    unknown = [name for name in names if not (_READ.match(name) or _WITHOUT_SHAPE.match(name))]
+    return [f"uses extensions that are not read: {listed(unknown, 8)}"] if unknown else []
 
 
 def _roots(header: dict[str, Any]) -> list[int]:
@@ -174,6 +191,7 @@ class _Reader:
         self._base = remembered(self._read_base)
         self._tinted = remembered(self._read_tinted)
         self.notes = MaskNotes()
+        self._hidden_nodes: dict[int, str] = {}  # {node: name}
         self._channels: AnimatedNodes = {}
         self._frame = 0
         self._local = cache(self._read_local)
@@ -225,9 +243,14 @@ class _Reader:
         return parts[number]
 
     def node(self, index: int) -> Node:
-        """Return a node; a node without a name gets the name of its mesh."""
+        """Return a node; a node without a name gets the name of its mesh.
+
+        A hidden node has neither meshes nor children.
+        """
         data = self._part("nodes", index)
         name = str(data.get("name") or "")
+        if self._is_hidden(index, data):
+            return Node(name, np.eye(4))
         meshes = list[SceneMesh]()
         copies = None
         if "mesh" in data:
@@ -245,6 +268,23 @@ class _Reader:
         children = data.get("children", ())
         skinned = "skin" in data
         return Node(name, self._local(index), meshes, children, copies, skinned)
+
+    def _is_hidden(self, index: int, data: dict[str, Any]) -> bool:
+        """Return True for a node that is hidden; ValueError if the file does not say it clearly."""
+        visible = _extension(data, _VISIBILITY).get("visible", True)
+        if not isinstance(visible, bool):
+            raise ValueError(f"node {index} has {visible!r} as {_VISIBILITY}.visible")
+        if not visible:
+            self._hidden_nodes[index] = printable(str(data.get("name") or f"node {index}"))
+        return not visible
+
+    def visibility_notes(self) -> list[str]:
+        """Return a note on hidden nodes, if any."""
+        if not self._hidden_nodes:
+            return []
+        names = [*self._hidden_nodes.values()]
+        nodes = plural(len(names), "hidden node")
+        return [f"has {nodes} ({_VISIBILITY}), left out with all below: {listed(names)}"]
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
         """Return matrices (k, 4, 4) of the copies of a node's mesh, or None without copies."""

@@ -1,4 +1,4 @@
-"""LAS and LAZ through laspy: files opened after a check of their headers, and their units."""
+"""LAS and LAZ through laspy: files opened after a check of their headers, and their systems."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from ...base.allowance import Allowance
 from ...base.errors import CutShortError, LidarError
 from ...base.extras import install_command
 from ...base.input_files import open_input
-from .las_units import CoordinateUnits, units_of
+from .noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
+from .stated_system import StatedSystem
 
 # Offsets within the header, by ASPRS LAS 1.4 R15, table 3.
 _HEADER_BYTES = 375  # of LAS 1.4; 1.2 has 227
@@ -68,13 +69,16 @@ def open_las(path: Path) -> Iterator[Any]:
                 raise CutShortError("its packed points end too early") from error
 
 
-def las_units(path: Path) -> CoordinateUnits | None:
-    """Return the units of a file's coordinates, or None if the file states no coordinate system.
+def noise_classes(header: Any) -> tuple[int, ...]:
+    """Return the classes of noise of a file, by the header of laspy."""
+    return NOISE_CLASSES if header.point_format.id >= 6 else LEGACY_NOISE_CLASSES
+
+
+def las_system(path: Path) -> StatedSystem | None:
+    """Return the coordinate system that a file states, or None.
 
     Raises
     ------
-    LidarError
-        If the coordinate system has a unit that cannot be known, or angles.
     ValueError
         If the records of the coordinate system are broken.
     OSError
@@ -83,7 +87,7 @@ def las_units(path: Path) -> CoordinateUnits | None:
     with open_input(path) as file:
         (encoding,) = _unpacked(file, *_ENCODING)
         records = dict(_projection_records(file))
-    return units_of(records, prefer_wkt=bool(encoding & _WKT_BIT))
+    return StatedSystem.of_records(records, prefer_wkt=bool(encoding & _WKT_BIT))
 
 
 def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:

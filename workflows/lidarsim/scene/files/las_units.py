@@ -1,4 +1,4 @@
-"""Units of the coordinates of a LAS file, by its coordinate system: WKT or GeoTIFF keys.
+"""Units of coordinates, by the coordinate system that a file states: WKT or GeoTIFF keys.
 
 OGC WKT 1 and 2 state each unit with its length. GeoTIFF keys name units, or a coordinate system,
 by EPSG codes; the units of a coordinate system are in PROJ's database, which rasterio has.
@@ -10,21 +10,22 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import NamedTuple
 
 from ...base.errors import CutShortError, LidarError
 from ...base.extras import install_command
+from .coordinate_systems import UTM_EPSG, crs_of_code, has_registry
 
-# Records of LASF_Projection, by ASPRS LAS 1.4.
-_WKT = 2112
-_GEO_KEYS = 34735
-_GEO_DOUBLES = 34736
+# Records of LASF_Projection, by ASPRS LAS 1.4, and tags of TIFF.
+GEO_KEYS = 34735
+GEO_DOUBLES = 34736
+GEO_TEXTS = 34737
 
 # GeoTIFF keys, by OGC GeoTIFF 1.1.
 _MODEL_TYPE = 1024
 _GEODETIC_CRS = 2048
-_PROJECTED_CRS = 3072
+PROJECTED_CRS = 3072
+_PROJECTION = 3075  # method of a projection of its own
 _LINEAR_UNIT = 3076
 _LINEAR_UNIT_SIZE = 3077
 _VERTICAL_CRS = 4096
@@ -32,7 +33,7 @@ _VERTICAL_UNIT = 4099
 # models
 _GEOGRAPHIC = 2
 _GEOCENTRIC = 3
-_USER_DEFINED = 32767
+USER_DEFINED = 32767
 
 _EPSG_UNITS = {  # {EPSG code: (name, metres)}
     1025: ("millimetre", 0.001),
@@ -48,15 +49,29 @@ _EPSG_UNITS = {  # {EPSG code: (name, metres)}
     9094: ("Gold Coast foot", 0.3047997101815088),
     9096: ("yard", 0.9144),
 }
-# Projected systems that are in metres by definition: UTM zones of WGS 84, ETRS89 and NAD83.
-_METRIC_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
+# Names of methods by their numbers in GeoTIFF 1.0, of those that the registry of names knows.
+_METHODS = {
+    1: "Transverse Mercator",
+    3: "Oblique Mercator",
+    5: "Swiss Oblique Mercator",
+    7: "Mercator",
+    8: "Lambert Conformal Conic 2SP",
+    9: "Lambert Conformal Conic 1SP",
+    16: "Oblique Stereographic",
+    18: "Cassini",
+}
 _DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
 # Commands and functions that read a cloud have unit; compare has two clouds.
 _OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and unit_a=, or b)"
-_PROJECT = (
-    "project it to metres first (pdal translate IN OUT reprojection "
-    "--filters.reprojection.out_srs=EPSG:CODE)"
-)
+
+
+def advice_to_project(epsg: int | None) -> str:
+    """Return a clause on how to bring a cloud to a system in metres: a code, or any."""
+    code = epsg or "CODE"
+    return (
+        f"give lidarpool scene points --epsg {code} (in Python epsg=), or project it first (pdal "
+        f"translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:{code})"
+    )
 
 
 class CoordinateUnit(NamedTuple):
@@ -104,41 +119,24 @@ class CoordinateUnits:
         )
 
 
-def units_of(records: Mapping[int, bytes], prefer_wkt: bool) -> CoordinateUnits | None:
-    """Return the units that the records of a coordinate system state; None without a system.
-
-    Parameters
-    ----------
-    records
-        {number of a record of LASF_Projection: its content}.
-    prefer_wkt
-        Whether WKT counts where a file also has GeoTIFF keys.
-
-    Raises
-    ------
-    LidarError
-        If coordinates are angles, or have a unit that cannot be known.
-    ValueError
-        If a record is broken.
-    """
-    text = records.get(_WKT, b"").partition(b"\0")[0].decode("utf-8", "replace").strip()
-    keys = _geo_keys(records)
-    if text and (prefer_wkt or not keys):
-        return wkt_units(text)
-    return _units_of_keys(keys) if keys else None
-
-
 # -- WKT -----------------------------------------------------------------------------------------
 
 _TOKENS = re.compile(
     r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)|([-+]?[\d.]+(?:[eE][-+]?\d+)?)|([][(),])'
 )
 _MAX_DEPTH = 50
-_HORIZONTAL = {"PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"}
+_HORIZONTAL = {
+    "PROJCS",
+    "PROJCRS",
+    "PROJECTEDCRS",
+    "LOCAL_CS",
+    "ENGCRS",
+    "ENGINEERINGCRS",
+    "DERIVEDPROJCRS",
+}
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
-_BOUND = {"BOUNDCRS": "SOURCECRS"}
 _LENGTH_UNITS = ("UNIT", "LENGTHUNIT")
 
 
@@ -165,17 +163,16 @@ def wkt_units(text: str) -> CoordinateUnits:
     ValueError
         If the text is no WKT.
     """
-    node = _parsed(text)
-    if node.keyword == "BOUNDCRS":  # a system, and its transformation to another one
-        source = node.child({"SOURCECRS"})
-        node = source.nodes[0] if source and source.nodes else node
-    parts = node.nodes if node.keyword in _COMPOUND else [node]
+    node, parts = _systems(text)
     horizontal = next((part for part in parts if part.keyword in _HORIZONTAL), None)
     vertical = next((part for part in parts if part.keyword in _VERTICAL), None)
     name = node.values[0] if node.values else node.keyword
     if horizontal is None:
-        if any(part.keyword in _ANGULAR for part in parts):
-            raise LidarError(f"its coordinates are angles ({name[:80]}): {_PROJECT}.")
+        if angular := next((part for part in parts if part.keyword in _ANGULAR), None):
+            kind = "geocentric" if _is_geocentric(angular) else "angles"
+            raise LidarError(
+                f"its coordinates are {kind} ({name[:80]}): {advice_to_project(None)}."
+            )
         raise ValueError(
             f"its coordinate system begins with {node.keyword[:20]!r}, and WKT of a projection was "
             "expected"
@@ -187,6 +184,49 @@ def wkt_units(text: str) -> CoordinateUnits:
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
     return CoordinateUnits(unit, heights)
+
+
+def wkt_method(text: str) -> str:
+    """Return the name of the projection's method in WKT; empty without a projection."""
+    _, parts = _systems(text)
+    for part in parts:
+        if part.keyword in _HORIZONTAL:
+            conversion = part.child({"CONVERSION"}) or part
+            method = conversion.child({"METHOD", "PROJECTION"})
+            return method.values[0] if method and method.values else ""
+    return ""
+
+
+def wkt_code(text: str) -> int | None:
+    """Return the EPSG code of the projected system in WKT, or None."""
+    _, parts = _systems(text)
+    for part in parts:
+        code = part.child({"AUTHORITY", "ID"}) if part.keyword in _HORIZONTAL else None
+        if code and len(code.values) > 1 and code.values[0].upper() == "EPSG":
+            return int(code.values[1]) if code.values[1].isdecimal() else None
+    return None
+
+
+def _systems(text: str) -> tuple[_Node, list[_Node]]:
+    """Return the system in WKT, and its parts: horizontal and vertical, or the system alone."""
+    node = _without_transformation(_parsed(text))
+    if node.keyword not in _COMPOUND:
+        return node, [node]
+    return node, [_without_transformation(part) for part in node.nodes]
+
+
+def _without_transformation(node: _Node) -> _Node:
+    """Return the system within a bound one: a system, and its transformation to another one."""
+    source = node.child({"SOURCECRS"}) if node.keyword == "BOUNDCRS" else None
+    return source.nodes[0] if source and source.nodes else node
+
+
+def _is_geocentric(system: _Node) -> bool:
+    """Return True if a geodetic system has its origin in the middle of the Earth."""
+    axes = system.child({"CS"})
+    return system.keyword == "GEOCCS" or (
+        axes is not None and any(node.keyword == "CARTESIAN" for node in axes.nodes)
+    )
 
 
 def _parsed(text: str) -> _Node:
@@ -246,12 +286,12 @@ def _unit_of(node: _Node) -> CoordinateUnit:
 # -- GeoTIFF keys --------------------------------------------------------------------------------
 
 
-def _geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
+def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
     """Return the numbers of the GeoTIFF keys of a file; keys of texts are left out."""
-    data = records.get(_GEO_KEYS, b"")
+    data = records.get(GEO_KEYS, b"")
     if len(data) < 8:
         return {}
-    doubles = records.get(_GEO_DOUBLES, b"")
+    doubles = records.get(GEO_DOUBLES, b"")
     (count,) = struct.unpack_from("<H", data, 6)
     if 8 + 8 * count > len(data):
         raise CutShortError(f"{count} GeoTIFF keys announced, and there are fewer")
@@ -264,53 +304,63 @@ def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, 
         key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
         if location == 0:
             yield key, value
-        elif location == _GEO_DOUBLES:
+        elif location == GEO_DOUBLES:
             yield key, struct.unpack_from("<d", doubles, 8 * value)[0]
 
 
-def _units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
+def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     """Return the units that GeoTIFF keys state, or None without a projection."""
     model = keys.get(_MODEL_TYPE)
-    projected = int(keys.get(_PROJECTED_CRS, 0))
+    projected = int(keys.get(PROJECTED_CRS, 0))
     if model in (_GEOGRAPHIC, _GEOCENTRIC) or (
         _GEODETIC_CRS in keys and not projected and not model
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
-        raise LidarError(f"its coordinates are angles, or geocentric (EPSG:{code}): {_PROJECT}.")
+        kind = "geocentric" if model == _GEOCENTRIC else "angles"
+        raise LidarError(f"its coordinates are {kind} (EPSG:{code}): {advice_to_project(None)}.")
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
-    if keys.get(_LINEAR_UNIT) == _USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
+    if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
         unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
-    if projected not in (0, _USER_DEFINED) and unit is None:
-        system = _units_of_epsg(projected)
+    if projected not in (0, USER_DEFINED) and unit is None:
+        system = units_of_epsg(projected)
         unit = system.horizontal
         heights = system.vertical if system.vertical_stated else None
     if unit is None:
         if not projected:
             return None  # keys that say nothing of a projection
         raise LidarError(f"its coordinate system is of its own and states no unit: {_OVERRIDE}.")
-    vertical = int(keys.get(_VERTICAL_CRS, 0))
-    if _VERTICAL_UNIT in keys:
-        heights = _unit_of_code(keys[_VERTICAL_UNIT])
-    elif vertical not in (0, _USER_DEFINED):
-        heights = _vertical_unit_of_epsg(vertical)
+    heights = height_unit_of_keys(keys) or heights
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
     return CoordinateUnits(unit, heights)
 
 
+def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
+    """Return the unit of heights that GeoTIFF keys state, or None."""
+    vertical = int(keys.get(_VERTICAL_CRS, 0))
+    if _VERTICAL_UNIT in keys:
+        return _unit_of_code(keys[_VERTICAL_UNIT])
+    return None if vertical in (0, USER_DEFINED) else _vertical_unit_of_epsg(vertical)
+
+
+def method_of_keys(keys: Mapping[int, float]) -> str:
+    """Return the name of the projection's method by GeoTIFF keys; empty if it is unknown."""
+    return _METHODS.get(int(keys.get(_PROJECTION, 0)), "")
+
+
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
     """Return the unit of an EPSG code; None without a code, or for a user-defined unit."""
-    if code is None or code in (0, _USER_DEFINED):
+    if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:
         raise LidarError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")
     return CoordinateUnit(*_EPSG_UNITS[int(code)])
 
 
-def _units_of_epsg(code: int) -> CoordinateUnits:
+def units_of_epsg(code: int) -> CoordinateUnits:
     """Return the units of a projected or compound system of the EPSG registry."""
-    if any(code in codes for codes in _METRIC_EPSG):
+    if any(code in codes for codes in UTM_EPSG):
         return CoordinateUnits(METRE, METRE, vertical_stated=False)
     return wkt_units(_wkt_of_epsg(code))
 
@@ -325,15 +375,12 @@ def _vertical_unit_of_epsg(code: int) -> CoordinateUnit | None:
 
 def _wkt_of_epsg(code: int) -> str:
     """Return a system of the EPSG registry as WKT."""
-    if find_spec("rasterio") is None:
+    if not has_registry():
         raise LidarError(
             f"its coordinate system EPSG:{code} may be in any unit: {_OVERRIDE}, or install what "
             f"knows it, {install_command('lidarpool[geo]')}."
         )
-    from rasterio.crs import CRS
-    from rasterio.errors import CRSError
-
-    try:
-        return str(CRS.from_epsg(code).to_wkt(version="WKT2_2019"))
-    except CRSError as error:
-        raise LidarError(f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}.") from error
+    crs = crs_of_code(code)
+    if crs is None:
+        raise LidarError(f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}.")
+    return str(crs.to_wkt(version="WKT2_2019"))

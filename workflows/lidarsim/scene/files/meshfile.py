@@ -23,7 +23,7 @@ from ...base.input_files import open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
-from ...base.words import as_python, did_you_mean, plural, printable
+from ...base.words import as_python, did_you_mean, listed, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
 from ..actors import Actor, join_meshes
@@ -229,15 +229,40 @@ def _in_world(
 ) -> Objects:
     """Place the objects of a file in the world.
 
-    `upright` converts the file's unit and axes to metres and Z-up, before `transform`.
+    `upright` converts the file's unit and axes to metres and Z-up, before `transform`. Objects that
+    are farther away than anything on Earth are left out, which `content.notes` say; LidarError if
+    all are.
     """
     transforms = [upright] if transform is None else [upright, transform]
     placement = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
+    static = []
+    actors = []
+    reaches_m: dict[str, float] = {}  # {name of a remote object: metres from the origin}
     with prefixed(path):
-        return Objects(
-            tuple(_placed_object(mesh, path.stem, transforms) for mesh in content.meshes),
-            tuple(_actor_of_part(part, path.stem, upright, placement) for part in content.moving),
+        for mesh in content.meshes:
+            item, reach_m = _placed_object(mesh, path.stem, transforms)
+            if item is None:
+                reaches_m[printable(mesh.name) or printable(path.stem)] = reach_m
+            else:
+                static.append(item)
+        for part in content.moving:
+            actor, reach_m = _actor_of_part(part, path.stem, upright, placement)
+            if actor is None:
+                reaches_m[printable(part.name) or printable(path.stem)] = reach_m
+            else:
+                actors.append(actor)
+        if not static and not actors:
+            name, reach_m = next(iter(reaches_m.items()))
+            raise LidarError(
+                f"Object {name!r} reaches {reach_m:.3g} m from the origin, farther than anything "
+                "on Earth: check its unit and placement."
+            )
+    if reaches_m:
+        content.notes.append(
+            f"has objects farther than anything on Earth ({max(reaches_m.values()):.3g} m from the "
+            f"origin), which are left out: {listed([*reaches_m])}; check their units and placement"
         )
+    return Objects(tuple(static), tuple(actors))
 
 
 def _tell_notes(
@@ -511,19 +536,23 @@ def _other_format(path: Path, data: bytes) -> str:
 
 def _placed_object(
     item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
-) -> SceneMesh | SceneInstance:
-    """Return an object in the world, with a name that is safe for terminals and files."""
+) -> tuple[SceneMesh | SceneInstance | None, float]:
+    """Return an object in the world, and how far it reaches from the origin, metres.
+
+    The name of the object is safe for terminals and files. None if the object is too far away.
+    """
     name = printable(item.name) or printable(stem)
+    if isinstance(item, SceneInstance):  # an instance cannot be moved too far
+        position = item.matrix[:3, 3]
+        for transform in transforms:
+            position = turned(position[None], transform.linear)[0] + transform.offset
+        if not (reach_m := float(np.abs(position).max())) <= MAX_COORDINATE_M:
+            return None, reach_m
     for transform in transforms:
         if name != item.name or not _keeps_places(transform):
             item = item.moved(name, transform.linear, transform.offset)
-    reach = np.abs(_corners(item)).max()
-    if reach > MAX_COORDINATE_M:
-        raise LidarError(
-            f"Object {item.name!r} reaches {reach:.3g} m from the origin, farther than anything "
-            "on Earth: check its unit and placement."
-        )
-    return item
+    reach_m = float(np.abs(_corners(item)).max())
+    return (item if reach_m <= MAX_COORDINATE_M else None), reach_m
 
 
 def _keeps_places(transform: Transform) -> bool:
@@ -531,10 +560,13 @@ def _keeps_places(transform: Transform) -> bool:
     return np.array_equal(transform.linear, np.eye(3)) and not transform.offset.any()
 
 
-def _actor_of_part(part: RigidPart, stem: str, upright: Transform, placement: Transform) -> Actor:
+def _actor_of_part(
+    part: RigidPart, stem: str, upright: Transform, placement: Transform
+) -> tuple[Actor | None, float]:
     """Return a moving part as an actor, with its frame rotated as the axes of the file are.
 
-    The mesh of the actor has all scales, since a trajectory only rotates and moves.
+    The mesh of the actor has all scales, since a trajectory only rotates and moves. None if the
+    actor moves too far away. The number is how far, metres from the origin.
     """
     name = printable(part.name) or printable(stem)
     unit_m, scale = (cbrt(determinant(transform.linear)) for transform in (upright, placement))
@@ -547,13 +579,12 @@ def _actor_of_part(part: RigidPart, stem: str, upright: Transform, placement: Tr
     objects = [item.moved(name, scale * upright.linear, np.zeros(3)) for item in part.objects]
     linear = matmul(placement.linear, upright.linear)
     positions = turned(part.positions, linear) + placement.offset
-    if not np.abs(positions).max() <= MAX_COORDINATE_M:
-        raise LidarError(
-            f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
-        )
+    reach_m = float(np.abs(positions).max())
+    if not reach_m <= MAX_COORDINATE_M:
+        return None, reach_m
     rotations = matmul(matmul(matmul(rotation, axes), part.rotations), axes.T)
     track = Track(part.times_s, positions, quaternions_of(rotations), start_s=0.0, beyond="hold")
-    return Actor(join_meshes(name, objects), track)
+    return Actor(join_meshes(name, objects), track), reach_m
 
 
 def _mesh_at_start(actor: Actor) -> SceneMesh:

@@ -502,6 +502,7 @@ class _PlyHeader(NamedTuple):
     order: str  # byte order, '' of text
     body: bytes
     lines: int  # of the header
+    comments: list[str]  # texts of comment and obj_info
 
 
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -562,6 +563,11 @@ def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
 
 
+def ply_comments(data: bytes) -> list[str]:
+    """Return the comments of a Stanford polygon file, also of its lines obj_info."""
+    return _ply_header(data).comments
+
+
 def _ply_vertices(rows: _PlyRows) -> Floats:
     """Return the positions of vertices, (v, 3); ValueError if an axis is missing."""
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
@@ -578,6 +584,7 @@ def _ply_header(data: bytes) -> _PlyHeader:
             raise CutShortError("its header has no line end_header")
         raise ValueError("its first line is not 'ply', with which the header of a .ply begins")
     elements: list[_Element] = []
+    comments: list[str] = []
     order = ""
     for number, line in enumerate((header_match[1] or b"").decode("latin-1").splitlines(), 2):
         match line.split():
@@ -591,12 +598,14 @@ def _ply_header(data: bytes) -> _PlyHeader:
                 elements[-1].properties[name] = _PLY_TYPES[kind], _PLY_TYPES[length]
             case ["property", kind, name] if elements and kind in _PLY_TYPES:
                 elements[-1].properties[name] = _PLY_TYPES[kind], ""
-            case [] | ["comment" | "obj_info", *_]:
+            case [] | ["comment" | "obj_info"]:
                 pass
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
             case _:
                 raise ValueError(f"line {number} is '{line[:60]}', {_PLY_LINE}")
     lines = len(header_match[0].splitlines())
-    return _PlyHeader(elements, order, data[header_match.end() :], lines)
+    return _PlyHeader(elements, order, data[header_match.end() :], lines, comments)
 
 
 def _ply_rows(header: _PlyHeader) -> _PlyRows:
@@ -605,7 +614,7 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
     Text is read in double precision, whatever type its header states: georeferenced vertices are
     often declared `float` and have more digits.
     """
-    elements, order, body, _ = header
+    elements, order, body, *_ = header
     if not order:
         try:
             words = np.array(list(map(float, body.split())))

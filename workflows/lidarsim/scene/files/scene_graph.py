@@ -19,7 +19,7 @@ from .. import colours, face_materials
 from ..animation import Animation
 from ..colours import Colours
 from ..face_materials import FaceMaterials
-from ..scene_instances import SceneInstance
+from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
@@ -235,7 +235,11 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
         if (dimensions < 2 or (mesh in shared_meshes and not mesh.has_area)) and not copy_all:
             content.skipped.append(name)
-        elif mesh in shared_meshes and dimensions == 3:
+        elif (
+            mesh in shared_meshes
+            and dimensions == 3
+            and (np.abs(matrix[:3, 3]) <= MAX_COORDINATE_M).all()
+        ):
             objects.append(SceneInstance(mesh, matrix, name))
         else:
             objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))

@@ -1,0 +1,29 @@
+"""Fail if `make test` takes much more processor time than it should.
+
+Machines differ, so its time is compared with that of `make demo` in the same run. A busy machine
+takes longer for a run, but little more processor time.
+
+Usage: python .ci/suite_time.py TEST_SECONDS DEMO_SECONDS    (files that .ci/timed has written)
+"""
+
+import sys
+from pathlib import Path
+
+QUIET_RATIO = 6.0
+ALLOWED = 1.4 * QUIET_RATIO
+
+
+def main() -> None:
+    """Print both times and their ratio; exit with 1 if the ratio is above the limit."""
+    test_s, demo_s = (float(Path(name).read_text()) for name in sys.argv[1:])
+    ratio = test_s / demo_s
+    print(
+        f"processor time: make test {test_s:.0f} s, make demo {demo_s:.0f} s, ratio {ratio:.2f} "
+        f"({QUIET_RATIO:.2f} on a quiet machine, at most {ALLOWED:.2f})"
+    )
+    if ratio > ALLOWED:
+        sys.exit("make test takes too long: see the slowest tests above; leave some to test-all")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Exports as decoders and devkits of others read them.
+
+    python -m benchmarks.decoders [--python PYTHON …] [--only PROGRAM …] [--quick]
+
+Sensors of Velodyne and Ouster stand in a city, and their packets are written; a car with two lidars
+drives past actors, and the drive is written in six formats. Each program reads its files in a
+process of its own. What it has read is compared with the cloud of the survey, and with the closed
+form of the actors' trajectories. A program is taken from the first Python that has it: the one that
+runs this, then those of `--python`, since some programs demand packages that lidarpool does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarpool import Scene, save_cloud
+from lidarscenes.procedural.city import city
+
+from .decoders_compare import (
+    Arrays,
+    Row,
+    compare_bag,
+    compare_e57,
+    compare_kitti,
+    compare_las,
+    compare_nuscenes,
+    compare_ouster,
+    compare_velodyne,
+)
+from .decoders_surveys import Drive, drive_of, packets_of
+
+TRIANGLES = 100_000  # of the city
+SWEEPS = 20  # of the drive
+REVOLUTIONS = 5  # of packets
+TOY_TRIANGLES = 5_000
+TOY_SWEEPS = 9
+TOY_REVOLUTIONS = 1
+
+
+class PacketProgram(NamedTuple):
+    """A decoder of packets."""
+
+    maker: str
+    models: tuple[str, ...]
+    compare: Callable[[Drive, str, Arrays], Iterator[Row]]
+
+
+class FileProgram(NamedTuple):
+    """A reader of files of the drive."""
+
+    files: dict[str, str]  # {name: format}
+    compare: Callable[[Drive, Arrays], Iterator[Row]]
+    inputs: tuple[str, ...] = ()  # what it opens, unless the files
+    companion: str = ""  # package that it needs as well
+
+
+PROGRAMS: dict[str, PacketProgram | FileProgram] = {
+    "velodyne-decoder": PacketProgram(
+        "velodyne", ("vlp16", "vlp16-hires", "vlp32c", "hdl32e", "vls128"), compare_velodyne
+    ),
+    "ouster-sdk": PacketProgram("ouster", ("os0-32", "os1-64", "os2-128"), compare_ouster),
+    "nuscenes-devkit": FileProgram({"nuscenes": "nuscenes"}, compare_nuscenes),
+    "pykitti": FileProgram(
+        {"kitti": "kitti"},
+        compare_kitti,
+        ("kitti/sequences/00", "kitti/sequences/01"),
+        "opencv-python-headless",
+    ),
+    "pye57": FileProgram({"e57.e57": "e57"}, compare_e57),
+    "laspy": FileProgram({"las.las": "las", "laz.laz": "laz"}, compare_las, companion="lazrs"),
+    "mcap": FileProgram({"bag.mcap": "mcap"}, compare_bag, companion="mcap-ros2-support"),
+}
+
+
+def packages_of(program: str) -> list[str]:
+    """Return the names of the packages that a program needs, on the package index."""
+    description = PROGRAMS[program]
+    companion = description.companion if isinstance(description, FileProgram) else ""
+    return [program, *filter(None, [companion])]
+
+
+def python_of(program: str, pythons: list[str]) -> str | None:
+    """Return the first Python that has the packages of a program, or None."""
+    look = f"from importlib.metadata import version; [*map(version, {packages_of(program)!r})]"
+    for python in pythons:
+        ended = subprocess.run([python, "-c", look], capture_output=True, check=False)
+        if ended.returncode == 0:
+            return python
+    return None
+
+
+def read_files(program: str, python: str, files: list[Path], folder: Path) -> Arrays:
+    """Have a program read files; return the arrays that it has read, and its `version`.
+
+    RuntimeError if the program fails.
+    """
+    script = Path(__file__).with_name("decoders_peers.py")
+    out = folder / f"{program}.npz"
+    # -P: the folder of the script, whose modules are called as packages, is not searched.
+    command = [python, "-P", str(script), program, str(out), *map(str, files)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    if ended.returncode:
+        raise RuntimeError(f"{program} failed:\n{ended.stderr}")
+    with np.load(out) as arrays:
+        return dict(arrays)
+
+
+def packet_rows(
+    program: str, python: str, folder: Path, scene: Scene, revolutions: int
+) -> tuple[str, list[Row]]:
+    """Compare packets of a maker's models with what a program reads: its version, and rows."""
+    description = PROGRAMS[program]
+    assert isinstance(description, PacketProgram)
+    drives = {}
+    files = []
+    for model in description.models:
+        drive = packets_of(f"{description.maker}/{model}", scene, revolutions)
+        save_cloud(drive.cloud, folder / model, format="pcap")
+        for file in (folder / model).glob("lidar.*"):
+            file.rename(file.with_stem(model))  # arrays have the names of the files
+        files.append(folder / model / f"{model}.pcap")
+        drives[model] = drive
+    arrays = read_files(program, python, files, folder)
+    rows: list[Row] = []
+    for model, drive in drives.items():
+        prefix = f"{model}/"
+        of_model = {
+            name.removeprefix(prefix): array
+            for name, array in arrays.items()
+            if name.startswith(prefix)
+        }
+        rows += description.compare(drive, model, of_model)
+    return str(arrays["version"]), rows
+
+
+def drive_rows(program: str, python: str, folder: Path, drive: Drive) -> tuple[str, list[Row]]:
+    """Compare files of the drive with what a program reads: its version, and rows."""
+    description = PROGRAMS[program]
+    assert isinstance(description, FileProgram)
+    for name, file_format in description.files.items():
+        save_cloud(drive.cloud, folder / name, format=file_format)
+    files = [folder / name for name in description.inputs or description.files]
+    arrays = read_files(program, python, files, folder)
+    return str(arrays["version"]), list(description.compare(drive, arrays))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; return 1 if a program is missing."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--python", action="append", default=[], help="a Python with programs")
+    parser.add_argument("--only", nargs="+", choices=PROGRAMS, default=[*PROGRAMS])
+    parser.add_argument("--quick", action="store_true", help="toy sizes")
+    chosen = parser.parse_args(arguments)
+    scene = city(TOY_TRIANGLES if chosen.quick else TRIANGLES)
+    drive = drive_of(scene, TOY_SWEEPS if chosen.quick else SWEEPS)
+    revolutions = TOY_REVOLUTIONS if chosen.quick else REVOLUTIONS
+    missing = []
+    print("| program | file | compared | number | greatest difference |")
+    print("|---|---|---|--:|---|")
+    for program in chosen.only:
+        python = python_of(program, [sys.executable, *chosen.python])
+        if python is None:
+            missing.append(program)
+            continue
+        with tempfile.TemporaryDirectory() as name:
+            if isinstance(PROGRAMS[program], PacketProgram):
+                version, rows = packet_rows(program, python, Path(name), scene, revolutions)
+            else:
+                version, rows = drive_rows(program, python, Path(name), drive)
+        for row in rows:
+            words = "; ".join(f"{name} {value}" for name, value in row.differences.items())
+            cells = (f"{program} {version}", row.file, row.things, f"{row.count:,}", words)
+            print("|", " | ".join(cells), "|", flush=True)
+    for program in missing:
+        print(
+            f"{program} was left out: pip install {' '.join(packages_of(program))}, or give "
+            "--python with the Python of an environment that has it",
+            file=sys.stderr,
+        )
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""Boxes of actors in exports: poses at their stamps, of one size, with the velocities of actors."""
+
+import io
+import json
+import tarfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_cloud
+from lidarpool.export.boxes import Boxes
+from lidarpool.export.formats import Format
+from lidarsim.columns.cloud import Cloud
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.animation import Animation
+from lidarsim.sensor.trajectory import matrices
+from lidarsim.sweeps.sweeps import Sweeps
+
+PERIOD_NS = 100_000_000  # of a sweep
+SCANS = 36  # of a sweep
+LABELS = ("Bus", "Walker", "Tram", "Guest")
+# Where the actors would be at time 0, m, and their velocities, m/s.
+STARTS = np.array([[-8, 6, 0], [5, -4, 0.1], [3, -9, 0], [20, 8, 0]], float)
+VELOCITIES = np.array([[3, 0, 0], [0.84, 1.12, 0], [-12, 5, 0.25], [-15, 0, 0]], float)
+# Sizes of the boxes, m: the walker's arms and legs reach 0.6 m ahead, 0.4 m back and 0.3 m aside.
+SIZES = np.array([[11, 2.5, 3], [1.0, 0.6, 1.75], [20, 2.3, 3.4], [4, 2, 1.5]])
+GUEST_S = (0.25, 0.83)  # Guest 1 appears during its third sweep, and leaves during its ninth
+
+
+def walker():
+    """A mesh that is 0.2 m long while it stands, and swings 0.6 m ahead and 0.4 m back."""
+    mesh = box("Walker 1", (0.2, 0.6, 1.75))
+    swing = np.where(mesh.vertices[:, 2:] < 1, [[1.0, 0, 0]], 0)
+    poses = mesh.vertices + np.array([0, 0.5, 0, -0.3])[:, None, None] * swing
+    return replace(mesh, animation=Animation(poses, 0.25))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Points of a sensor of ten and one of five sweeps a second, on a carrier that turns."""
+    meshes = [box("Bus 1", SIZES[0]), walker(), box("Tram 1", SIZES[2]), box("Guest 1", SIZES[3])]
+    spans_s = [(-1, 2), (-1, 2), (-1, 2), GUEST_S]
+    actors = [
+        Actor(mesh, Track(span, start + np.outer(span, velocity), start_s=0, beyond="absent"))
+        for mesh, span, start, velocity in zip(meshes, spans_s, STARTS, VELOCITIES, strict=True)
+    ]
+    scene = Scene.from_meshes([box("Floor", (60, 60, 0.01))]).with_actors(actors)
+    half = np.sqrt(0.5)
+    carrier = Track([0, 1], [[0, 0, 1], [4, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
+    sensors = [
+        Mounted(Sensor.grid(SCANS * 10, 4), Pose((1, 0, 0.5), 30.0), "roof"),
+        Mounted(Sensor.grid(SCANS * 10, 4, rate_hz=5.0), Pose((-1, 0, 0.5), 200.0), "rear"),
+    ]
+    columns = ["time", "intensity", "reflectivity", "class"]
+    return Survey(sensors=sensors, trajectory=carrier, columns=columns), scene
+
+
+def cloud_of(survey, scene):
+    """Return a cloud with a point of each actor in each scan in which the actor is there."""
+    begins_ns = np.array([survey.begins_ns(scan) for scan in range(survey.scan_count)])
+    scan = np.repeat(np.arange(survey.scan_count), len(LABELS))
+    actor = np.tile(np.arange(len(LABELS)), survey.scan_count)
+    time_s = begins_ns[scan] / 1e9
+    kept = (actor < 3) | ((GUEST_S[0] <= time_s) & (time_s <= GUEST_S[1]))
+    scan, actor, time_s = scan[kept], actor[kept], time_s[kept]
+    positions = STARTS[actor] + VELOCITIES[actor] * time_s[:, None] + [0, 0, 0.5]
+    columns = {
+        "scan": scan, "channel": 0 * scan, "object": len(scene.names) + actor,
+        "time": np.rint(1e9 * time_s), "class": 0 * scan, "intensity": np.ones(len(scan), "f4"),
+        "reflectivity": np.full(len(scan), 9, np.uint8),
+    }  # fmt: skip
+    sweeps = Sweeps.from_survey(survey, scene)
+    return Cloud(positions, columns, sweeps=lambda: sweeps)
+
+
+@pytest.fixture(scope="module")
+def cloud(drive):
+    return cloud_of(*drive)
+
+
+def poses_of(sweeps, sensor):
+    """Return the matrices (n, 4, 4) of the poses of a sensor, and the times of its sweeps, s."""
+    numbers = np.flatnonzero(sweeps.sensor == sensor)
+    return [sweeps.pose.matrix(number) for number in numbers], sweeps.begins_ns[numbers] / 1e9
+
+
+class Labels:
+    """Boxes of each actor in a file: times, s, centres in the world, m, sizes, m."""
+
+    def __init__(self):
+        self.rows = {name: [] for name in LABELS}
+
+    def add(self, name, time_s, centre, size):
+        self.rows[name.split()[0]].append((time_s, centre, size))
+
+    def check(self, place_m, size_m=1e-6, counts=(10, 7)):
+        """Check all boxes by closed form, to an accuracy of the file."""
+        for actor, name in enumerate(LABELS):
+            times_s, centres, sizes = map(np.array, zip(*self.rows[name], strict=True))
+            order = np.argsort(times_s, kind="stable")
+            times_s, centres, sizes = times_s[order], centres[order], sizes[order]
+            ahead = 0.1 if name == "Walker" else 0.0  # of the middle of the box, horizontally
+            heading = np.arctan2(*VELOCITIES[actor, 1::-1])
+            middle = [ahead * np.cos(heading), ahead * np.sin(heading), SIZES[actor, 2] / 2]
+            expected = STARTS[actor] + middle + np.outer(times_s, VELOCITIES[actor])
+            np.testing.assert_allclose(centres, expected, atol=place_m)
+            np.testing.assert_allclose(sizes, np.tile(SIZES[actor], (len(sizes), 1)), atol=size_m)
+            assert len(times_s) == counts[name == "Guest"]
+            speeds = devkit_velocities(times_s, centres)
+            assert (np.linalg.norm(speeds - VELOCITIES[actor], axis=1)
+                    < 0.02 * np.linalg.norm(VELOCITIES[actor])).all()  # fmt: skip
+
+
+def devkit_velocities(times_s, centres):
+    """Return velocities by the rule of nuscenes-devkit: from the box before to the next."""
+    last = np.minimum(np.arange(len(times_s)) + 1, len(times_s) - 1)
+    first = np.maximum(np.arange(len(times_s)) - 1, 0)
+    return (centres[last] - centres[first]) / (times_s[last] - times_s[first])[:, None]
+
+
+def nuscenes_tables(folder):
+    """Return the tables of a data set, {table: {token: row}}."""
+    return {
+        path.stem: {row["token"]: row for row in json.loads(path.read_text())}
+        for path in folder.glob("v1.0-lidarpool/*.json")
+    }
+
+
+def test_nuscenes_has_boxes_at_the_times_of_samples(cloud, tmp_path):
+    save_cloud(cloud, tmp_path / "nu", format="nuscenes")
+    tables = nuscenes_tables(tmp_path / "nu")
+    labels = Labels()
+    for row in tables["sample_annotation"].values():
+        instance = tables["instance"][row["instance_token"]]
+        name = tables["category"][instance["category_token"]]["name"]
+        time_s = tables["sample"][row["sample_token"]]["timestamp"] / 1e6
+        width, length, height = row["size"]
+        labels.add(name, time_s, row["translation"], (length, width, height))
+        w, *vector = row["rotation"]
+        forward = matrices(np.array([[*vector, w]]))[0][:, 0]
+        speed = VELOCITIES[LABELS.index(name)] * [1, 1, 0]  # actors are level
+        np.testing.assert_allclose(forward, speed / np.linalg.norm(speed), atol=1e-9)
+    labels.check(1e-9)
+    assert len(tables["sample"]) == 10
+    counts = [row["num_lidar_pts"] for row in tables["sample_annotation"].values()]
+    # The rear sensor's sweep that begins with a sample is its key frame.
+    assert sum(counts) == len(cloud)
+
+
+def test_nuscenes_interpolates_boxes_between_samples(drive, tmp_path):
+    """By the rule of the devkit: sweeps between samples point to the sample that follows."""
+    survey, scene = drive
+    rear = Mounted(Sensor.grid(SCANS * 10, 4, rate_hz=30.0), Pose((-1, 0, 0.5), 200.0), "rear")
+    cloud = cloud_of(replace(survey, sensors=[survey.carried[0], rear]), scene)
+    save_cloud(cloud, tmp_path / "nu", format="nuscenes")
+    tables = nuscenes_tables(tmp_path / "nu")
+    samples = tables["sample"]
+    x_of_bus = {
+        row["sample_token"]: row["translation"][0]
+        for row in tables["sample_annotation"].values()
+        if row["size"][2] == SIZES[0, 2]
+    }
+    interpolated = []
+    last_us = max(row["timestamp"] for row in samples.values())
+    for row in tables["sample_data"].values():
+        sample = samples[row["sample_token"]]
+        if row["is_key_frame"]:
+            assert 0 <= row["timestamp"] - sample["timestamp"] < 34_000
+        elif row["timestamp"] < last_us:
+            before = samples[sample["prev"]]
+            times_us = [before["timestamp"], sample["timestamp"]]
+            assert times_us[0] < row["timestamp"] < times_us[1]
+            x = np.interp(
+                row["timestamp"], times_us, [x_of_bus[sample["prev"]], x_of_bus[sample["token"]]]
+            )
+            assert x == pytest.approx(STARTS[0, 0] + VELOCITIES[0, 0] * row["timestamp"] / 1e6)
+            interpolated.append(row)
+    assert len(interpolated) == 18
+
+
+@pytest.mark.parametrize(("sequence", "counts"), [("00", (10, 7)), ("01", (5, 4))])
+def test_kitti_has_boxes_at_the_times_of_sweeps(cloud, tmp_path, sequence, counts):
+    save_cloud(cloud, tmp_path / "kitti", format="kitti")
+    poses, starts_s = poses_of(cloud.sweeps(), int(sequence))
+    folder = tmp_path / "kitti/sequences" / sequence
+    times_s = np.loadtxt(folder / "times.txt")
+    np.testing.assert_allclose(times_s, starts_s, atol=1e-9)
+    camera = np.loadtxt(folder / "calib.txt", usecols=range(1, 13))[4].reshape(3, 4)[:, :3]
+    labels = Labels()
+    for number, (pose, time_s) in enumerate(zip(poses, times_s, strict=True)):
+        for line in (folder / f"label_2/{number:06}.txt").read_text().splitlines():
+            name, *words = line.split()
+            height, width, length, *bottom, _ = map(float, words[7:])
+            inside = camera.T @ (bottom - np.array([0, height / 2, 0]))
+            labels.add(name, time_s, pose[:3, :3] @ inside + pose[:3, 3], (length, width, height))
+    labels.check(2e-4, 1e-4, counts)
+
+
+def test_webdataset_has_boxes_at_the_times_of_sweeps(cloud, tmp_path):
+    save_cloud(cloud, tmp_path / "web", format="webdataset")
+    files = {}
+    for path in (tmp_path / "web").rglob("*.tar"):
+        with tarfile.open(path) as tar:
+            files |= {m.name: tar.extractfile(m).read() for m in tar.getmembers()}
+    labels = Labels()
+    for key in [name.removesuffix(".json") for name in files if name.endswith(".json")]:
+        about = json.loads(files[f"{key}.json"])
+        if about["sensor"] != "roof":
+            continue
+        boxes = np.load(io.BytesIO(files[f"{key}.boxes.npy"]))
+        pose = np.load(io.BytesIO(files[f"{key}.pose.npy"]))
+        centres = boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        for name, centre, row in zip(about["box_types"], centres, boxes, strict=True):
+            labels.add(name, about["time_ns"] / 1e9, centre, row[3:6])
+    labels.check(5e-6, 1e-6)
+
+
+def test_osi_has_boxes_and_velocities_at_the_stamps_of_messages(cloud, tmp_path):
+    osi = pytest.importorskip("betterosi", reason="betterosi is an extra")
+    save_cloud(cloud, tmp_path / "a.osi", format="osi")
+    labels = Labels()
+    for message in osi.read(tmp_path / "a.osi", osi_message_type="SensorData"):
+        if message.sensor_id.value:
+            continue
+        truth = message.sensor_view[0].global_ground_truth
+        time_s = truth.timestamp.seconds + truth.timestamp.nanos / 1e9
+        for thing in truth.moving_object[1:]:
+            base = thing.base
+            size = (base.dimension.length, base.dimension.width, base.dimension.height)
+            labels.add(thing.model_reference, time_s, vector_of(base.position), size)
+            speed = VELOCITIES[LABELS.index(thing.model_reference.split()[0])]
+            np.testing.assert_allclose(vector_of(base.velocity), speed, atol=1e-9)
+    labels.check(1e-9)
+
+
+def vector_of(message):
+    return np.array([message.x, message.y, message.z])
+
+
+def test_bags_have_boxes_at_their_stamps(cloud, tmp_path):
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is an extra")
+    from rosbags.typesys import Stores, get_typestore
+
+    save_cloud(cloud, tmp_path / "a.mcap")
+    labels = Labels()
+    seen_ns = set()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
+        connections = [one for one in bag.connections if one.topic == "/actors"]
+        for connection, when_ns, data in bag.messages(connections):
+            for marker in bag.deserialize(data, connection.msgtype).markers:
+                stamp_ns = marker.header.stamp.sec * 10**9 + marker.header.stamp.nanosec
+                assert stamp_ns == when_ns
+                since_ns = stamp_ns - bag.start_time
+                if marker.action or (since_ns, marker.text) in seen_ns:
+                    continue  # of the other sensor
+                seen_ns.add((since_ns, marker.text))
+                size = (marker.scale.x, marker.scale.y, marker.scale.z)
+                labels.add(
+                    marker.text.split("_")[0], since_ns / 1e9, vector_of(marker.pose.position), size
+                )
+    labels.check(1e-9)
+
+
+def test_an_actor_whose_box_is_beside_its_origin_has_the_velocity_of_the_box(tmp_path):
+    """A trailer that turns about its hitch, 4 m from the middle of its box, at 0.5 rad/s."""
+    mesh = box("Trailer 1", (8, 2, 3))
+    mesh = replace(mesh, vertices=mesh.vertices - [4, 0, 0])
+    angles = np.linspace(0, 1, 401)
+    quaternions = np.stack([0 * angles, 0 * angles, np.sin(angles / 2), np.cos(angles / 2)], axis=1)
+    track = Track(2 * angles, np.tile([9.0, 0, 0], (401, 1)), quaternions)
+    scene = Scene.from_meshes([box("Floor", (60, 60, 0.01))]).with_actors([Actor(mesh, track)])
+    sweeps = Sweeps.from_survey(Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=180), scene)
+    turned = 0.5 * sweeps.begins_ns / 1e9
+    expected = 2 * np.stack([np.sin(turned), -np.cos(turned), 0 * turned], axis=1)
+    np.testing.assert_allclose(sweeps.actor_velocities[0], expected, atol=1e-9)
+
+
+def test_sweeps_of_one_firing_have_velocities(drive):
+    """Beginning and end of such a sweep are the same time."""
+    _, scene = drive
+    flash = Survey(Sensor.grid(1, 4, step_deg=360), [(0, 0, 1)], steps=5)
+    sweeps = Sweeps.from_survey(flash, scene)
+    assert (sweeps.ends_ns == sweeps.begins_ns).all()
+    np.testing.assert_allclose(sweeps.actor_velocities[:3, 2], VELOCITIES[:3], atol=1e-9)
+
+
+def test_repeated_points_of_an_actor_that_has_left_have_no_box(drive):
+    survey, scene = drive
+    survey = replace(survey, sensors=survey.carried[:1], faults=[Fault("frozen", 0.75)])
+    sweeps = Sweeps.from_survey(survey, scene)
+    guest = len(scene.names) + 3
+    points = Cloud(np.zeros((1, 3)), {"scan": [SCANS * 9], "object": [guest]})
+    boxes = Boxes.from_points(sweeps, 9, points)
+    assert boxes.points.tolist() == [0, 0, 0, 1]
+    assert boxes.present.tolist() == [True, True, True, False]
+
+
+def test_the_first_sensor_of_nuscenes_is_lidar_top_and_a_note_says_so(drive, tmp_path):
+    survey, scene = drive
+    for names, channels, words in (
+        (("roof", "rear"), {"LIDAR_TOP", "rear"}, "'roof', is LIDAR_TOP in nuscenes: "),
+        (("LIDAR_TOP", "rear"), {"LIDAR_TOP", "rear"}, ""),
+        (("rear", "LIDAR_TOP"), {"LIDAR_TOP", "LIDAR_TOP_2"}, "and 'LIDAR_TOP' is LIDAR_TOP_2"),
+    ):
+        sensors = [
+            replace(carried, name=name) for carried, name in zip(survey.carried, names, strict=True)
+        ]
+        cloud = cloud_of(replace(survey, sensors=sensors), scene)
+        folder = tmp_path / "-".join(names)
+        save_cloud(cloud, folder, format="nuscenes")
+        tables = nuscenes_tables(folder)
+        assert {row["channel"] for row in tables["sensor"].values()} == channels
+        assert {path.name for path in (folder / "samples").iterdir()} == channels
+        # As the devkit looks for it: the key frame of each sample with the time of the sample.
+        of_channel = {row["token"]: row["channel"] for row in tables["sensor"].values()}
+        top = [
+            row for row in tables["sample_data"].values()
+            if row["is_key_frame"] and of_channel[
+                tables["calibrated_sensor"][row["calibrated_sensor_token"]]["sensor_token"]
+            ] == "LIDAR_TOP"
+        ]  # fmt: skip
+        times = {row["token"]: row["timestamp"] for row in tables["sample"].values()}
+        assert {row["sample_token"]: row["timestamp"] for row in top} == times
+        notes = Format("nuscenes").notes(cloud, cloud.sweeps())
+        assert [words in note for note in notes if "LIDAR_TOP" in note] == [True] * bool(words)
+        assert not any("LIDAR_TOP" in note for note in Format("kitti").notes(cloud, cloud.sweeps()))

@@ -1,0 +1,64 @@
+"""Which visuals the lidars of a world see: <visibility_flags> and <visibility_mask>.
+
+A lidar sees a visual if its mask and the flags of the visual have a bit in common (SDFormat 1.12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from xml.etree.ElementTree import Element
+
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.validation import shown
+from lidarsim.base.words import printable
+
+LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # types of sensors
+ALL_BITS = 0xFFFF_FFFF  # default of flags and masks
+
+
+def lidar_elements(link: Element) -> Iterator[Element]:
+    """Yield the <sensor>s of a link that are lidars."""
+    return (sensor for sensor in link.findall("sensor") if sensor.get("type") in LIDARS)
+
+
+def figures_of(sensor: Element) -> Element | None:
+    """Return the <lidar> or <ray> of a <sensor>; None without any."""
+    figures = sensor.find("lidar")
+    return sensor.find("ray") if figures is None else figures
+
+
+def flags_of(visual: Element) -> int:
+    """Return the <visibility_flags> of a visual; LidarError if they are no number of 32 bits."""
+    return _bits(visual, "visibility_flags")
+
+
+def mask_of(sensor: Element) -> int:
+    """Return the <visibility_mask> of a lidar; LidarError if it is no number of 32 bits."""
+    figures = figures_of(sensor)
+    return ALL_BITS if figures is None else _bits(figures, "visibility_mask")
+
+
+def masks_of(links: Iterable[Element]) -> tuple[int, ...]:
+    """Return the distinct masks of the lidars of links, ascending."""
+    masks = set()
+    for link in links:
+        for sensor in lidar_elements(link):
+            with prefixed(f"sensor {printable(sensor.get('name', ''))!r}"):
+                masks.add(mask_of(sensor))
+    return tuple(sorted(masks))
+
+
+def _bits(element: Element, name: str) -> int:
+    """Return a child element's number of 32 bits, by default with all bits."""
+    text = (element.findtext(name) or "").strip()
+    if not text:
+        return ALL_BITS
+    try:
+        bits = int(text, 16 if text.lower().startswith("0x") else 10)
+    except ValueError:
+        bits = -1
+    if not 0 <= bits <= ALL_BITS:
+        raise LidarError(
+            f"<{name}> is {shown(text)}; it must be a whole number from 0 to {ALL_BITS}."
+        )
+    return bits

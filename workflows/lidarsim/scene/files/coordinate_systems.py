@@ -1,0 +1,375 @@
+"""Coordinate systems on Earth: where their metres are metres on the ground, by rasterio's PROJ.
+
+A map projection stretches lengths. National grids and UTM zones do so by less than 1 % where they
+are meant to be used; Web Mercator (EPSG:3857) by 47 % in Zurich, with heights as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.elementary import sin_cos
+from ...base.errors import LidarError
+from ...base.extras import install_command
+from ...base.vectors import turned
+from ...base.vocabulary import OF_THE_WORLD, WORLD_EPSG
+from ..scene_instances import SceneInstance
+from ..scene_mesh import SceneMesh
+
+MAX_SCALE_ERROR = 0.01  # of lengths that count as true
+UTM_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
+_UTM_MIDDLE_M = 500_000.0  # easting of the meridian in the middle of a zone
+_UTM_HALF_WIDTH_M = 900_000.0  # from the middle to where lengths are wrong by 0.96 %
+_GROUND_STEP_M = 10.0  # of the differences by which a scale is computed
+_BLOCK_POINTS = 100_000  # that are reprojected at a time, through lists of Python
+UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
+POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
+_POLAR_DEG = 84.0  # latitude from which the polar stereographic projection stands for UTM
+_WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in metres, inverse flattening
+
+# Projections that are made for lengths of countries, by letters of their names.
+_OF_COUNTRIES = re.compile(
+    "transversemercator|gausskruger|conformalconic|conicconformal|obliquestereographic|"
+    "doublestereographic|hotine|obliquemercator|swissoblique|rectifiedskew|krovak|cassini|"
+    "newzealandmapgrid|laborde"
+)
+
+
+@dataclass(frozen=True)
+class GroundScale:
+    """True lengths of a metre of a coordinate system at a place, by its direction."""
+
+    shortest: float  # metres
+    longest: float  # metres
+
+    @property
+    def error(self) -> float:
+        """Largest relative error of a length, in any direction."""
+        return max(abs(self.shortest - 1), abs(self.longest - 1))
+
+    @property
+    def is_true(self) -> bool:
+        """Whether lengths in all directions are true within `MAX_SCALE_ERROR`."""
+        return self.error <= MAX_SCALE_ERROR
+
+    @property
+    def is_even(self) -> bool:
+        """Whether lengths in all directions are stretched alike, within `MAX_SCALE_ERROR`."""
+        return self.longest - self.shortest <= MAX_SCALE_ERROR * self.longest
+
+    def __str__(self) -> str:
+        if self.is_even:
+            return f"{(self.shortest + self.longest) / 2:.3g} m"
+        return f"{self.shortest:.3g} to {self.longest:.3g} m"
+
+
+def has_registry() -> bool:
+    """Return True if rasterio is installed, which has PROJ and the registry of EPSG."""
+    return find_spec("rasterio") is not None
+
+
+def need_registry(purpose: str) -> None:
+    """Check that rasterio is installed; LidarError if not. `purpose` starts the error."""
+    if not has_registry():
+        raise LidarError(f"{purpose} by rasterio: {install_command('lidarpool[geo]')}.")
+
+
+def crs_of_text(text: str) -> Any:
+    """Return the `rasterio.crs.CRS` of WKT, a code such as EPSG:3857, or a definition of PROJ.
+
+    None for a text that PROJ does not understand.
+    """
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        return CRS.from_user_input(text)
+    except CRSError:
+        return None
+
+
+@lru_cache(maxsize=32)
+def _crs_of_json(text: str) -> Any:
+    """Return the `rasterio.crs.CRS` of PROJJSON, which takes 20 ms to read."""
+    return crs_of_text(text)
+
+
+def crs_of_code(epsg: int) -> Any:
+    """Return the `rasterio.crs.CRS` of an EPSG code; None if the code is unknown."""
+    return crs_of_text(f"EPSG:{epsg}")
+
+
+def projjson(crs: Any) -> dict[str, Any]:
+    """Return the PROJJSON of a coordinate system, without a datum bound to the system."""
+    return _unbound(crs.to_dict(projjson=True))
+
+
+def _unbound(described: dict[str, Any]) -> dict[str, Any]:
+    """Return the PROJJSON of a system that may be bound to a datum."""
+    source: dict[str, Any] = described.get("source_crs", described)
+    return source
+
+
+def horizontal_part(crs: Any) -> tuple[Any, float | None]:
+    """Return the horizontal system of a system on Earth, and metres in its unit of heights.
+
+    The unit is None for a system without heights.
+    """
+    described = projjson(crs)
+    parts = [_unbound(part) for part in described.get("components", [described])]
+    axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
+    units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
+    horizontal = _crs_of_json(json.dumps(parts[0])) if len(parts) > 1 else crs
+    if not units:
+        return horizontal, None
+    return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
+
+
+def is_geocentric(crs: Any) -> bool:
+    """Return True for a system with its origin in the middle of the Earth."""
+    described = projjson(crs)
+    axes = described.get("coordinate_system", {})
+    return described["type"] == "GeodeticCRS" and axes.get("subtype") == "Cartesian"
+
+
+def crs_key(crs: Any) -> tuple[str, int | None]:
+    """Return a text that identifies a coordinate system, and its EPSG code if that is certain."""
+    if crs is None:
+        return "", None
+    code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
+    return f"EPSG:{code}" if code else crs.to_wkt(), code
+
+
+def crs_name(crs: Any) -> str:
+    """Return the code and the name of a coordinate system for messages."""
+    _, code = crs_key(crs)
+    name = str(projjson(crs)["name"])[:80]
+    if not code:
+        return name
+    return f"EPSG:{code}" if name in UNNAMED else f"EPSG:{code} ({name})"
+
+
+def transformed(source: Any, target: Any, points: Floats) -> Floats:
+    """Return points (n, 2) or (n, 3) in another coordinate system.
+
+    Infinite where a coordinate is not finite; any exception where a point is outside of what one of
+    the systems can represent.
+    """
+    from rasterio.warp import transform
+
+    moved = np.empty((len(points), points.shape[1]))
+    for start in range(0, len(points), _BLOCK_POINTS):
+        block = slice(start, start + _BLOCK_POINTS)
+        moved[block] = np.transpose(transform(source, target, *points[block].T))
+    return moved
+
+
+def longitude_latitude(crs: Any, x: float, y: float) -> tuple[float, float] | None:
+    """Return longitude and latitude (WGS 84) of a place, degrees; None outside of the system."""
+    places = _transformed_places(crs, crs_of_code(4326), np.array([[x, y]]))
+    return None if places is None else (float(places[0, 0]), float(places[0, 1]))
+
+
+def _transformed_places(source: Any, target: Any, places: Floats) -> Floats | None:
+    """Return places (n, 2) in another system; None if one of them has no coordinates there."""
+    try:
+        moved = transformed(source, target, places)
+    except Exception:  # errors of GDAL have classes that rasterio keeps private
+        return None
+    return moved if np.isfinite(moved).all() else None
+
+
+def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
+    """Return the scale of a projected system at a place in its own unit.
+
+    The lengths on the ellipsoid of steps along x and y, as PROJ's factors have them; rasterio has
+    no function for these. None outside of the system, and for a system that is not projected.
+
+    Parameters
+    ----------
+    crs
+        A `rasterio.crs.CRS`, not compound.
+    x, y
+        Coordinates of the place, in the unit of the system.
+    """
+    if not crs.is_projected:
+        return None
+    base = projjson(crs).get("base_crs")
+    geographic = _crs_of_json(json.dumps(base)) if base else None
+    step = _GROUND_STEP_M / crs.linear_units_factor[1]
+    places = np.array([x, y]) + step / 2 * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+    degrees = _transformed_places(crs, geographic or crs_of_code(4326), places)
+    if degrees is None:
+        return None
+    degrees = degrees * _degrees_per_unit(base or {})
+    east_m, north_m = _ground_metres_of_degrees(base or {}, degrees[:, 1].mean())
+    longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps may cross the date line
+    latitude = np.diff(degrees[:, 1])[::2]
+    steps = np.stack([longitude * east_m, latitude * north_m]) / _GROUND_STEP_M
+    return _ellipse(steps)
+
+
+def _ellipse(steps: Floats) -> GroundScale:
+    """Return the half axes of Tissot's ellipse: the singular values of steps (2, 2)."""
+    squares = float((steps * steps).sum())
+    east, north = steps
+    difference = float((east * east).sum() - (north * north).sum())
+    product = 2 * float((east * north).sum())
+    spread = float(np.sqrt(difference * difference + product * product))
+    shortest = float(np.sqrt(max(squares - spread, 0.0) / 2))
+    longest = float(np.sqrt((squares + spread) / 2))
+    return GroundScale(shortest, longest)
+
+
+def _degrees_per_unit(base: dict[str, Any]) -> float:
+    """Return the degrees in the unit of a geographic system: France's old grids are in grads."""
+    axes = base.get("coordinate_system", {}).get("axis", ({},))
+    unit = axes[0].get("unit", "degree")
+    return 1.0 if isinstance(unit, str) else float(np.degrees(unit["conversion_factor"]))
+
+
+def _ground_metres_of_degrees(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
+    """Return the lengths of a degree of longitude and of latitude on an ellipsoid, metres."""
+    datum = base.get("datum") or base.get("datum_ensemble") or {}
+    ellipsoid = datum.get("ellipsoid", {})
+    axis, inverse = _WGS84_ELLIPSOID
+    radius = ellipsoid.get("radius", ellipsoid.get("semi_major_axis"))
+    if isinstance(radius, float | int):
+        axis = float(radius)
+        inverse = float(ellipsoid.get("inverse_flattening", np.inf))
+    flattening = 1 / inverse
+    square = flattening * (2 - flattening)  # of the eccentricity
+    sine, cosine = sin_cos(np.radians(np.array([latitude_deg])))
+    level = 1 - square * float(sine[0]) ** 2
+    meridian = axis * (1 - square) / (level * np.sqrt(level))
+    return (
+        float(np.radians(axis / np.sqrt(level)) * cosine[0]),
+        float(np.radians(meridian)),
+    )
+
+
+def zone_in_metres(longitude: float, latitude: float) -> int:
+    """Return the EPSG code of the UTM zone (WGS 84) of a place, beyond 84 degrees of a polar one.
+
+    Universal polar stereographic has a scale of 0.994 to 0.997 there.
+    """
+    if abs(latitude) >= _POLAR_DEG:
+        return POLAR_EPSG[0] if latitude > 0 else POLAR_EPSG[1]
+    zone = int(np.floor((longitude + 180) / 6)) % 60 + 1
+    return (32600 if latitude >= 0 else 32700) + zone
+
+
+def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
+    """Return the EPSG code of a system in true metres at a place; None if it is not on Earth."""
+    place = longitude_latitude(horizontal_part(crs)[0], x, y)
+    return None if place is None else zone_in_metres(*place)
+
+
+def projection_kind(name: str) -> bool | None:
+    """Return whether a projection is made for true lengths, by its name; None if unknown.
+
+    For where PROJ cannot tell the scale: False for Mercator's.
+    """
+    letters = re.sub("[^a-z]", "", name.lower())
+    if _OF_COUNTRIES.search(letters):
+        return True
+    return False if "mercator" in letters else None
+
+
+def middle_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
+    """Return x and y in the middle of the middles of objects, (2,); zero without any."""
+    if not objects:
+        return np.zeros(2)
+    middles = np.array([_middle(item)[:2] for item in objects])
+    middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    return middle
+
+
+def _middle(item: SceneMesh | SceneInstance) -> Floats:
+    """Return the middle of an object's bounds in the world, (3,)."""
+    if isinstance(item, SceneMesh):
+        return np.asarray(item.bounds.mean(axis=0))
+    middle = item.mesh.bounds.mean(axis=0)
+    return np.asarray(turned(middle[None], item.matrix[:3, :3])[0] + item.matrix[:3, 3])
+
+
+def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
+    """Return why lengths are not true at a place of a system, as a clause; empty if they are.
+
+    For systems of meshes, in metres. The clause follows the name of the system, such as «whose
+    metre is 0.68 m long on the ground here».
+
+    Parameters
+    ----------
+    system
+        A code such as EPSG:3857, WKT, or a definition of PROJ. Of a system that is not understood,
+        and without rasterio, only `WORLD_EPSG` are known.
+    x, y
+        Coordinates of the place, in the unit of the system.
+    in_system
+        Whether the mesh has coordinates of the system, so that the clause says what placement makes
+        its lengths true.
+    """
+    if not has_registry():
+        is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
+        return "whose metres are not true to scale" if is_known else ""
+    crs = crs_of_text(system)
+    scale = None if crs is None else ground_scale(horizontal_part(crs)[0], x, y)
+    if scale is None or scale.is_true:
+        return ""
+    clause = f"whose metre is {scale} long on the ground here"
+    if scale.is_even and in_system:
+        factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
+        clause += f": scale [{factor}, {factor}, 1] makes its lengths true"
+    return clause
+
+
+def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
+    """Return why lengths in a chosen system are not true metres at a place of that system.
+
+    A clause that begins with the code, such as «EPSG:3857 (WGS 84 / Pseudo-Mercator), whose …»;
+    empty if lengths are true within `MAX_SCALE_ERROR`. Systems of the whole Earth (`WORLD_EPSG`)
+    are refused everywhere. Without rasterio, only these systems are known. `why_there` follows the
+    coordinates in the message.
+    """
+    if is_utm(epsg) and is_true_in_utm(np.array([x])):
+        return ""  # reading the registry takes half a second
+    if not has_registry():
+        return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
+    crs = crs_of_code(epsg)
+    if crs is None:
+        return f"EPSG:{epsg}, a code that rasterio does not know"
+    name = f"EPSG:{epsg} ({projjson(crs)['name']})"
+    horizontal, _ = horizontal_part(crs)
+    if not horizontal.is_projected or horizontal.linear_units_factor[1] != 1:
+        return f"{name}, which is not in metres"
+    if epsg in WORLD_EPSG:
+        return f"{name}, {OF_THE_WORLD}"
+    scale = ground_scale(horizontal, x, y)
+    if scale is None:
+        return f"{name}, which does not reach to x {x:.9g}, y {y:.9g}"
+    if scale.is_true:
+        return ""
+    advice = "choose a system for this place"
+    if code := suggested_epsg(horizontal, x, y):
+        advice = f"EPSG:{code} has true metres there"
+    return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
+
+
+def is_utm(epsg: int) -> bool:
+    """Return True for UTM zones of WGS 84, ETRS89 and NAD83."""
+    return any(epsg in codes for codes in UTM_EPSG)
+
+
+def is_true_in_utm(eastings: Floats) -> bool:
+    """Return True if lengths at all eastings (n,) of a UTM zone, metres, are true."""
+    return bool((np.abs(eastings - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M).all())

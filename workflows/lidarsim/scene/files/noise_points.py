@@ -1,0 +1,69 @@
+"""Points that a file marks as not to be used, as LAS does: withheld points, and noise.
+
+ASPRS LAS 1.4 R15 withholds points that are not to be included in processing, as if they were
+deleted. Its class 7 is low noise; class 18 is high noise in point formats 6 to 10 alone. Programs
+that convert LAS keep these columns under names of their own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import AnyArray, Bools
+from ...base.words import plural
+
+NOISE_CLASSES = (7, 18)
+LEGACY_NOISE_CLASSES = (7,)  # of point formats 0 to 5
+_CLASS_COLUMN = "classification"
+_WITHHELD_COLUMNS = ("withheld", "withheldflag", "classifwithheldflag")
+
+
+class LeftOut(NamedTuple):
+    """Numbers of points that are left out."""
+
+    withheld: int = 0
+    noise: int = 0
+
+    def note(self) -> str:
+        """Return a sentence with the numbers; empty if no points are left out."""
+        kinds = []
+        if self.withheld:
+            kinds.append(f"{plural(self.withheld, 'withheld point')}")
+        if self.noise:
+            kinds.append(f"{plural(self.noise, 'point')} of noise (classes 7 and 18)")
+        verb = "is" if sum(self) == 1 else "are"
+        keeps = f"--keep-noise (in Python keep_noise=True) keeps {'it' if verb == 'is' else 'them'}"
+        return f"{' and '.join(kinds)} {verb} left out: {keeps}" if kinds else ""
+
+
+def usable_points(
+    columns: Mapping[str, AnyArray], noise_classes: Collection[int] = NOISE_CLASSES
+) -> tuple[Bools | None, LeftOut]:
+    """Return which points (n,) are neither withheld nor noise, None for all, and the others' count.
+
+    Parameters
+    ----------
+    columns
+        Columns of a file, (n,) each, as LAS or a program that converts LAS names them.
+    noise_classes
+        Classes of noise: `NOISE_CLASSES`, or `LEGACY_NOISE_CLASSES`.
+    """
+    withheld: Bools | None = None
+    noise: Bools | None = None
+    for name, values in columns.items():
+        letters = re.sub("[^a-z]", "", name.lower().removeprefix("scalar_"))
+        if letters == _CLASS_COLUMN and noise is None:
+            noise = np.isin(np.asarray(values), list(noise_classes))
+        elif letters in _WITHHELD_COLUMNS and withheld is None:
+            withheld = np.asarray(values) != 0
+    marks = [marks for marks in (withheld, noise) if marks is not None and marks.any()]
+    if not marks:
+        return None, LeftOut()
+    withheld_count = 0 if withheld is None else int(np.count_nonzero(withheld))
+    unusable = np.logical_or.reduce(marks)
+    noise_count = int(np.count_nonzero(unusable)) - withheld_count
+    return ~unusable, LeftOut(withheld_count, noise_count)

@@ -1,0 +1,489 @@
+"""The coordinate system that a cloud states, and positions in true metres by that system.
+
+Coordinates are taken as they are if their metres, feet or other units are true to scale; else they
+are refused, or brought to a system that the user chooses.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.errors import LidarError
+from ...base.extras import install_command
+from ...base.vocabulary import UNITS_M, WORLD_EPSG
+from ...base.words import printable
+from .coordinate_systems import (
+    MAX_SCALE_ERROR,
+    UNNAMED,
+    crs_key,
+    crs_name,
+    crs_of_code,
+    crs_of_text,
+    ground_scale,
+    has_registry,
+    horizontal_part,
+    is_geocentric,
+    is_true_in_utm,
+    is_utm,
+    need_registry,
+    projection_kind,
+    projjson,
+    suggested_epsg,
+    target_problem,
+    transformed,
+)
+from .las_units import (
+    GEO_DOUBLES,
+    GEO_KEYS,
+    GEO_TEXTS,
+    PROJECTED_CRS,
+    USER_DEFINED,
+    CoordinateUnits,
+    advice_to_project,
+    geo_keys,
+    height_unit_of_keys,
+    method_of_keys,
+    units_of_epsg,
+    units_of_keys,
+    wkt_code,
+    wkt_method,
+    wkt_units,
+)
+
+WKT_RECORD = 2112  # of LASF_Projection, by ASPRS LAS 1.4
+_CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:[\d.]*:?(\d{4,6})")
+_COMMENT = re.compile(
+    r"(?i)(?:(?:crs|srs|projection|coordinate system|spatial reference)(?: wkt)?\s*[:=]?\s*)?"
+    r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
+    r"(?P<wkt>(?:projcs|projcrs|compd_cs|compoundcrs|geogcs|geogcrs|boundcrs)\s*\[.*))"
+)
+Metres = tuple[float, float, float]  # in the units of x, y and z
+
+
+class _TiffTag(NamedTuple):
+    """A tag of TIFF."""
+
+    number: int
+    type: int  # 3 for 16 bits, 4 for 32 bits, 12 for doubles, 2 for text
+    value_count: int
+    values: bytes
+
+
+@dataclass(frozen=True)
+class StatedSystem:
+    """Coordinate system that a file states: text, or GeoTIFF keys as LAS has them.
+
+    Attributes
+    ----------
+    text
+        WKT 1 or 2, or a code such as EPSG:25832; empty for keys.
+    records
+        {number of a record of GeoTIFF keys: its content}.
+    """
+
+    text: str = ""
+    records: Mapping[int, bytes] = field(default_factory=dict)
+
+    @classmethod
+    def of_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
+        """Return the system of the records of LASF_Projection in a LAS file; None without one.
+
+        `prefer_wkt` says whether WKT counts where a file also has GeoTIFF keys. ValueError if a
+        record is broken.
+        """
+        text = records.get(WKT_RECORD, b"").partition(b"\0")[0].decode("utf-8", "replace").strip()
+        keys = geo_keys(records)
+        if text and (prefer_wkt or not keys):
+            return cls(text)
+        return cls(records=records) if keys else None
+
+    @classmethod
+    def of_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
+        """Return the system that a comment of a file consists of, such as «crs: EPSG:3857»."""
+        matches = (_COMMENT.fullmatch(comment.strip()) for comment in comments)
+        texts = (match["wkt"] or f"EPSG:{match['code']}" for match in matches if match)
+        return next((cls(text) for text in texts), None)
+
+    @cached_property
+    def _keys(self) -> dict[int, float]:
+        """Numbers of the GeoTIFF keys."""
+        return geo_keys(self.records)
+
+    @cached_property
+    def _is_code(self) -> bool:
+        """Whether the text is a code alone."""
+        return _CODE.fullmatch(self.text) is not None
+
+    @cached_property
+    def _code(self) -> int | None:
+        """EPSG code that the text or the keys state, of a projected system if they are no code."""
+        if match := _CODE.fullmatch(self.text):
+            return int(match[1])
+        if self.text:
+            try:
+                return wkt_code(self.text)
+            except ValueError:  # no WKT, which counts as metres where the user gives the unit
+                return None
+        code = int(self._keys.get(PROJECTED_CRS, 0))
+        return None if code in (0, USER_DEFINED) else code
+
+    def units(self) -> CoordinateUnits | None:
+        """Return the units of the coordinates; None if the file says nothing of a projection.
+
+        Raises
+        ------
+        LidarError
+            If coordinates are angles or geocentric, or have a unit that cannot be known.
+        ValueError
+            If the text is no WKT.
+        """
+        if not self.text:
+            return units_of_keys(self._keys)
+        if self._is_code and self._code is not None:
+            return units_of_epsg(self._code)
+        return wkt_units(self.text)
+
+    @cached_property
+    def crs(self) -> Any:
+        """The `rasterio.crs.CRS`; None without rasterio, and for none on Earth that PROJ knows."""
+        if not has_registry():
+            return None
+        crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
+        on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
+        if not on_earth and self._code:  # codes of Esri are beside those of EPSG in GeoTIFF keys
+            return crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
+        return crs if on_earth else None
+
+    @property
+    def horizontal_m(self) -> float | None:
+        """Metres in the unit of x and y; None for angles, and if the unit is not known."""
+        if self.crs is not None:
+            return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
+        return self._stated_m
+
+    @property
+    def _stated_m(self) -> float | None:
+        """Metres in the unit of x and y by the text or keys themselves, or None."""
+        try:
+            units = self.units()
+        except (LidarError, ValueError):  # angles, or a text that is no WKT
+            return None
+        return None if units is None else units.horizontal.metres
+
+    @property
+    def angles(self) -> str:
+        """A clause on angles or geocentric coordinates that follows a file's name, or empty."""
+        if self.crs is None or self.crs.is_projected:
+            return ""
+        if is_geocentric(self.crs):
+            return f"is in {self.name}, geocentric"
+        return f"is in {self.name}, of angles" if self.crs.is_geographic else ""
+
+    @property
+    def is_true_by_name(self) -> bool | None:
+        """Whether the projection is made for true lengths, by its code or name; None if unknown."""
+        if self._code in WORLD_EPSG:
+            return False
+        if self._code is not None and is_utm(self._code):
+            return True
+        if not self.text:
+            method = method_of_keys(self._keys)
+            has_projection = PROJECTED_CRS in self._keys
+        elif self._is_code:
+            return None
+        else:
+            try:
+                method = wkt_method(self.text)
+            except ValueError:  # no WKT, which counts as metres where the user gives the unit
+                return None
+            has_projection = bool(method)
+        return projection_kind(method) if has_projection else True  # of a local system
+
+    def is_in_utm_zone(self, positions: Floats) -> bool:
+        """Return True for a UTM zone whose metres are true at all positions (n, 3)."""
+        if self._code is None or not is_utm(self._code) or self._stated_m != 1:
+            return False
+        return not len(positions) or is_true_in_utm(positions[:, 0])
+
+    def height_m(self) -> tuple[float, str]:
+        """Return the metres in the unit of heights, and a clause if the unit is not stated."""
+        stated = height_unit_of_keys(self._keys) if not self.text else None
+        if stated is not None:
+            return stated.metres, ""
+        horizontal, up_m = horizontal_part(self.crs)
+        if up_m is not None:
+            return up_m, ""
+        if horizontal.is_projected:
+            name, metres = horizontal.linear_units_factor
+            note = f"states no unit of heights, which are taken in the unit {name} of x and y"
+            return float(metres), note if metres != 1 else ""
+        return 1.0, "states no unit of heights, which are taken in metres"
+
+    @property
+    def name(self) -> str:
+        """Code and name of the system for messages."""
+        if self.crs is not None and self._has_name:
+            return crs_name(self.crs if is_geocentric(self.crs) else horizontal_part(self.crs)[0])
+        if self._code is not None:
+            return f"EPSG:{self._code}"
+        projected = r'(?i)PROJ(?:CS|CRS|ECTEDCRS)\s*[\[(]\s*"([^"]*)"'
+        quoted = re.search(projected, self.text) or re.search(r'"([^"]*)"', self.text)
+        return (
+            printable(quoted[1] if quoted else self.text)[:80] or "a coordinate system of its own"
+        )
+
+    @property
+    def _has_name(self) -> bool:
+        """Whether PROJ knows a code or a name of the system."""
+        _, code = crs_key(self.crs)
+        return code is not None or projjson(self.crs)["name"] not in UNNAMED
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """What is known of the scale of a system where positions are."""
+
+    problem: str = ""  # why lengths are not true, as a clause that follows a file's name
+    epsg: int | None = None  # code of a system with true metres
+    note: str = ""  # clause on lengths at the edges, or on a scale that is unknown
+
+
+def stated_metres(
+    system: StatedSystem | None, positions: Floats, unit: str | None
+) -> tuple[Metres, list[str]]:
+    """Return the metres in the units of x, y and z, and notes as clauses that follow a file's name.
+
+    Parameters
+    ----------
+    system
+        The system that the file states; None counts as metres.
+    positions
+        (n, 3): points of the file, or a sample, in its units.
+    unit
+        Unit that the user gives, in place of the units of the system.
+
+    Raises
+    ------
+    LidarError
+        If coordinates are angles or geocentric, have a unit that cannot be known, or are lengths on
+        a map whose scale is not true.
+    """
+    if unit is not None or system is None:
+        metre = UNITS_M[unit or "m"]
+        problem = "" if system is None else system.angles or _scale_of(system, positions).problem
+        note = f"{problem}; its coordinates are taken in {unit} of true length, as you say"
+        return (metre, metre, metre), [note] if problem else []
+    scale = _scale_of(system, positions)
+    if scale.problem:
+        raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
+    units = system.units()
+    if units is None:
+        return (1.0, 1.0, 1.0), []
+    return units.factors, [note for note in (units.note(), scale.note) if note]
+
+
+def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:
+    """Check the system of a file whose format has true metres, such as E57; return notes.
+
+    `positions` (n, 3) are points of the file, or a sample, in metres.
+
+    Raises
+    ------
+    LidarError
+        If coordinates are geocentric, or lengths on a map whose scale is not true.
+    """
+    if system is None:
+        return []
+    if system.crs is not None and is_geocentric(system.crs):
+        raise LidarError(f"it is in {system.name}, geocentric: {advice_to_project(None)}.")
+    metre = system.horizontal_m
+    if metre is None:
+        return [f"states the coordinate system {system.name!r}, and is taken in metres"]
+    scale = _scale_of(system, positions / metre)
+    if scale.problem:
+        raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
+    notes = [scale.note] if scale.note else []
+    if metre != 1.0:
+        notes.append(f"is in {system.name}, and is taken in metres, as its format has them")
+    return notes
+
+
+def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
+    """Return what is known of the scale of a system in the middle of positions (n, 3).
+
+    Without rasterio, or where PROJ cannot tell, the name of the projection counts.
+    """
+    middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
+    if system.is_in_utm_zone(positions):
+        return _Scale()  # without the registry, which takes half a second to load
+    horizontal = None
+    if system.crs is not None and not is_geocentric(system.crs):
+        horizontal, _ = horizontal_part(system.crs)
+    if horizontal is None or not len(positions):
+        return _scale_by_name(system)
+    scale = ground_scale(horizontal, *middle.tolist())
+    if scale is None:
+        return _Scale() if horizontal.is_geographic else _scale_by_name(system)
+    if not scale.is_true:
+        problem = f"is in {system.name}, whose metre is {scale} long on the ground here"
+        return _Scale(problem, suggested_epsg(horizontal, *middle.tolist()))
+    corners = np.array([positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)])
+    scales = [ground_scale(horizontal, x, y) for x in corners[:, 0] for y in corners[:, 1]]
+    error = max((scale.error for scale in scales if scale is not None), default=0.0)
+    if error <= MAX_SCALE_ERROR:
+        return _Scale()
+    return _Scale(
+        note=f"is so wide that lengths of {system.name} are wrong by {error:.1%} at its edges"
+    )
+
+
+def _scale_by_name(system: StatedSystem) -> _Scale:
+    """Return what the name of a projection says of its scale."""
+    is_true = system.is_true_by_name
+    if is_true:
+        return _Scale()
+    if is_true is None:
+        why = "" if has_registry() else f": {install_command('lidarpool[geo]')} to have it checked"
+        return _Scale(note=f"is in {system.name}, whose scale is taken as true{why}")
+    return _Scale(f"is in {system.name}, whose metres are not true to scale")
+
+
+class Reprojection:
+    """Brings positions from the system that a file states to a system in true metres.
+
+    Heights are converted to metres and stay as in the file, with their vertical datum; those of
+    geocentric coordinates are above the ellipsoid.
+
+    Parameters
+    ----------
+    system
+        The system that the file states.
+    epsg
+        Code of a projected system in metres.
+
+    Attributes
+    ----------
+    notes
+        Clauses that follow the name of the file.
+
+    Raises
+    ------
+    LidarError
+        If the file states no system, PROJ does not understand one of the systems, or rasterio is
+        missing.
+    """
+
+    def __init__(self, system: StatedSystem | None, epsg: int) -> None:
+        need_registry("clouds are brought to another coordinate system")
+        if system is None:
+            raise LidarError(
+                f"it states no coordinate system, so it cannot be brought to EPSG:{epsg}: leave "
+                "out --epsg (in Python epsg=), or state its system first (pdal translate IN OUT "
+                "--readers.las.override_srs=EPSG:CODE)."
+            )
+        source = system.crs
+        if source is None:
+            raise LidarError(f"its coordinate system {system.name!r} is not known to PROJ.")
+        target = crs_of_code(epsg)
+        if target is None:
+            raise LidarError(f"EPSG:{epsg} is not known to PROJ: give the code of another system.")
+        self._epsg = epsg
+        self._target, _ = horizontal_part(target)
+        self._is_geocentric = is_geocentric(source)
+        self._source = source if self._is_geocentric else horizontal_part(source)[0]
+        self.notes = [f"was brought from {system.name} to EPSG:{epsg}"]
+        self._height_m = 1.0
+        if not self._is_geocentric:
+            self._height_m, note = system.height_m()
+            self.notes += [note] if note else []
+
+    def check(self, positions: Floats) -> None:
+        """Check that the chosen system is in true metres in the middle of positions (n, 3).
+
+        LidarError if it is not.
+        """
+        moved = self.apply(positions)
+        if len(moved):
+            x, y = np.median(moved[:, :2], axis=0).tolist()
+            if problem := target_problem(self._epsg, x, y):
+                raise LidarError(f"it cannot be brought to {problem}.")
+
+    def apply(self, positions: Floats) -> Floats:
+        """Return positions (n, 3) in metres of the chosen system; NaN for positions not finite.
+
+        LidarError for a position that is outside of one of the systems.
+        """
+        finite = np.asarray(np.isfinite(positions).all(axis=1))
+        moved = np.where(finite[:, None], positions, np.nan).astype(np.float64)
+        axes = slice(3) if self._is_geocentric else slice(2)
+        try:
+            moved[finite, axes] = transformed(self._source, self._target, moved[finite, axes])
+        except Exception as error:  # errors of GDAL have classes that rasterio keeps private
+            raise self._no_place() from error
+        if not np.isfinite(moved[finite]).all():
+            raise self._no_place()
+        moved[:, 2] *= self._height_m
+        return moved
+
+    def _no_place(self) -> LidarError:
+        return LidarError(
+            f"points of it have no place in EPSG:{self._epsg}: give the code of another system."
+        )
+
+
+def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
+    """Return the `rasterio.crs.CRS` of GeoTIFF keys, or None.
+
+    GDAL reads them from a TIFF of one pixel, so that projections of a file's own are understood.
+    """
+    from rasterio.errors import RasterioError
+    from rasterio.io import MemoryFile
+
+    try:
+        with MemoryFile(_tiff(records)) as memory, memory.open(driver="GTiff") as file:
+            return file.crs
+    except RasterioError:
+        return None
+
+
+def _tiff(records: Mapping[int, bytes]) -> bytes:
+    """Return a TIFF of one pixel with GeoTIFF keys; TIFF 6.0, little-endian."""
+    tags = [
+        _TiffTag(256, 4, 1, struct.pack("<I", 1)),  # width
+        _TiffTag(257, 4, 1, struct.pack("<I", 1)),  # length
+        _TiffTag(258, 3, 1, struct.pack("<H", 8)),  # bits of a sample
+        _TiffTag(259, 3, 1, struct.pack("<H", 1)),  # no compression
+        _TiffTag(262, 3, 1, struct.pack("<H", 1)),  # black is zero
+        _TiffTag(273, 4, 1, struct.pack("<I", 8)),  # offset of the pixel
+        _TiffTag(277, 3, 1, struct.pack("<H", 1)),  # samples of a pixel
+        _TiffTag(278, 4, 1, struct.pack("<I", 1)),  # rows
+        _TiffTag(279, 4, 1, struct.pack("<I", 1)),  # bytes of the pixel
+        _TiffTag(33550, 12, 3, struct.pack("<3d", 1, 1, 0)),  # size of the pixel
+        _TiffTag(33922, 12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),  # its place
+        *(
+            _TiffTag(number, kind, len(records[number]) // size, records[number])
+            for number, kind, size in ((GEO_KEYS, 3, 2), (GEO_DOUBLES, 12, 8), (GEO_TEXTS, 2, 1))
+            if records.get(number)
+        ),
+    ]
+    directory = 12  # its offset: after the head, and four bytes of which the first is the pixel
+    body_start = directory + 2 + 12 * len(tags) + 4
+    rows = b""
+    body = b""
+    for tag in tags:
+        rows += struct.pack("<HHI", tag.number, tag.type, tag.value_count)
+        if len(tag.values) <= 4:
+            rows += tag.values.ljust(4, b"\0")
+        else:
+            rows += struct.pack("<I", body_start + len(body))
+            body += tag.values + b"\0" * (len(tag.values) % 2)
+    head = b"II*\0" + struct.pack("<I", directory) + bytes(4)
+    return head + struct.pack("<H", len(tags)) + rows + bytes(4) + body
