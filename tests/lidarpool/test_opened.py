@@ -301,6 +301,10 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     folder, _, _ = exported
     shutil.copytree(folder / "kitti" / "sequences" / "00", tmp_path / "cut")
     (tmp_path / "cut" / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    shutil.copytree(folder / "kitti" / "sequences" / "00", tmp_path / "uncalibrated")
+    (tmp_path / "uncalibrated" / "calib.txt").write_text("Tr: x 0 0 0 0 1 0 0 0 0 1 0\n")
+    shutil.copytree(tmp_path / "cut", tmp_path / "bad")
+    (tmp_path / "bad" / "poses.txt").write_text(2 * "1 0 0 0 0 1 0 0 0 0 1\n")
     (tmp_path / "cut.bin").write_bytes(b"123")
     (tmp_path / "cut.tar").write_bytes(b"123")
     (tmp_path / "cut.parquet").write_bytes(b"123")
@@ -319,6 +323,8 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     next((tmp_path / "lost" / "samples").rglob("*.bin")).unlink()
     for name, words in (
         ("cut", "poses.txt has 1 rows for 3 files"),
+        ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
+        ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),

@@ -297,7 +297,7 @@ def test_vectors_of_a_pcd_are_turned_by_its_viewpoint(tmp_path):
     names = ("origin_x", "origin_y", "origin_z")
     columns = [(name, values.astype("f4")) for name, values in zip(names, origin.T, strict=True)]
     path, _ = pcd_with_viewpoint(tmp_path / "a.pcd", columns)
-    assert facing(scene_of_points(path, voxel_m=1e-3), [*STATION, 0, 0, 50]).all()
+    assert facing(scene_of_points(path, voxel_m=1e-3), STATION + np.array([0, 0, 50])).all()
 
 
 @pytest.mark.parametrize("name", ["a.pcd", "a.ptx", "a.npy", "a.csv"])
@@ -331,7 +331,7 @@ def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
     text = ""
     for side in (-3.0, 3.0):  # a wall seen from both sides, 2 m thick
         scanner = np.array([side, 2, 1.5])
-        local = ([*wall, side / 3, 0, 0] - scanner) @ QUARTER
+        local = (wall + np.array([side / 3, 0, 0]) - scanner) @ QUARTER
         axes = "0 1 0\n-1 0 0\n0 0 1\n"
         position = " ".join(map(str, scanner))
         transformation = "".join(f"{line} 0\n" for line in axes.split("\n")[:3])
@@ -360,7 +360,7 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     notes = []
     scene = scene_of_points(path, tell=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
-    assert "is converted: its header states units of 0.001, 0.001, 0.001 m" in notes[0]
+    assert "was converted to metres: its header names units of 0.001, 0.001, 0.001 m" in notes[0]
     metres = scene_of_points(path, unit="cm", tell=notes.append)
     np.testing.assert_allclose(metres.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])

@@ -89,6 +89,12 @@ def test_columns_of_words_are_left_out_and_empty_cells_are_nan(tmp_path):
     assert columns_of(without_header) == {"column_4": [9, 9], "column_5": [8, 7]}
 
 
+def test_a_cloud_may_have_angles_beside_its_coordinates(tmp_path):
+    scan = read(tmp_path, "a.csv", "lat,lon,x,y,z,roll,pitch,yaw\n1,2,3,4,5,6,7,8\n")
+    assert scan.positions.tolist() == [[3, 4, 5]]
+    assert [*scan.columns] == ["lat", "lon", "roll", "pitch", "yaw"]
+
+
 def test_units_in_names_are_units_of_the_axes(tmp_path):
     scan = read(tmp_path, "a.csv", "x [mm],y [mm],z [m]\n1500,2000,3\n")
     assert scan.positions.tolist() == [[1500, 2000, 3]] and scan.units_m == (1e-3, 1e-3, 1.0)
@@ -130,7 +136,10 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
         ("1,234.5;2;3\n", "line 1 is '1,234.5;2;3'"),
         ("lat,lon,height\n1,2,3\n", "line 1 names latitude and longitude, .*project it"),
         ("x_deg,y_deg,z\n1,2,3\n", "line 1 names 'x_deg': x in a unit of length was expected"),
-        ("t,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n", "line 1 names rotations .*it is a trajectory"),
+        (
+            "t,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
+            "line 1 names a quaternion .*it is a trajectory",
+        ),
         ("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0.6 0.8\n", "its lines are poses: it is a trajectory"),
         ("1 0 0 5 0 1 0 6 0 0 1 7\n", "its lines are poses: it is a trajectory"),
         ("1 5 6 7\n2 5 6 7\n3 5 6 7\n", "its first column counts the points"),

@@ -20,12 +20,13 @@ from lidarsim.base.archives import open_archive, read_npy
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import need
-from lidarsim.base.input_files import input_size, read_input
+from lidarsim.base.input_files import input_size, read_input, read_input_text
 from lidarsim.base.words import natural
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.e57_system import e57_system
 from lidarsim.scene.files.float_rows import NUSCENES, columns_by_name, read_float_columns
 from lidarsim.scene.files.stated_system import check_metric_format
+from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.scene.transform import affine
 from lidarsim.sensor.trajectory import matrices
 
@@ -35,6 +36,7 @@ Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
 Read = tuple[AnyArray, Columns, Floats | None]
 
+_MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]  # of KITTI
 _E57_COLUMNS = {
     "colorRed": "red",
     "colorGreen": "green",
@@ -143,7 +145,7 @@ def _kitti_sequence(folder: Path, inner: str) -> SweepFiles:
     files = sorted((folder / inner).glob("*.bin"), key=lambda file: natural(file.name))
     poses: Floats | None = None
     if (folder / "poses.txt").exists():
-        rows = np.loadtxt(folder / "poses.txt", ndmin=2).reshape(-1, 3, 4)
+        rows = _kitti_matrices(folder / "poses.txt")
         camera = _kitti_calibration(folder / "calib.txt")
         poses = np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
     times_ns: Floats | None = None
@@ -163,13 +165,26 @@ def _kitti_sequence(folder: Path, inner: str) -> SweepFiles:
     return SweepFiles(len(files), read, None if times_ns is None else times_ns[: len(files)])
 
 
+def _kitti_matrices(path: Path) -> Floats:
+    """Return the matrices (n, 3, 4) of a file, one in each line; ValueError names a wrong line."""
+    reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
+    try:
+        return reader.read(read_input_text(path).splitlines(), 1).reshape(-1, 3, 4)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
 def _kitti_calibration(path: Path) -> Floats:
     """Return the matrix (4, 4) from the lidar to the camera; the identity without a file."""
     if path.exists():
-        for line in path.read_text("utf-8").splitlines():
+        for number, line in enumerate(read_input_text(path).splitlines(), 1):
             key, _, values = line.partition(":")
             if key == "Tr":
-                return _square(np.array(values.split(), float).reshape(3, 4))
+                reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
+                try:
+                    return _square(reader.read([values], number).reshape(3, 4))
+                except ValueError as error:
+                    raise ValueError(f"{path.name}: {error}") from error
     return np.eye(4)
 
 

@@ -43,7 +43,7 @@ _AXES = {
     "altitude": "z",
     "up": "z",
 }
-_ROTATIONS = {"qx", "qy", "qz", "qw", "roll", "pitch", "yaw", "heading"}
+_QUATERNION = {"qx", "qy", "qz", "qw"}
 _DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
 _TUM_COLUMNS = 8  # time, position and quaternion
 _KITTI_COLUMNS = 12  # three rows of a matrix, in each of them a rotation and an offset
@@ -233,12 +233,12 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
     """
     columns = [column_name(name) for name in names]
     words = [column.words for column in columns]
-    if len(_ROTATIONS.intersection(words)) >= 2:
+    if _QUATERNION.issubset(words):
         raise ValueError(
-            f"line {head.names_line} names rotations ({printable(', '.join(names))}): it is a "
+            f"line {head.names_line} names a quaternion ({printable(', '.join(names))}): it is a "
             "trajectory, and no cloud"
         )
-    if len(_DEGREES.intersection(words)) >= 2:
+    if not {_AXES.get(word) for word in words} >= {"x", "y", "z"}:
         raise ValueError(
             f"line {head.names_line} names latitude and longitude, and x and y in a unit of length "
             "were expected: project it"
