@@ -91,7 +91,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
     ("options", "says"),
     [
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
-        (["--mesh", "notes.txt"], "notes.txt has the ending .txt, which is not a mesh format"),
+        (["--mesh", "notes.txt"], "notes.txt is not read: if it is a point cloud, make a mesh"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),

@@ -17,6 +17,7 @@ import numpy as np
 from ...base.arrays import Floats
 from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input
+from ...base.vectors import matmul
 from ...base.words import plural, printable
 from ..transform import affine
 from .cloud_scan import CloudScan
@@ -139,7 +140,7 @@ def _pose(rows: Floats, start: int) -> Floats:
     not a rotation and a position.
     """
     rotation = rows[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    error = np.abs(matmul(rotation, rotation.T) - np.eye(3)).max()
     if error > _MAX_ROTATION_ERROR or not np.array_equal(rows[:, 3], [0, 0, 0, 1]):
         raise ValueError(
             f"the transformation of the header that begins with line {start} is not a rotation "
