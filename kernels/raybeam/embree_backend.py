@@ -125,7 +125,7 @@ class EmbreeBackend(Backend):
         # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
-        width = embree_library.packet_width()
+        self._width = width = embree_library.packet_width()
         packets = [embree_exact.propose] * min(16 // width, 4)  # unused if a packet is one ray
         single = embree_exact.propose
         if not masked:
@@ -142,7 +142,6 @@ class EmbreeBackend(Backend):
         cast["single"] = single.address
         cast["decide"] = embree_exact.decide.address
         cast["nearby"] = embree_exact.nearby.address
-        cast["width"] = width
         cast["coherence"] = _COHERENCE
         cast["index"] = self._index.ctypes.data
         self._records = self._instance_records(scene)
@@ -180,6 +179,9 @@ class EmbreeBackend(Backend):
         base["scale"] = frame.scale
         base["lower"] = frame.lower
         base["upper"] = frame.upper
+        grid = embree_library.direction_grid(scene)
+        base["rounding"] = 1.5 * 2.0**52 * grid
+        base["width"] = self._width if np.isfinite(grid) else 1
         if self._instances is not None:
             self._instances.update_scene(scene)
             self._records["matrix"] = scene.matrices
