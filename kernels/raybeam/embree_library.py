@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, files, version
@@ -153,7 +154,10 @@ def direction_grid(scene: Scene) -> float:
     grid = _FINE_GRID / min(float(np.abs(elements[used]).min()), 1.0)
     if (used.sum(axis=2) > 1).any():
         grid = max(grid, _COARSE_GRID)
-    return float(np.exp2(np.ceil(np.log2(grid)))) if grid <= _MAX_GRID else np.inf
+    if grid > _MAX_GRID:
+        return np.inf
+    mantissa, exponent = math.frexp(grid)
+    return 2.0 ** (exponent - (mantissa == 0.5))
 
 
 def _remove_small(elements: AnyArray) -> None:
