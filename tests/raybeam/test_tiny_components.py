@@ -6,7 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-from tests.rows import quick
 
 from raybeam import (
     Instance,
@@ -99,6 +98,7 @@ def test_rays_that_start_outside(backend, shapes):
     check(backend, [Instance(mesh)], [30.0, 0.1, -0.2], directions, all_hit=False)
 
 
+@pytest.mark.extended(keep=("embree-*",))
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_rays_at_an_instance(backend, shapes, name):
     check(backend, [instance(Mesh(*shapes["sphere"]()), name)], ORIGIN, packets(60))
@@ -161,6 +161,7 @@ def test_rays_at_moving_bodies(backend, shapes):
         np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))
 
 
+@pytest.mark.extended(keep=("embree-*",))
 @pytest.mark.parametrize("count", [1, 2, 5, 16, 19])
 def test_few_rays(backend, shapes, count):
     directions = packets(2, 4)[:count]
@@ -200,7 +201,9 @@ def check_instruction_set():
         check("embree", [instance(mesh, name)], ORIGIN, packets(60))
 
 
-@pytest.mark.parametrize("isa", quick(("AVX2",), ("SSE4.2", "AVX", "AVX2", "AVX512")))
+@pytest.mark.extended
+@pytest.mark.slow(keep=("AVX2",))
+@pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
 def test_packets_of_every_width(isa):
     flag = {"SSE4.2": "SSE42", "AVX512": "AVX512_SKX"}.get(isa, isa)
     if not np._core._multiarray_umath.__cpu_features__[flag]:
