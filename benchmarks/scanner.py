@@ -78,7 +78,11 @@ class LidarpoolScans:
         stop = sensor.firings(firings[-1])[1]
         self.directions = sensor.directions(np.arange(stop)).reshape(-1, 3)
         origins = sensor.origins(np.arange(stop))
-        self.pattern = Pattern(self.directions, None if origins is None else origins.reshape(-1, 3))
+        self.pattern = Pattern(
+            self.directions,
+            None if origins is None else origins.reshape(-1, 3),
+            step=sensor.ring_step,
+        )
         self.caster = RayCaster(scene.vertices, scene.faces, backend, threads=1)
         self.scanner = Scanner(scene, sensor, backend=backend, threads=1)
         noise = Noise(range_m=0.02)

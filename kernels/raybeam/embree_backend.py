@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -25,10 +24,12 @@ from .hits import Part, join_hits
 from .installation import install_command
 from .instances import Scene
 from .mesh import NEAR
+from .pattern import GOLDEN, sample_rows
 from .pattern_rays import checked_rays
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
+from .trials import Alternation, Trials, clock
 
 if TYPE_CHECKING:
     from .embree_memory import Cast
@@ -39,7 +40,6 @@ _SHARE = 1 << 13  # rays that a thread casts in a call, if there are several thr
 _COHERENCE = 0.94
 _SHAPES = ((16, 1), (8, 2), (4, 4))  # of groups: rays along a ring, and neighbouring rings
 _MAX_BLOCK = 1 << 15  # rays of a block
-_TRIALS = 5  # ranges of rays that are cast in every grouping, to choose the fastest grouping
 _TRIAL_RAYS = 1 << 10  # minimum number of rays of a timed cast
 _SIMILAR = 0.02  # maximum difference of the coherence of patterns with the same fastest grouping
 _MAX_PLANS = 16
@@ -116,8 +116,7 @@ class EmbreeBackend(Backend):
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
         self._plans: dict[tuple[int, int], _GroupingPlan] = {}
-        # Seconds a ray of timed calls of `cast_crossing`: in packets, and ray by ray.
-        self._crossing_times: tuple[list[float], list[float]] = [], []
+        self._crossing_options = Alternation()  # of `cast_crossing`: in packets, and ray by ray
         self._loops = embree_packets
         self._memory = embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
@@ -125,7 +124,7 @@ class EmbreeBackend(Backend):
         # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         masked = any(mesh.opacity is not None for mesh in scene.meshes)
-        width = embree_library.packet_width()
+        self._width = width = embree_library.packet_width()
         packets = [embree_exact.propose] * min(16 // width, 4)  # unused if a packet is one ray
         single = embree_exact.propose
         if not masked:
@@ -142,7 +141,6 @@ class EmbreeBackend(Backend):
         cast["single"] = single.address
         cast["decide"] = embree_exact.decide.address
         cast["nearby"] = embree_exact.nearby.address
-        cast["width"] = width
         cast["coherence"] = _COHERENCE
         cast["index"] = self._index.ctypes.data
         self._records = self._instance_records(scene)
@@ -180,6 +178,9 @@ class EmbreeBackend(Backend):
         base["scale"] = frame.scale
         base["lower"] = frame.lower
         base["upper"] = frame.upper
+        grid = embree_library.direction_grid(scene)
+        base["rounding"] = 1.5 * 2.0**52 * grid
+        base["width"] = self._width if np.isfinite(grid) else 1
         if self._instances is not None:
             self._instances.update_scene(scene)
             self._records["matrix"] = scene.matrices
@@ -209,19 +210,14 @@ class EmbreeBackend(Backend):
         scale = self._scene.frame.scale
         record["t_min"], record["t_max"] = (limit * scale for limit in crossing.limits)
         record["scratch"], _ = self._memory.thread_memory.addresses(0)
-        # Threads may time calls at the same time: each list has enough, whatever the order.
-        packets, single = self._crossing_times
-        decided = min(len(packets), len(single)) >= _TRIALS
-        use_single = len(single) < len(packets)
-        if decided:  # by the medians
-            use_single = sorted(single)[_TRIALS // 2] < sorted(packets)[_TRIALS // 2]
-        record["coherence"] = 2.0 if use_single else _COHERENCE
-        pairs = crossing.contiguous()
-        start = time.perf_counter()
-        cast_crossing(record, pairs, nearest)
         count = len(crossing.row)
-        if not decided and count >= _TRIAL_RAYS:
-            self._crossing_times[bool(use_single)].append((time.perf_counter() - start) / count)
+        one_by_one = self._crossing_options.next()
+        record["coherence"] = 2.0 if one_by_one else _COHERENCE
+        pairs = crossing.contiguous()
+        start = clock()
+        cast_crossing(record, pairs, nearest)
+        if count >= _TRIAL_RAYS:
+            self._crossing_options.add(one_by_one, (clock() - start) / count)
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
         """Yield ranges of rays of a scan, and the hits of each range.
@@ -233,9 +229,10 @@ class EmbreeBackend(Backend):
         plan = self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
             for begin, end, is_trial in plan.pieces(start, stop):
-                yield begin, end, self._cast(cast, begin, end, plan.groupings[0])
-                if is_trial:
-                    plan.choose(partial(self._cast, cast, begin, end))
+                yield begin, end, self._cast(cast, begin, end, plan.trials.current)
+                if is_trial:  # of rays that were cast before, so caches are warm
+                    work = partial(self._cast, cast, begin, end, in_this_thread=True)
+                    plan.trials.try_all(work, end - begin)
 
     def _ray_cast(self, rays: Rays) -> Cast:
         """Return the `Cast` of rays that are not of a pattern.
@@ -315,12 +312,18 @@ class EmbreeBackend(Backend):
         return plan
 
     def _cast(
-        self, cast: Cast, start: int, stop: int, grouping: _RayGrouping = _CONSECUTIVE
+        self,
+        cast: Cast,
+        start: int,
+        stop: int,
+        grouping: _RayGrouping = _CONSECUTIVE,
+        *,
+        in_this_thread: bool = False,
     ) -> Part:
         """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
 
         Distances are in metres; `triangle` is the row in the caller's faces, or the row of the
-        corners if `index` of the record is 0.
+        corners if `index` of the record is 0. With `in_this_thread` no other thread casts.
         """
         n = stop - start
         ray = np.empty(n, np.uint32)
@@ -349,7 +352,7 @@ class EmbreeBackend(Backend):
             return ray[hits], distance[hits], triangle[hits], instance[hits]
 
         share = max(_SHARE // grouping.block, 1) * grouping.block
-        if self._count == 1 or n <= share:
+        if self._count == 1 or in_this_thread or n <= share:
             share = n
             return cast_share(start)
         if self._process != os.getpid():  # a fork, which has no threads of its parent
@@ -367,8 +370,8 @@ class _GroupingPlan:
 
     Attributes
     ----------
-    groupings
-        Groupings that are tried; after `_TRIALS` timed ranges, the fastest alone.
+    trials
+        The groupings that are tried, and the grouping that casts.
     """
 
     def __init__(self, scan: Scan, rays_per_pose: int) -> None:
@@ -378,23 +381,26 @@ class _GroupingPlan:
         coherences = {step: _coherence(scan, _RayGrouping(step, 16, 1)) for step in steps}
         self._step = max(coherences, key=lambda step: coherences[step])
         self._coherence = coherences[self._step]
-        self.groupings = [_CONSECUTIVE]
+        groupings = [_CONSECUTIVE]
         if self._coherence > _COHERENCE:
-            groupings = {
-                _RayGrouping(self._step, rays_along, rays_across)
+            shapes = {
+                _RayGrouping(step, rays_along, rays_across)
+                for step in steps
                 for rays_along, rays_across in _SHAPES
-                if rays_across <= self._step
+                if rays_across <= step
             }
             if subrays > 1:  # the sub-rays of a beam, which differ least, form groups
                 squares = {_RayGrouping(step, *_SHAPES[-1]) for step in steps if step > 4}
-                groupings = {_CONSECUTIVE} | squares
-            self.groupings = [
+                shapes = {_CONSECUTIVE} | squares
+            groupings = [
                 grouping
-                for grouping in sorted(groupings)
+                for grouping in sorted(shapes)
                 if grouping.block <= _MAX_BLOCK and _coherence(scan, grouping) > _COHERENCE
-            ] or self.groupings
-            self.groupings.append(_RayGrouping(1, 16, 1, 2.0))
-        self._trials: list[list[float]] = []  # times of the groupings, as shares of the shortest
+            ] or groupings
+            groupings.append(_RayGrouping(1, 16, 1, 2.0))
+        self.trials = Trials(groupings)
+        self._trial_rays = max(_TRIAL_RAYS, *(grouping.block for grouping in groupings))
+        self._single_trials = 0  # so far
 
     def fits(self, scan: Scan) -> bool:
         """Return whether the plan holds for a scan: of the same beams, or as coherent."""
@@ -404,36 +410,30 @@ class _GroupingPlan:
         return abs(_coherence(scan, grouping) - self._coherence) < _SIMILAR
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Yield start and stop of ranges of rays, and whether to time all groupings on a range."""
-        piece = -(-(stop - start) // _TRIALS)
-        while start < stop:
-            end = stop
-            if len(self.groupings) > 1:
-                block = max(grouping.block for grouping in self.groupings)
-                trial_end = min(start + max(block, _TRIAL_RAYS), stop)
-                yield start, trial_end, True
-                end = min(max(trial_end, start + piece), stop)
-                start = trial_end
-            if start < end:
-                yield start, end, False
-            start = end
+        """Yield start and stop of ranges of rays, and whether to try all groupings on a range.
 
-    def choose(self, cast: Callable[[_RayGrouping], object]) -> None:
-        """Time the cast of a range of rays in each grouping; after the last trial keep the fastest.
-
-        `cast` casts the range in a grouping. The range was cast before, so the caches are warm.
+        The caller casts each range by `trials.current`, and tries before it asks for the next one.
         """
-        groupings = self.groupings
-        marks = [time.perf_counter()]
-        if len(groupings) == 1:  # another thread has chosen meanwhile
-            return
-        for grouping in groupings:
-            cast(grouping)
-            marks.append(time.perf_counter())
-        times = np.diff(marks)
-        self._trials.append(list(times / times.min()))
-        if len(self._trials) >= _TRIALS:
-            self.groupings = [groupings[int(np.median(self._trials, axis=0).argmin())]]
+        self.trials.worked(stop - start)
+        due = self.trials.due
+        if due == 1:  # elsewhere each time, so that checks see all parts of scans
+            self._single_trials += 1
+            spare = max(stop - start - self._trial_rays, 0)
+            lead = int(self._single_trials * GOLDEN % 1 * spare)
+            if lead:
+                yield start, start + lead, False
+                start += lead
+        while due and start < stop:
+            trial_end = min(start + self._trial_rays, stop)
+            yield start, trial_end, True
+            # The trials that are left share the rays that are left.
+            end = max(min(start + -(-(stop - start) // due), stop), trial_end)
+            if trial_end < end:
+                yield trial_end, end, False
+            start = end
+            due = self.trials.due
+        if start < stop:
+            yield start, stop, False
 
 
 def _coherence(scan: Scan, grouping: _RayGrouping) -> float:
@@ -446,7 +446,7 @@ def _coherence(scan: Scan, grouping: _RayGrouping) -> float:
     last_start = len(scan) - int(lags[-1])
     if last_start <= 0:
         return -1.0
-    ray = np.linspace(0, last_start - 1, 32).astype(np.int64)[:, None] + lags
+    ray = sample_rows(32, last_start)[:, None] + lags
     _, directions = checked_rays(scan.pattern, scan.first, ray.reshape(-1), scan.poses)
     packets = directions.reshape(-1, len(lags), 3)
     return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())

@@ -293,11 +293,19 @@ def _intersect(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-
 
 @stage
 def _is_transparent(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-untyped-def]
-    """Return whether a mask lets a ray through the triangle of a key."""
+    """Return whether a mask lets a ray through the triangle of a key.
+
+    If it does so at the rim of the triangle, the ray becomes unsure: in float64 it may hit the
+    neighbour, which Embree need not propose, where the neighbour's mask is opaque.
+    """
     hit, record = _intersect(mesh, instances, numbers, floats, lane, key)
     if record[3] == 0:
         return False
-    return hit.det == 0 or not _is_opaque(record, key & (KEYS_PER_INSTANCE - 1), hit)
+    if hit.det != 0 and _is_opaque(record, key & (KEYS_PER_INSTANCE - 1), hit):
+        return False
+    if not _is_clearly_inside(hit):
+        numbers[_SURE + lane] = 0
+    return True
 
 
 @cache
@@ -509,11 +517,11 @@ def _is_sure(floats, lane, t_min, hit):  # type: ignore[no-untyped-def]
 def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-def]
     """Test the candidates of a ray in float64, and write the closer hit to `t`, `key` and `sure`.
 
-    `sure` is 0 for a ray that must be cast again by `cast_until_sure`.
+    `sure` is 0 for a ray that must be cast again by `cast_until_sure`; it may be 0 before.
     """
     t = np.inf
     key = np.int64(-1)
-    sure = True
+    sure = numbers[_SURE + lane] != 0
     t_min = floats[_T_MIN]
     first = numbers[_FIRST + lane]
     second = numbers[_SECOND + lane]
@@ -521,7 +529,7 @@ def verify(mesh, instances, numbers, floats, lane):  # type: ignore[no-untyped-d
         hit, _ = _intersect(mesh, instances, numbers, floats, lane, first)
         t = hit.t
         key = first
-        sure = _is_sure(floats, lane, t_min, hit)
+        sure = sure and _is_sure(floats, lane, t_min, hit)
         if second >= 0:
             hit, _ = _intersect(mesh, instances, numbers, floats, lane, second)
             sure = sure and _is_sure(floats, lane, t_min, hit)

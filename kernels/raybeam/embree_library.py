@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, files, version
@@ -11,7 +12,7 @@ from weakref import finalize
 
 import numpy as np
 
-from .arrays import Floats
+from .arrays import AnyArray, Floats
 from .instances import Scene
 from .mesh import LocalMesh
 
@@ -28,6 +29,12 @@ _ROBUST = 1 << 2  # rays between two triangles hit one of them
 _FILTER_IN_ARGUMENTS = 1 << 3
 # RTC_DEVICE_PROPERTY_NATIVE_RAY…_SUPPORTED, and the rays of a packet.
 _WIDTHS = ((34, 16), (33, 8), (32, 4))
+
+# Grids of direction components, see `direction_grid`.
+_FINE_GRID = 2.0**-58  # above 1e-18, below which Embree replaces a component
+_COARSE_GRID = 2.0**-30
+_MAX_GRID = 2.0**-27  # an eighth of the rounding errors of directions in float32
+_SMALL_ELEMENT = 2.0**-26  # share of the largest element that counts as zero, see `_remove_small`
 
 # What embreex names the library on Linux, macOS and Windows.
 _ENDINGS = (".dylib", ".dll")
@@ -125,6 +132,48 @@ def build() -> str:
     return f"{version('embreex')} ({digest}{'' if fused else ', without FMA'})"
 
 
+def direction_grid(scene: Scene) -> float:
+    """Return the spacing, a power of two, to which the directions of packets are rounded.
+
+    Embree loses packets in which a component is negative and above -1e-18, see `_on_grid` of
+    embree_packets.py. A component on the grid is zero, or large enough. At an instance, Embree
+    computes the components in the axes of the mesh in float32: sums of three products with elements
+    of a matrix. For a single product, a grid that is coarser by the smallest element suffices. A
+    sum is zero, or at least the grid times the last digit of an element: on the coarse grid, large
+    enough for elements above 2^-5. Sums that are nearly zero come from matrices with such elements,
+    as of a turn by 45 degrees, at which a direction of (1e-16, 1e-16, 1) lost its packet.
+
+    Returns `inf` if the grid would change directions by more than `_MAX_GRID`: then no packets may
+    be cast.
+    """
+    if scene.matrices is None:
+        return _FINE_GRID
+    elements = scene.matrices.reshape(-1, 3, 4)[:, :, :3].copy()
+    _remove_small(elements)
+    used = elements != 0
+    grid = _FINE_GRID / min(float(np.abs(elements[used]).min()), 1.0)
+    if (used.sum(axis=2) > 1).any():
+        grid = max(grid, _COARSE_GRID)
+    if grid > _MAX_GRID:
+        return np.inf
+    mantissa, exponent = math.frexp(grid)
+    return 2.0 ** (exponent - (mantissa == 0.5))
+
+
+def _remove_small(elements: AnyArray) -> None:
+    """Set elements of matrices (n, 3, 3), which are small beside others, to zero.
+
+    The cosine of a right angle is 6e-17 in float64. As an element of a matrix, it makes of a
+    component of 0.01 a component of 6e-19, for which Embree loses packets, see `direction_grid`.
+    An element counts as zero if it is less than `_SMALL_ELEMENT` times the largest of its row, and
+    of its column. So a mesh that is flat, or far larger along one axis, keeps its shape, and
+    a coordinate to which such an element adds changes by less than float32 rounds.
+    """
+    sizes = np.abs(elements)
+    limits = np.minimum(sizes.max(axis=1, keepdims=True), sizes.max(axis=2, keepdims=True))
+    elements[sizes < _SMALL_ELEMENT * limits] = 0
+
+
 class EmbreeScene:
     """A scene of Embree: a tree over geometries.
 
@@ -194,6 +243,7 @@ class EmbreeInstances(EmbreeScene):
         assert transforms is not None
         changed = np.flatnonzero((transforms != self._transforms).any(axis=(1, 2)))
         matrices = np.ascontiguousarray(transforms[changed], np.float32)
+        _remove_small(matrices[:, :, :3])
         address = matrices.ctypes.data
         geometry_of = embree.rtcGetGeometry
         set_transform = embree.rtcSetGeometryTransform

@@ -57,6 +57,7 @@ CAST = np.dtype(
         ("rays_along", "i8"),  # rays of each ring in a group
         ("rays_across", "i8"),  # rings of a group
         ("width", "i8"),  # rays of a packet of Embree, 1 for no packets
+        ("rounding", "f8"),  # directions in packets are rounded to the spacing of numbers about it
         ("coherence", "f8"),  # a group with a smaller cosine between two rays is cast ray by ray
         ("t_min", "f8"),  # closest and farthest distance of a hit, local
         ("t_max", "f8"),

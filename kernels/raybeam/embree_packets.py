@@ -127,15 +127,34 @@ def _is_incoherent(floats, coherence):  # type: ignore[no-untyped-def]
     return False
 
 
+@inlined
+def _on_grid(d, rounding):  # type: ignore[no-untyped-def]
+    """Return a component of a direction in a packet: rounded, so that none is too close to zero.
+
+    With the flag `COHERENT`, Embree (`intersectCoherent` of bvh_intersector_hybrid.cpp) divides a
+    packet into parts whose directions have the same signs, and casts each part as a frustum, whose
+    sides follow from the sign of the reciprocals. But for the reciprocals, `zero_fix` of vec3.h
+    replaces components nearer to zero than 1e-18 by +1e-18. So a ray with a component of -1e-19 is
+    in the part of the negative components, and its reciprocal is positive: that turns the frustum
+    inside out, and all rays of the part miss. Zeros of both signs count as positive in both places.
+    A ray that is cast by itself is in no frustum.
+
+    A component becomes a multiple of the spacing of numbers about `rounding`, see
+    `embree_library.direction_grid`.
+    """
+    return np.float32((d + rounding) - rounding)
+
+
 def _filler(width: int) -> Any:
     """Return a function that fills packets of `width` rays, by vector instructions."""
 
     @stage
-    def fill(scratch, t_min, t_max, has_origins):  # type: ignore[no-untyped-def]
+    def fill(scratch, t_min, t_max, rounding, has_origins):  # type: ignore[no-untyped-def]
         """Write the rays of a group to packets, in float32.
 
         Origins and the lower limits of distances are not written if the packets have these already;
-        directions and the upper limits are. `t_min` and `t_max` are local.
+        directions and the upper limits are. `t_min` and `t_max` are local, `rounding` is of the
+        `CAST`.
         """
         rays = float32s(scratch)
         floats = float64s(scratch)
@@ -152,9 +171,9 @@ def _filler(width: int) -> Any:
         for lane in range(LANES):
             k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
             reach = min(t_max - floats[_ENTRY + lane] + exact.MARGIN, exact.MAX_DISTANCE)
-            rays[k + 4 * width] = np.float32(floats[_DX + lane])
-            rays[k + 5 * width] = np.float32(floats[_DY + lane])
-            rays[k + 6 * width] = np.float32(floats[_DZ + lane])
+            rays[k + 4 * width] = _on_grid(floats[_DX + lane], rounding)
+            rays[k + 5 * width] = _on_grid(floats[_DY + lane], rounding)
+            rays[k + 6 * width] = _on_grid(floats[_DZ + lane], rounding)
             rays[k + 8 * width] = np.float32(reach)
 
     return fill
@@ -164,14 +183,14 @@ _fill_4, _fill_8, _fill_16 = map(_filler, (4, 8, 16))
 
 
 @inlined
-def _fill(scratch, width, t_min, t_max, has_origins):  # type: ignore[no-untyped-def]
-    """Write a group's rays to packets of `width` rays; the origins unless `has_origins`."""
-    if width == 16:
-        _fill_16(scratch, t_min, t_max, has_origins)
-    elif width == 8:
-        _fill_8(scratch, t_min, t_max, has_origins)
+def _fill(cast, has_origins):  # type: ignore[no-untyped-def]
+    """Write a group's rays to the packets of a `CAST`; the origins unless `has_origins`."""
+    if cast.width == 16:
+        _fill_16(cast.scratch, cast.t_min, cast.t_max, cast.rounding, has_origins)
+    elif cast.width == 8:
+        _fill_8(cast.scratch, cast.t_min, cast.t_max, cast.rounding, has_origins)
     else:
-        _fill_4(scratch, t_min, t_max, has_origins)
+        _fill_4(cast.scratch, cast.t_min, cast.t_max, cast.rounding, has_origins)
 
 
 @stage
@@ -210,6 +229,7 @@ def _reset(scratch, masked):  # type: ignore[no-untyped-def]
             floats[_ROUGH + lane] = np.inf
             numbers[_INSIDE + lane] = -1
             numbers[_FIRST + lane] = numbers[_SECOND + lane] = -1
+            numbers[_SURE + lane] = 1
 
 
 @stage
@@ -246,7 +266,7 @@ def _cast_packets(cast, has_origins):  # type: ignore[no-untyped-def]
     scene = cast.scene
     width = cast.width
     numbers = int64s(scratch)
-    _fill(scratch, width, cast.t_min, cast.t_max, has_origins)
+    _fill(cast, has_origins)
     arguments = scratch + _ARGUMENTS_AT
     numbers[_FILTER] = cast.packets[0]
     if width == 16:
@@ -349,7 +369,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: C901, PL
         write_origins(cast, scratch)
         localise(cast, scratch)
         if cast.width > 1:
-            _fill(scratch, cast.width, cast.t_min, t_max, np.int64(0))
+            _fill(cast, np.int64(0))
     hit_count = 0
     for block in range(start, stop, span):
         count = min(span, stop - block)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from copy import copy
 from functools import cached_property
+from operator import index
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
@@ -13,7 +15,13 @@ from .poses import Poses
 from .rays import check_origins, unit_directions
 from .sub_rays import SubRays
 
-_MAX_STEP = 1 << 10  # more than the beams of any lidar
+GOLDEN = 0.618033988749895  # of the golden ratio: its multiples, modulo 1, are evenly spread
+_MAX_STEP = 256  # of a guess
+_SAMPLES = 384  # consecutive rows that are compared with later rows: more than `_MAX_STEP`
+# Relative differences of squared lengths that count as equal: in float64, in float32, with jitter.
+_EXACT = 1e-9
+_NEAR = 1e-3
+_ROUGH = 0.1
 
 
 class Pattern:
@@ -34,12 +42,17 @@ class Pattern:
     offsets
         (n, 2): angles across and up, radians, added to the angles of the sub-rays of each
         direction.
+    step
+        Rows from one firing of a channel to its next, that is from a ray to its neighbour along a
+        ring: the number of channels if each firing has all channels, 1 for ring after ring. None to
+        guess the step, which may fail above 256. A wrong step makes casting slower, and changes no
+        hit.
 
     Raises
     ------
     ValueError
         For a wrong shape, or a direction that is zero or not finite, or an origin that is not
-        finite.
+        finite, or a step below 1.
 
     Examples
     --------
@@ -54,7 +67,12 @@ class Pattern:
         origins: ArrayLike | None = None,
         sub_rays: SubRays | None = None,
         offsets: ArrayLike | None = None,
+        *,
+        step: int | None = None,
     ) -> None:
+        if step is not None and index(step) < 1:
+            raise ValueError(f"step is {step}; it must be at least 1, or None to guess it.")
+        self._step = None if step is None else index(step)
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
         self._origins: Floats | None = None
@@ -78,7 +96,7 @@ class Pattern:
         After its last row the pattern repeats. `offsets` (m, 2) are angles across and up of each
         beam, radians, added to the angles of its sub-rays.
         """
-        _ = self.step  # computed here for all copies: takes as long as 10,000 rays
+        _ = self.step  # guessed here for all copies: takes as long as 5,000 rays
         pattern = copy(self)
         if rows is not None:
             pattern._directions = self._directions.take(rows, axis=1, mode="wrap")
@@ -114,19 +132,10 @@ class Pattern:
 
     @cached_property
     def step(self) -> int:
-        """Rows from a ray to its neighbour along a ring: the step of least difference."""
-        rows = self._directions.shape[1]
-        steps = np.arange(1, min(rows // 32, _MAX_STEP) + 1)
-        if not len(steps):
-            return 1
-        samples = np.arange(32) * (rows // 32)
-        compared = (
-            samples[:, None] + np.array([[1], [8], [15]])[:, :, None] * steps
-        )  # (3, 32, steps)
-        cosines = np.zeros(compared.shape)
-        for axis in self._directions:
-            cosines += axis[samples][:, None] * axis[compared % rows]
-        return int(steps[np.argmax(cosines.min(axis=0).mean(axis=0))])
+        """Rows between successive firings of a channel, as given or guessed."""
+        if self._step is not None:
+            return self._step
+        return _repetition(self._directions) or _least_difference(self._directions)
 
     def shares_origin(self, poses: Poses) -> bool:
         """Return whether all rays start at a single position."""
@@ -134,3 +143,67 @@ class Pattern:
             self.sub_rays and self.sub_rays.starts is not None
         )
         return len(poses) == 1 and poses.motion is None and not own_origins
+
+
+def _repetition(directions: Floats) -> int:
+    """Return the step after which the distances between neighbouring rows are the same; 0 if none.
+
+    `directions` (3, n) are unit vectors. Where a firing has all rings, the head has turned after
+    as many rows, and all distances are the same. Where rings follow each other, those within a ring
+    are the same after a single row, but not after the length of a ring, since rings are of
+    different radius. Distances do not depend on the axis of the head. Nearness shows no step:
+    rings may be nearer to each other than the firings.
+    """
+    rows = directions.shape[1]
+    steps = min(rows // 2, _MAX_STEP)
+    samples = min(rows - 1 - steps, _SAMPLES)
+    if steps < 2:
+        return 0
+    part = directions[:, : samples + steps + 1]
+    difference = np.diff(part)
+    squared = (difference * difference).sum(axis=0)
+    first = squared[:samples]
+    deviations = np.abs(sliding_window_view(squared[1:], samples) - first)  # (steps, samples)
+
+    def equal(difference: float) -> Floats:
+        """Return the share of equal distances of each step, up to a relative difference."""
+        return np.asarray((deviations <= difference * first).mean(axis=1))
+
+    # Distances that are equal in float64 tell apart rings of nearly the same radius. In directions
+    # of float32 such distances are chance: then the share of them is reached by an earlier step.
+    for strict, loose in ((_EXACT, _NEAR), (_NEAR, _NEAR), (_ROUGH, _ROUGH)):
+        shares = equal(strict)
+        share = shares.max()
+        if share >= (0.5 if share == shares[0] else 0.9):  # short rings have many ends
+            return int((equal(loose) >= share).argmax()) + 1
+    return 0
+
+
+def _least_difference(directions: Floats) -> int:
+    """Return the step with the least angles between a row and later rows of a packet.
+
+    `directions` (3, n) are unit vectors, of which 32 rows are sampled.
+    """
+    rows = directions.shape[1]
+    steps = np.arange(1, min(rows // 32, _MAX_STEP) + 1)
+    if not len(steps):
+        return 1
+    samples = sample_rows(32, rows)
+    compared = samples[:, None] + np.array([[1], [8], [15]])[:, :, None] * steps  # (3, 32, steps)
+    cosines = np.zeros(compared.shape)
+    for axis in directions:
+        cosines += axis[samples][:, None] * axis[compared % rows]
+    return int(steps[np.argmax(cosines.min(axis=0).mean(axis=0))])
+
+
+def sample_rows(count: int, stop: int) -> Ints:
+    """Return `count` numbers from 0 to `stop`, ascending and evenly spread, at no regular step.
+
+    Rows at a regular step may all be of one ring.
+
+    Examples
+    --------
+    >>> sample_rows(5, 100).tolist()
+    [0, 23, 47, 61, 85]
+    """
+    return np.sort((np.arange(count) * GOLDEN % 1 * stop).astype(np.int64))

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
+from lidarsim.sensor.beams import Spin
 from lidarsim.sensor.models import load_sensor, model_names, read_model
 from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
+from lidarsim.sensor.sensor import Sensor
+from raybeam import Pattern
 
 READY = [name for name in model_names() if not read_model(name).needs_calibration]
 
@@ -36,6 +39,23 @@ def test_every_model_makes_a_sensor(name):
     assert (np.diff(sensor.beams.elevation) >= 0).all(), "channel 0 is the lowest"
     assert (np.diff(times[:, 0]) > 0).all() and (times >= 0).all()
     assert sensor.firings(35)[1] in (sensor.firings(35)[0] + 1, *range(10, 100_000))
+
+
+def test_models_with_rings_say_the_rays_from_one_firing_of_a_channel_to_its_next():
+    """All but prisms and lines: the same elevation again, a firing later, in the order of rows."""
+    ringed = {name: load_sensor(name) for name in READY}
+    ringed = {
+        name: sensor
+        for name, sensor in ringed.items()
+        if type(sensor) is Sensor and isinstance(sensor.head, Spin) and sensor.channels < 1_000
+    }
+    assert len(ringed) == 24
+    for name, sensor in ringed.items():
+        directions = sensor.directions(np.arange(40)).reshape(-1, 3)
+        step = sensor.ring_step
+        assert np.array_equal(directions[step:, 2], directions[:-step, 2]), name
+        assert min(k for k in range(1, step + 1) if directions[k, 2] == directions[0, 2]) == step
+        assert Pattern(directions).step == step, name  # also if it is guessed
 
 
 # Channels counted from the lowest: elevation, and azimuth offset without the turn in between.

@@ -169,3 +169,9 @@ def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch
     for one, two in ((other, fresh), (rig, Rig(scene, surveys[0], "numpy"))):
         assert pack(columns_of(list(one.cast(0, 14)))) == pack(columns_of(list(two.cast(0, 14))))
     assert other.scene.actors == (car,) and rig.scene.actors == ()
+
+
+def test_patterns_know_the_rays_from_one_firing_of_a_channel_to_its_next(scene):
+    """Also patterns of a single firing, from which it cannot be guessed."""
+    rig = Rig(scene, SURVEYS["beams with offsets"], "numpy")
+    assert [rig.pattern(0, 0, stop).step for stop in (1, 90)] == [4, 4]

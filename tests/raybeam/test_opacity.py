@@ -138,3 +138,21 @@ def test_meshes_that_share_a_mask_keep_it_once(backend):
 def test_refused(mask, uv, words):
     with pytest.raises(ValueError, match=words):
         Mesh(SQUARE, HALVES, Opacity(mask, uv))
+
+
+def test_at_an_edge_the_opaque_neighbour_stops_a_ray(backend, shapes):
+    """Rays at the edges of triangles whose masks differ; Embree may propose either triangle."""
+    vertices, faces = shapes["sphere"](12, 16)
+    rng = np.random.default_rng(6)
+    opacity = Opacity(np.array([[True, False]]), rng.random((len(faces), 3, 2)))
+    corners = vertices[faces[::3]]
+    share = rng.random((len(corners), 1))
+    directions = share * corners[:, 1] + (1 - share) * corners[:, 2]
+    want, got = (
+        RayCaster.from_instances([Instance(Mesh(vertices, faces, opacity))], name).cast(
+            [0, 0, 0], directions
+        )
+        for name in ("numpy", backend)
+    )
+    assert 0.3 < want.hit.mean() < 0.95
+    same(got, want)

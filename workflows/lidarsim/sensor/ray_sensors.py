@@ -165,6 +165,11 @@ class ListedSensor(Sensor):
     cycle: ClassVar[str] = "frame"
 
     @property
+    def ring_step(self) -> int | None:
+        """None: a list may have the rays of several channels in turn."""
+        return None
+
+    @property
     def period(self) -> int | None:
         """Number of rays in the list, after which directions repeat."""
         return len(self.rays)

@@ -232,6 +232,11 @@ class Sensor:
         return len(self.beams)
 
     @property
+    def ring_step(self) -> int | None:
+        """Rays between successive firings of a channel, for `raybeam.Pattern`; None if unknown."""
+        return self.channels
+
+    @property
     def period(self) -> int | None:
         """Number of firings after which directions and origins repeat; None without repetition."""
         return self.head.period

@@ -110,7 +110,7 @@ class Rig:
             rays = _Rays(None)
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
-                pattern = Pattern(sensor.ahead, origin)
+                pattern = Pattern(sensor.ahead, origin, step=sensor.ring_step)
                 rays = _Rays(pattern, by_head=True)
             elif repeats:
                 rays = _Rays(self._pattern_of_firings(number, 0, sensor.period or 0))
@@ -205,7 +205,7 @@ class Rig:
             origins = turned(origins.reshape(-1, 3), mount.rotation)
         if any(mount.position):
             origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
-        return Pattern(directions, origins)
+        return Pattern(directions, origins, step=carried.sensor.ring_step)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yield the returns of each group of scans.
