@@ -193,9 +193,7 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
 
 def in_unit(count, start=0):
     """Floating car data whose times are numbers of units, `count` a second."""
-    return re.sub(
-        r'time="(\d+)\.00"', lambda match: f'time="{start + int(match[1]) * count}"', FCD
-    )
+    return re.sub(r'time="(\d+)\.00"', lambda match: f'time="{start + int(match[1]) * count}"', FCD)
 
 
 @pytest.mark.parametrize(
@@ -244,9 +242,7 @@ def test_days_and_times_before_zero_of_sumo(tmp_path):
     read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", steps=36)
     (car,) = build(read).scene.actors
     assert car.trajectory.times_s.tolist() == [-1.5, 2.25]
-    read = scenario(
-        tmp_path, f"<fcd-export>{steps}</fcd-export>", {"offset_s": -90_000}, steps=36
-    )
+    read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", {"offset_s": -90_000}, steps=36)
     (car,) = build(read).scene.actors
     assert car.trajectory.times_s.tolist() == [2.25 - 90_000, 61.0]
 

@@ -229,7 +229,9 @@ class TestSurveys:
         survey = drive(MAX_STEPS / 36, 1)
         assert survey.scan_count == MAX_STEPS
         assert survey.duration_ns / 1e9 == pytest.approx(MAX_STEPS / 36, abs=0.1)
-        words = r"lasts 277778 s, and 10,000,000 .*limit.* take 27777\.8 s: give duration_s or steps"
+        words = (
+            r"lasts 277778 s, and 10,000,000 .*limit.* take 27777\.8 s: give duration_s or steps"
+        )
         with pytest.raises(LidarError, match=words):
             drive(MAX_STEPS / 36, 10)
 

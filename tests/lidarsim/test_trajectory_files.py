@@ -385,7 +385,9 @@ def test_options_of_other_formats_are_refused(load, tmp_path):
 def test_binary_files_of_times_are_named(tmp_path):
     np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()] * 2)
     (tmp_path / "times.txt").write_bytes(gzip.compress(b"0\n1\n"))
-    with pytest.raises(LidarError, match=r"times\.txt has no usable times: it is compressed by gzip"):
+    with pytest.raises(
+        LidarError, match=r"times\.txt has no usable times: it is compressed by gzip"
+    ):
         load_trajectory(tmp_path / "poses.txt", times=tmp_path / "times.txt")
 
 
