@@ -419,7 +419,7 @@ def test_a_scenario_states_the_unit_of_its_times(tmp_path):
     for actor in built.scene.actors:
         assert actor.trajectory.pose(0, 1.5e9).position[0] + built.scene.origin[0] == 1.5
     del data["actors"][1]["trajectory"]["time_unit"]
-    with pytest.raises(LidarError, match="actor 'Van': points: .* probably nanoseconds"):
+    with pytest.raises(LidarError, match=r"actor 'Van': points: .* probably nanoseconds"):
         build(Scenario.from_data(data, folder=tmp_path))
     del data["actors"][0]["trajectory"]["time_unit"]
     with pytest.raises(LidarError, match=r"actor 'Car': .*car\.tum .* probably nanoseconds"):

@@ -106,7 +106,8 @@ def colours_of(
     `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
     without names and with too many values for a legend are on a scale like numbers. Columns with
     `Column.scale` "logarithmic", such as intensities, have that scale if their values differ by
-    large factors. Velocities are blue below 0 and red above. NaN is grey, and so are points on no surface.
+    large factors. Velocities are blue below 0 and red above. NaN is grey, and so are points on no
+    surface.
     """
     if column in (RGB, NORMALS):
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
