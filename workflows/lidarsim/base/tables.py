@@ -411,11 +411,11 @@ class _ColumnReader:
             first, *other_units = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
             choice = f", or give columns: {{{quantity.name}: {cell}}}" * self.can_choose
-            choice += ", or give time_unit" * (quantity.units is SECONDS)
+            unit_option = ", or give time_unit" * (quantity.units is SECONDS)
             names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
             raise ValueError(
                 f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well"
+                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well{unit_option}"
             )
         return None
 

@@ -244,10 +244,7 @@ def _of_rows(
         return kind, PoseTable(seconds_of(rows[:, 0], timing.unit), rows[:, 1:4], rows[:, 4:])
     if timing.file is None:
         raise ValueError("KITTI's poses have no times: give their file as times")
-    try:
-        seconds = _seconds_in_file(Path(timing.file), timing.unit)
-    except ValueError as error:
-        raise ValueError(f"{timing.file} has no usable times: {message_of(error)}") from error
+    seconds = _seconds_in_file(Path(timing.file), timing.unit)
     expected = WIDTH if kind == "oxts" else 12
     if width != expected:
         raise ValueError(f"its rows have {width} numbers, not {expected}")
@@ -262,11 +259,18 @@ def _of_rows(
 
 def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
     """Return the seconds (k,) in a file of times: a number or a date in each row."""
-    text = read_text(path)
-    dates = dates_of(text)
-    if dates is None or not len(dates):
-        return seconds_of(_numbers(text, 1)[:, 0], unit)
-    return _seconds_of_dates(dates, unit)
+    try:
+        text = read_text(path)
+        dates = dates_of(text)
+        has_dates = dates is not None and len(dates) > 0
+        times = dates if has_dates else _numbers(text, 1)[:, 0]
+    except ValueError as error:
+        raise ValueError(f"{path} has no times: {message_of(error)}") from error
+    assert times is not None  # of dates, or of numbers
+    try:
+        return _seconds_of_dates(times, unit) if has_dates else seconds_of(times, unit)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
