@@ -204,7 +204,8 @@ pool: {backend: numpy, gpu: 1}
 
 
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.parametrize("kept", quick(("folder",), DATA_SETS))
+@pytest.mark.slow(keep=("folder",))
+@pytest.mark.parametrize("kept", DATA_SETS)
 def test_a_campaign_has_the_same_bytes_twice(slots, tmp_path, monkeypatch, kept):
     """In other folders, by other paths and with other workers; two jobs fail with a message."""
     for name in ("here", "elsewhere/far"):
