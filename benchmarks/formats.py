@@ -6,8 +6,8 @@ Prints millions of points a second of processor time, and the most memory in MB 
 the mapped cloud. The scripts write neither poses nor labels, and read the whole cloud at once.
 """
 
+import argparse
 import multiprocessing
-import sys
 import tempfile
 import threading
 import time
@@ -171,4 +171,6 @@ def main(points=10_000_000):
 
 
 if __name__ == "__main__":
-    main(*(int(float(number)) for number in sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("points", type=float, nargs="?", default=1e7, help="points of the cloud")
+    main(int(parser.parse_args().points))

@@ -16,7 +16,7 @@ The ratio is the median of the ratios of all rounds. Formats whose package is no
 out.
 """
 
-import sys
+import argparse
 import tempfile
 import time
 from functools import partial
@@ -130,4 +130,9 @@ def main(*names):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("formats", metavar="FORMAT", nargs="*", help="by default all formats")
+    chosen = parser.parse_args().formats
+    if unknown := {*chosen} - {peer.__name__ for peer in PEERS}:
+        parser.error(f"no loader of {', '.join(unknown)}")
+    main(*chosen)

@@ -4,6 +4,7 @@ import html
 import json
 import re
 import tracemalloc
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from lidarpool import LidarError
 from lidarpool.datasets.figures import Figures
+from lidarpool.datasets.job_seconds import read_seconds
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_report import write_card
 from lidarsim.base.storage import Storage
@@ -118,7 +120,7 @@ def test_page_shows_what_failed_and_why(card):
     assert page.startswith("<!DOCTYPE html>")
     assert "1 failed job" in page and "no &lt;b&gt;surface&lt;/b&gt; | in range" in page
     assert "1 job of the description is not in the table" in page
-    assert page.count("<svg viewBox") == 2 and "var(--picture-ink" in page
+    assert page.count("<svg viewBox") == 3 and "var(--picture-ink" in page
     assert "campaign.yaml --retry-failed" in page
 
 
@@ -130,6 +132,19 @@ def test_same_jobs_make_the_same_files(card, tmp_path):
     write(Storage.at(tmp_path, durable=False), ROWS)
     for name in ("report.html", "report.json", "splits/train.txt", "pictures/varied.png"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_casting_times_are_in_the_report_alone(card, tmp_path):
+    folder, _ = card
+    slower = [replace(row, seconds=2 * row.seconds + 1) for row in ROWS]
+    place = Storage.at(tmp_path, durable=False)
+    write(place, slower, Page((80, 40)))
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    changed = {
+        name for name in names if (tmp_path / name).read_bytes() != (folder / name).read_bytes()
+    }
+    assert changed == {"report.html", "report.csv", "report.json"}
+    assert read_seconds(place) == {row.number: row.seconds for row in slower}
 
 
 @pytest.mark.extended

@@ -305,6 +305,8 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     (tmp_path / "uncalibrated" / "calib.txt").write_text("Tr: x 0 0 0 0 1 0 0 0 0 1 0\n")
     shutil.copytree(tmp_path / "cut", tmp_path / "bad")
     (tmp_path / "bad" / "poses.txt").write_text(2 * "1 0 0 0 0 1 0 0 0 0 1\n")
+    shutil.copytree(folder / "kitti" / "sequences" / "00", tmp_path / "long")
+    (tmp_path / "long" / "times.txt").write_text("0\n100000000\n200000000\n")
     (tmp_path / "cut.bin").write_bytes(b"123")
     (tmp_path / "cut.tar").write_bytes(b"123")
     (tmp_path / "cut.parquet").write_bytes(b"123")
@@ -325,6 +327,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("cut", "poses.txt has 1 rows for 3 files"),
         ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
         ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
+        ("long", "they are probably nanoseconds; write seconds into times.txt"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),

@@ -218,6 +218,19 @@ def test_moving_objects_of_ground_truth_are_actors(tmp_path, name):
     assert any("1 stationary object left out" in note for note in built.findings.notes)
 
 
+def test_timestamps_that_cannot_be_seconds_need_their_unit(tmp_path):
+    messages = list(truths())
+    for second, truth in enumerate(messages):
+        truth.timestamp.seconds = 1_790_000_000_000 + 1000 * second
+    written(tmp_path / "town.osi", messages)
+    with pytest.raises(LidarError, match="they are probably milliseconds; give time_unit: ms"):
+        build(scenario(tmp_path, "town.osi"))
+    timed = {"time_unit": "ms", "offset_s": -1_790_000_000}
+    built = build(scenario(tmp_path, "town.osi", **timed))
+    positions, _ = built.scene.actors[0].trajectory.poses(0, np.array([1.5e9]))
+    np.testing.assert_allclose(positions + built.scene.origin, [[15, 0, 0]], atol=1e-9)
+
+
 def test_shapes_of_traffic_and_the_host_are_a_choice(tmp_path):
     written(tmp_path / "town.osi", truths())
     vehicles = [{"types": "b*", "name": "Bus", "box": [10, 3, 4], "class": 13}]

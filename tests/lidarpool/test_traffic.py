@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -190,6 +191,62 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
     assert len(build(packed).scene.actors) == 3
 
 
+def in_unit(count, start=0):
+    """Floating car data whose times are numbers of units, `count` a second."""
+    return re.sub(r'time="(\d+)\.00"', lambda match: f'time="{start + int(match[1]) * count}"', FCD)
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "count", "start_s"),
+    [
+        ("ns", "nanoseconds", 10**9, 1_700_000_000),
+        ("ns", "nanoseconds", 10**9, 0),
+        ("ms", "milliseconds", 1000, 1_700_000_000),
+    ],
+)
+def test_times_of_traffic_that_cannot_be_seconds_need_their_unit(
+    tmp_path, unit, name, count, start_s
+):
+    text = in_unit(count, start_s * count)
+    with pytest.raises(LidarError, match=f"they are probably {name}; give time_unit: {unit}"):
+        build(scenario(tmp_path, text))
+    timed = {"time_unit": unit, "offset_s": -start_s}
+    expected = [actor.trajectory for actor in build(scenario(tmp_path)).scene.actors]
+    for actor, track in zip(
+        build(scenario(tmp_path, text, timed)).scene.actors, expected, strict=True
+    ):
+        assert actor.trajectory.times_s.tolist() == track.times_s.tolist()
+        assert np.allclose(actor.trajectory.positions, track.positions)
+
+
+@pytest.mark.parametrize("shown", ["{:02}:{:02}:{:02}.00", "0:{:02}:{:02}:{:02}", "{}:{:02}:{:02}"])
+def test_human_readable_times_of_sumo(tmp_path, shown):
+    def readable(match):
+        minutes, seconds = divmod(int(match[1]) + 3598, 60)
+        return f'time="{shown.format(*divmod(minutes, 60), seconds)}"'
+
+    text = re.sub(r'time="(\d+)\.00"', readable, FCD)
+    plain = build(scenario(tmp_path)).scene
+    read = build(scenario(tmp_path, text, {"offset_s": -3598})).scene
+    assert len(plain.actors) == 3 and fingerprint(read) == fingerprint(plain)
+    with pytest.raises(LidarError, match="hours, minutes and seconds: leave out time_unit"):
+        build(scenario(tmp_path, text, {"time_unit": "s"}))
+
+
+def test_days_and_times_before_zero_of_sumo(tmp_path):
+    rows = '<vehicle id="c" x="{}" y="5" angle="90" type="car"/>'
+    times = ("-00:00:01.50", "00:00:02.25", "1:01:01:01.00", "12:00:00:00.00")
+    steps = "".join(
+        f'<timestep time="{time}">{rows.format(x)}</timestep>' for x, time in enumerate(times)
+    )
+    read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", steps=36)
+    (car,) = build(read).scene.actors
+    assert car.trajectory.times_s.tolist() == [-1.5, 2.25]
+    read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", {"offset_s": -90_000}, steps=36)
+    (car,) = build(read).scene.actors
+    assert car.trajectory.times_s.tolist() == [2.25 - 90_000, 61.0]
+
+
 RAMP = "o Ramp\nv 0 0 0\nv 18.5 0 1.85\nv 18.5 9 1.85\nv 0 9 0\nf 1 2 3\nf 1 3 4\n"
 UPHILL = np.array([10, 0, 1]) / 101**0.5
 
@@ -281,7 +338,8 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
             FCD.replace('x="40"', 'x="40" heading="3"'),
             "vehicle has the attribute 'heading', which --fcd-output does not define: give ignore",
         ),
-        (FCD.replace('x="40"', 'x="east"'), "could not convert string to float: 'east'"),
+        (FCD.replace('x="40"', 'x="east"'), "vehicle 'a.1' has the x 'east'; give a number"),
+        (FCD.replace('time="3.00"', 'time="3:00"'), "a timestep has the time '3:00'; give a num"),
         (FCD.replace('angle="45"', ""), "'angle' is missing"),
         (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares an XML entity"),
     ],

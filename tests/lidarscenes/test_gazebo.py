@@ -380,6 +380,19 @@ def test_actors_follow_their_waypoints(tmp_path):
     assert not actors and bounds(objects["a"])[0] == [1, 2, 3]
 
 
+def test_a_loop_that_ends_early_is_noted(tmp_path):
+    write(tmp_path / "skin.dae", DAE)
+    waypoints = "".join(
+        f"<waypoint><time>{k / 100}</time><pose>{k} 0 1 0 0 0</pose></waypoint>" for k in range(101)
+    )
+    script = f"<script><trajectory id='0' type='walk'>{waypoints}</trajectory></script>"
+    skin = "<skin><filename>skin.dae</filename></skin>"
+    actor = f"<actor name='walker'>{skin}{script}</actor>"
+    _, (walker,), notes = load(tmp_path, world(model("g", link()), actor))
+    assert walker.trajectory.times_s[-1] == 49  # 5,000 waypoints at most
+    assert any("walker, with so many waypoints that it loops for 49 s alone" in n for n in notes)
+
+
 def test_skins_of_actors_are_at_rest(tmp_path):
     matrix = "1 0 0 0  0 1 0 0  0 0 1 0.5  0 0 0 1"
     skin = f"<skin source='#g'><bind_shape_matrix>{matrix}</bind_shape_matrix></skin>"

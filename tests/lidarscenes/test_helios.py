@@ -406,6 +406,22 @@ def test_a_trajectory_of_its_own_is_followed(imported):
     assert np.allclose(fired(of, 1, [0])[0, 0], platform @ about(X, 20) @ Y)
 
 
+def test_times_of_a_trajectory_must_be_seconds(imported):
+    inside = (
+        '<leg><platformSettings trajectory="parts/way.trj"/>'
+        '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
+    )
+    rows = "".join(f"{1403636580 + t}000000000,0,0,90,{t},2,30\n" for t in range(3))
+    words = r"way\.trj is not a usable .* probably nanoseconds; HELIOS\+\+ expects seconds"
+    with pytest.raises(LidarError, match=words):
+        imported(
+            scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
+            inside,
+            platform="interpolated",
+            parts={"way.trj": rows},
+        )
+
+
 @pytest.mark.parametrize(
     ("names", "words"),
     [

@@ -333,11 +333,18 @@ def test_tables_of_joints(tmp_path):
         ("pan,slide\n0,1\n", "no column 'time_s'"),
         ("time,pan\n0,1\n", "call it time_s, in seconds; time_ms or time_us"),
         ("time_s,pan\n0,nan\n", "has 'nan' in line 2"),
+        ("time_s,pan\n0,0\n50000000,1\n", "probably nanoseconds; give time_unit: ns"),
         ("time_s,pan\n1,0\n0,0\n", "must be finite, and ascend"),
     ):
         table.write_text(text)
         with pytest.raises(LidarError, match=words):
             robot.actors(joints=table)
+    table.write_text("time_s,pan\n0,0\n1000000000,1\n")
+    (*_, tip) = robot.actors(joints=table, time_unit="ns")
+    assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
+    assert robot.path("tip", joints=table, time_unit="ms").duration_ns == 1e15
+    with pytest.raises(LidarError, match="time_unit is of a file of joints"):
+        robot.actors(joints={"pan": 1}, time_unit="ns")
     for given, words in (
         ({"pam": 1}, "no joint 'pam' that moves. Did you mean 'pan'"),
         ({"pan": [0, 1]}, "one for each time_s"),

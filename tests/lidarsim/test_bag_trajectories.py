@@ -144,6 +144,16 @@ def test_topics_of_poses(bag, message):
     assert_same(load_trajectory(path, topic="/state"))
 
 
+def test_stamps_of_several_clocks_are_refused(bag):
+    messages = [pose_stamped(row) for row in ROWS]
+    messages[3].header.stamp.sec = 12  # since the start of a program
+    path = bag(state=messages)
+    words = r"go from 12\.3 to 1\.7e\+09 s, which are 53\.8 years: correct those that are far from"
+    with pytest.raises(LidarError, match=words):
+        load_trajectory(path)
+    assert load_trajectory(path, time_unit="s").times_s[0] == 12.3
+
+
 def test_several_topics_have_to_be_chosen(bag):
     path = bag(
         odom=[odometry(row) for row in ROWS],

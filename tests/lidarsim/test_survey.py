@@ -16,6 +16,7 @@ from tests.shapes import Cart
 
 from lidarpool import Beams, LidarError, Mounted, Pose, Sensor, Spin, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
+from lidarsim.sensor.survey import MAX_STEPS
 from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
 
 RNG = np.random.default_rng(5)
@@ -218,6 +219,21 @@ class TestSurveys:
         assert survey.scan_count == 36 * 10 + 18
         assert np.isclose(survey.pose(36).position[0], 2.0)
         assert Survey(Sensor.grid(), steps=5, trajectory=self.track).scan_count == 5
+
+    def test_a_trajectory_is_never_cut(self):
+        def drive(seconds, rate_hz):
+            track = Track([0, seconds], [[0, 0, 1], [seconds, 0, 1]])
+            return Survey(Sensor.grid(rate_hz=rate_hz), trajectory=track)
+
+        # A time step takes 1/36 of a revolution, and the last firing starts within the last one.
+        survey = drive(MAX_STEPS / 36, 1)
+        assert survey.scan_count == MAX_STEPS
+        assert survey.duration_ns / 1e9 == pytest.approx(MAX_STEPS / 36, abs=0.1)
+        words = (
+            r"lasts 277778 s, and 10,000,000 .*limit.* take 27777\.8 s: give duration_s or steps"
+        )
+        with pytest.raises(LidarError, match=words):
+            drive(MAX_STEPS / 36, 10)
 
     def test_no_more_than_it_lasts(self):
         with pytest.raises(LidarError, match=r"steps 400 take until 1.111.* s, 0.061.* s less"):

@@ -144,6 +144,86 @@ def test_times_have_a_unit(load):
     assert track.positions.tolist() == [[0, 0, 1], [10, 0, 1]]
 
 
+ROW = "0 0 1 0 0 0 1"  # of TUM, without its time
+EPOCH_S = 1403636580
+
+
+@pytest.mark.parametrize(
+    ("times", "name", "unit"),
+    [
+        ((1403636580838555648, 1403636581338555648, 1403636582838555648), "nanoseconds", "ns"),
+        ((1403636580838555, 1403636581338555, 1403636582838555), "microseconds", "us"),
+        ((1403636580838, 1403636581338, 1403636582838), "milliseconds", "ms"),
+        ((0, 500_000_000, 2_000_000_000), "nanoseconds", "ns"),  # since the start of a recording
+        ((1_000_000_000_000, 1_000_500_000_000, 1_002_000_000_000), "nanoseconds", "ns"),
+        ((1403636580000000, 1403636580000000 + 10_000_000, 1403636600000000), "microseconds", "us"),
+    ],
+)
+@pytest.mark.parametrize("form", ["tum", "csv", "kitti"])
+def test_times_that_are_too_large_for_seconds_need_their_unit(tmp_path, form, times, name, unit):
+    options = {}
+    path = tmp_path / f"drive.{form}"
+    if form == "kitti":
+        np.savetxt(path, [np.eye(4)[:3].ravel()] * 3)
+        (tmp_path / "times.txt").write_text("\n".join(map(str, times)))
+        options["times"] = tmp_path / "times.txt"
+    elif form == "tum":
+        path.write_text("\n".join(f"{time} {ROW}" for time in times))
+    else:
+        path.write_text("\n".join(["time_s,x,y,z", *(f"{time},0,0,1" for time in times)]))
+    words = rf"they are probably {name}; give time_unit: {unit}, or s if they are right"
+    with pytest.raises(LidarError, match=words) as raised:
+        load_trajectory(path, **options)
+    assert len(str(raised.value).splitlines()) == 1
+    track = load_trajectory(path, time_unit=unit, **options)
+    count = {"ns": 1e9, "us": 1e6, "ms": 1e3}[unit]
+    assert np.allclose(track.times_s, np.array(times) / count, rtol=0, atol=1e-6)
+    seconds = load_trajectory(path, time_unit="s", **options)
+    assert seconds.times_s.tolist() == [float(time) for time in times]
+
+
+def test_the_unit_of_a_header_is_doubted_as_well(load):
+    nanoseconds = [f"{EPOCH_S + k}000000000,{x},0,1" for k, x in ((0, 0), (1, 10))]
+    for column in ("timestamp [ms]", "time_us", "t_s"):
+        with pytest.raises(LidarError, match="they are probably nanoseconds; give time_unit: ns"):
+            load(head=f"{column},x,y,z", rows=nanoseconds)
+        track = load(head=f"{column},x,y,z", rows=nanoseconds, time_unit="ns")
+        assert track.times_s.tolist() == [EPOCH_S, EPOCH_S + 1]
+    for head, options in (("time,x,y,z", {}), ("stamp_s,x,y,z", {"columns": {"time": "stamp_s"}})):
+        track = load(head=head, rows=nanoseconds, time_unit="ns", **options)
+        assert track.times_s.tolist() == [EPOCH_S, EPOCH_S + 1]
+    with pytest.raises(LidarError, match=r"'time' has no unit.* read as well, or give time_unit"):
+        load(head="time,x,y,z", rows=nanoseconds)
+    with pytest.raises(LidarError, match="'time' as time_s, and time_unit is ns: give one of the"):
+        load(head="time,x,y,z", rows=nanoseconds, columns={"time_s": "time"}, time_unit="ns")
+
+
+def test_a_span_of_a_year_is_doubted(load):
+    year = 366 * 86400
+    for first, last in ((0, year), (-year, 0), (1.7e9, 1.7e9 + year), (-9e10, -9e10 + 1)):
+        track = load(rows=[f"{first},0,0,1", f"{last},1,0,1"])
+        assert track.times_s.tolist() == [first, last]
+    for first, last in ((0, year + 1), (-1e11, -1e11 + 1), (1e11, 1e11 + 1)):
+        rows = [f"{first},0,0,1", f"{last},1,0,1"]
+        with pytest.raises(LidarError, match="its times go from"):
+            load(rows=rows)
+        assert load(rows=rows, time_unit="s").times_s.tolist() == [first, last]
+    stray = [f"{time},{k},0,1" for k, time in enumerate((0, 1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2))]
+    with pytest.raises(LidarError, match=r"are 53\.8 years: correct those that are far from the"):
+        load(rows=stray)
+
+
+def test_times_of_kitti_may_be_dates(tmp_path):
+    np.savetxt(tmp_path / "poses.txt", [np.eye(4)[:3].ravel()] * 2)
+    dates = ["2011-09-26 13:02:25.964389445", "2011-09-26 13:02:26.067690100"]
+    (tmp_path / "timestamps.txt").write_text("\n".join(dates))
+    options = {"times": tmp_path / "timestamps.txt"}
+    track = load_trajectory(tmp_path / "poses.txt", **options)
+    assert np.allclose(track.times_s, [1317042145.964389445, 1317042146.0676901], atol=1e-6)
+    with pytest.raises(LidarError, match="its times are dates: leave out time_unit"):
+        load_trajectory(tmp_path / "poses.txt", time_unit="s", **options)
+
+
 EUROC = (
     "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
     "q_RS_z [], v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], "
@@ -242,6 +322,10 @@ def test_oxts_that_are_not_whole(oxts):
     with pytest.raises(LidarError, match=r"0000000001\.txt has 3 numbers, not 30"):
         load_trajectory(oxts)
     (oxts / "data" / "0000000001.txt").unlink()
+    with pytest.raises(LidarError, match="its times are dates: leave out time_unit"):
+        (oxts / "data" / "0000000003.txt").write_text(" ".join(map(str, OXTS)))
+        load_trajectory(oxts, time_unit="s")
+    (oxts / "data" / "0000000003.txt").unlink()
     with pytest.raises(LidarError, match=r"2 files of data, and timestamps\.txt 3 times"):
         load_trajectory(oxts)
     (oxts / "timestamps.txt").unlink()
@@ -311,3 +395,30 @@ def test_a_scenario_depends_on_the_files_of_a_folder(oxts, tmp_path):
     names = [file.name for file in Scenario.load(path).files]
     assert names == [f"{number:010}.txt" for number in range(3)] + ["timestamps.txt"]
     assert np.isclose(build(Scenario.load(path)).job().survey.pose(0).position[2], 12.8)
+
+
+def test_a_scenario_states_the_unit_of_its_times(tmp_path):
+    for name, start in (("drive.tum", 1403636580), ("car.tum", 1403636580)):
+        rows = [f"{(start + k) * 10**9} {k} 0 0 0 0 0 1" for k in range(3)]
+        (tmp_path / name).write_text("\n".join(rows))
+    unit = {"time_unit": "ns"}
+    points = [{"time_s": (1403636580 + k) * 10**9, "position": [k, 9, 0]} for k in range(3)]
+    data = {
+        "scene": {"ground": {}},
+        "sensor": "velodyne/vlp16",
+        "trajectory": {"file": "drive.tum", **unit},
+        "actors": [
+            {"name": "Car", "box": [4, 2, 1], "trajectory": {"file": "car.tum", **unit}},
+            {"name": "Van", "box": [4, 2, 1], "trajectory": {"points": points, **unit}},
+        ],
+    }
+    built = build(Scenario.from_data(data, folder=tmp_path))
+    assert built.job().survey.path.duration_ns == 2e9
+    for actor in built.scene.actors:
+        assert actor.trajectory.pose(0, 1.5e9).position[0] + built.scene.origin[0] == 1.5
+    del data["actors"][1]["trajectory"]["time_unit"]
+    with pytest.raises(LidarError, match=r"actor 'Van': points: .* probably nanoseconds"):
+        build(Scenario.from_data(data, folder=tmp_path))
+    del data["actors"][0]["trajectory"]["time_unit"]
+    with pytest.raises(LidarError, match=r"actor 'Car': .*car\.tum .* probably nanoseconds"):
+        build(Scenario.from_data(data, folder=tmp_path))

@@ -166,10 +166,11 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     save_cloud(Cloud(positions, columns, [wet]), result / "cloud.ply")
     figures = []
     monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
-    for name in ("z", "wetness", "object", "ring"):
+    for name in ("z", "wetness", "object", "ring", "x", "y"):
         plot(result, "--only", "cloud", "--colour", name, *SMALL)
     assert [figure.axes[0].get_ylabel() for figure in figures[:2]] == ["z (m)", "wetness (%)"]
-    keys = [[t.get_text() for t in figure.legends[0].get_texts()] for figure in figures[2:]]
+    assert [figure.axes[0].get_ylabel() for figure in figures[4:]] == ["x (m)", "y (m)"]
+    keys = [[t.get_text() for t in figure.legends[0].get_texts()] for figure in figures[2:4]]
     assert [key[0] for key in keys] == ["a\ufffd", "channel 0"]
     with pytest.raises(LidarError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
         plot(result, "--only", "cloud", "--colour", "wettness")

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import html
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 from tests.shapes import block, quad
 
@@ -19,10 +20,12 @@ from lidarpool import Cloud, LidarError
 from lidarpool.plan import Planning, best, run_trial
 from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
+from lidarsim.columns.table import AXES, TABLE, Column, X, Z
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
+from lidarview.render.colouring import TURBO, colours_of
 from lidarview.render.hit_density import hit_density
 from lidarview.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
 from lidarview.render.shot import GROUND, SKY, take_shot
@@ -147,6 +150,61 @@ def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
     red, green, blue = np.moveaxis(image, -1, 0)
     assert ((blue > red + 60) & (blue > green)).sum() > 10  # low
     assert ((green > red + 60) & (green > blue + 60)).sum() > 10
+
+
+ENERGIES = {"intensity", "signal", "amplitude"}
+OF_FACTORS = np.geomspace(1, 1000, 999)  # most are small, and a few are large
+
+
+@pytest.mark.parametrize("column", [*TABLE.values(), Column("a", "float32", "", "")], ids=str)
+def test_only_energies_have_a_logarithmic_scale(column):
+    values = OF_FACTORS.clip(max=255) if column.dtype == "uint8" else OF_FACTORS
+    colouring = colours_of(values.astype(column.dtype), column)
+    assert colouring.logarithmic == (column.name in ENERGIES)
+    assert colouring.logarithmic == (column.scale == "logarithmic")
+
+
+def test_half_of_the_colours_are_for_half_of_the_heights():
+    heights = np.append(np.full(9000, 0.1), np.linspace(0.1, 20.1, 1001))
+    for column in (Z, X, TABLE["origin_z"], TABLE["range"]):
+        colouring = colours_of(heights, column)
+        lower, upper = colouring.limits
+        (middle,) = colouring.paint(np.array([(lower + upper) / 2]))
+        assert np.array_equal(middle, TURBO[127])
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "marks"),
+    [
+        (496.985, 497.015, {"496.990", "497.000", "497.010"}),
+        (0, 99_999, {"0", "20,000", "80,000"}),
+        (-1, 1, {"−1.00", "0.00", "0.75"}),
+        (5_400_000, 5_400_001, {"5,400,000.0", "5,400,000.2"}),
+    ],
+)
+def test_numbers_beside_the_colours_are_whole(lower, upper, marks, scene, shot):
+    points = scene.vertices.copy()
+    points[:, 0] = np.linspace(lower, upper, len(points))
+    figure = draw_cloud(shot, Cloud(points, {}), len(points), X).figure
+    figure.draw_without_rendering()
+    axis = figure.axes[0].yaxis
+    assert marks <= {text.get_text() for text in axis.get_ticklabels()}
+    assert not axis.get_offset_text().get_text()
+    assert figure.axes[0].get_ylabel() == "x (m)"
+
+
+@pytest.mark.parametrize("name", ["z", "amplitude", "normal_x", "triangle", "cause", "signal"])
+def test_words_of_a_column_are_within_the_picture(name, scene, shot):
+    column = TABLE[name]
+    values = np.linspace(0, 250, len(scene.vertices)).astype(column.dtype)
+    columns = {} if column in AXES else {column.name: values}
+    figure = draw_cloud(shot, Cloud(scene.vertices, columns), len(values), column).figure
+    figure.draw_without_rendering()
+    texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+    for text in texts:
+        box_px = text.get_window_extent()
+        assert figure.bbox.x0 <= box_px.x0 and box_px.x1 <= figure.bbox.x1, text.get_text()
+        assert figure.bbox.y0 <= box_px.y0 and box_px.y1 <= figure.bbox.y1, text.get_text()
 
 
 @pytest.mark.extended(every=5)

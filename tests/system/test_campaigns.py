@@ -84,9 +84,16 @@ def files(tmp_path: Path) -> Path:
 
 
 def bytes_of(dataset: Path) -> dict[str, bytes]:
-    """Files of the jobs of a data set, and nothing that depends on time."""
-    found = [path for folder in ("jobs", ".jobs") for path in (dataset / folder).rglob("*")]
-    return {str(p.relative_to(dataset)): p.read_bytes() for p in found if p.is_file()}
+    """Bytes of the files of the jobs of a data set, and of its table of jobs if there is one."""
+    names = re.compile(r"\.?jobs/|jobs\.")
+    return {name: data for name, data in all_bytes_of(dataset).items() if names.match(name)}
+
+
+def all_bytes_of(dataset: Path) -> dict[str, bytes]:
+    """Bytes of each file of a data set, but of its report and of its unfinished run."""
+    paths = {str(path.relative_to(dataset)): path for path in dataset.rglob("*") if path.is_file()}
+    of_run = re.compile(r"run/|report\.(html|json|csv)$")
+    return {name: path.read_bytes() for name, path in paths.items() if not of_run.match(name)}
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +180,54 @@ def test_any_number_of_workers_gives_the_same_bytes(files, whole):
     assert scans["export"] == scans["collect"] == 6 * 45
     assert bytes_of(files / "ds") == whole
     assert not (files / "ds" / "run").exists()
+
+
+TWICE = """
+base: parts/base.yaml
+count: 5
+seed: 2
+vary:
+  noise.range_m: {uniform: [0.001, 0.05]}
+  trajectory: {each: [way.tum, way.tum, cut.tum]}
+  actors.0.class: {choice: [3, 4]}
+keep: FORMAT
+splits: {train: 0.5, test: 0.5}
+"""
+TWICE_BASE = """
+trajectory: way.tum
+sensors: {roof: {model: velodyne/vlp16}, nose: {model: velodyne/vlp16, mount: [1, 0, 0]}}
+actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
+cloud: {keep_every: 1, columns: [class, time, intensity]}
+planning: {enabled: false}
+pool: {backend: numpy, gpu: 1}
+"""
+
+
+@pytest.mark.usefixtures("pictures")
+@pytest.mark.slow(keep=("folder",))
+@pytest.mark.parametrize("kept", DATA_SETS)
+def test_a_campaign_has_the_same_bytes_twice(slots, tmp_path, monkeypatch, kept):
+    """In other folders, by other paths and with other workers; two jobs fail with a message."""
+    for name in ("here", "elsewhere/far"):
+        parts = tmp_path / name / "parts"
+        parts.mkdir(parents=True)
+        (parts / "base.yaml").write_text(TWICE_BASE)
+        (parts / "way.tum").write_text("0 0 0 1 0 0 0 1\n0.1 1 0 1 0 0 0 1\n")
+        (parts / "cut.tum").write_text("0 0 0 1\n")
+        (parts.parent / "c.yaml").write_text(TWICE.replace("FORMAT", kept))
+    here = tmp_path / "here"
+    with Client(slots, set_as_default=False) as client:
+        run = Campaign.load(here / "c.yaml").run(here / "ds", client=client)
+    assert [row.number for row in run.failed] == [2] and run.done == 4
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    many = ({"GPU": 1}, {"GPU": 2, "A": 1}, {"LIDAR": 5}, {"LIDAR": 2, "A": 1})
+    with thread_cluster(*many) as cluster, Client(cluster, set_as_default=False) as client:
+        Campaign.load("far/c.yaml").run("ds", client=client)
+    first = all_bytes_of(here / "ds")
+    assert all_bytes_of(tmp_path / "elsewhere" / "ds") == first
+    assert {"jobs.csv", "jobs.parquet", "dataset.json", "campaign.json"} <= first.keys()
+    assert {"README.md", "splits/train.txt", "pictures/results.png"} <= first.keys()
+    assert b"c.yaml: job 2: parts/cut.tum is not a usable trajectory" in first["jobs.csv"]
 
 
 # -- jobs that fail -------------------------------------------------------------------------------
@@ -336,7 +391,8 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert "new model, 10 Hz; old model, 10 Hz" in (tmp_path / "ds" / "README.md").read_text()
     assert set(made) <= {0, 2}  # the first says which values there are
     after = bytes_of(tmp_path / "ds")
-    before.pop(".jobs/0002.json")  # said that the job had failed
+    for name in (".jobs/0002.json", "jobs.csv", "jobs.parquet"):  # said that the job had failed
+        before.pop(name)
     assert before.items() <= after.items() and len(after) > len(before)
     assert not (tmp_path / "ds" / "run").exists()
     assert campaign.run(tmp_path / "ds", client=client, retry_failed=True).done == 4
@@ -672,7 +728,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     assert len(other.run(ds, client=client, fresh=True, overwrite=True).failed) == 1
     assert {name.split("/")[0] for name in all_of(ds)} == {
         "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
-        "README.md", "report.html", "report.json", "pictures",
+        "README.md", "report.html", "report.csv", "report.json", "pictures",
     }  # fmt: skip
     with pytest.raises(LidarError, match="holds a finished data set"):
         other.run(ds, client=client, fresh=True)

@@ -4,19 +4,22 @@ What cannot run says so in a comment before it, `<!-- not run: the reason -->`; 
 can be looked at without running it is. Files, links and tests that documents name exist.
 """
 
+import argparse
 import ast
 import doctest
 import importlib.util
+import inspect
 import re
 import runpy
 import shlex
 import subprocess
 import sys
 import tomllib
+import warnings
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
@@ -30,7 +33,12 @@ import yaml
 from distributed.cli import dask_scheduler, dask_worker
 from tests.clusters import import_jobqueue
 
+import lidarpool
 import lidarpool.run.cluster.cluster
+import lidarsim
+import lidarsim.packets
+import poolpart
+import raybeam
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.datasets.dataset import DATA_SETS
@@ -40,6 +48,8 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.sensor.models import SensorModel, model_names, read_model
 
@@ -195,7 +205,9 @@ def look(words: list[str]) -> bool:
         case ["make", target, *_]:
             assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
         case ["python" | "python3", "-m", module, *_]:
-            assert importlib.util.find_spec(module), module
+            if options_of_module(module) is not None:
+                arguments = words[words.index(module) + 1 :]
+                parser_of(module).parse_args(arguments)  # SystemExit if they are wrong
         case ["pip", "install", *arguments]:  # pip takes an extra that there is not
             project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
             extras = re.findall(r"\[(\w+)\]", " ".join(arguments))
@@ -207,6 +219,211 @@ def look(words: list[str]) -> bool:
     for word in words:
         assert not word.startswith("examples/") or (ROOT / word).exists(), word
     return True
+
+
+# Pages on which each command and option must exist. Changelogs also name what there was.
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *(ROOT / name for name in ("benchmarks/README.md", "kernels/README.md", "scheduler/README.md")),
+    *DOCUMENTS[1:],
+]
+PAGES.remove(ROOT / "CHANGELOG.md")
+_FENCED = re.compile(r"^```.*?^```", re.M | re.S)
+_INLINE = re.compile(r"(?<!`)(`+)(?!`)(.+?)(?<!`)\1(?!`)", re.S)
+# Options of other programs, {option: program}, that pages name without the program.
+OF_OTHERS = {
+    "--array": "sbatch",
+    "--human-readable-time": "sumo",
+    "--fcd-output": "sumo",
+    "--fcd-output.geo": "sumo",
+    "--step-length": "sumo",
+    "--remap": "ros2 run",
+    "--writeWaveform": "helios",
+    "--seed": "helios",
+}
+# Single words of code before a verb that are neither commands nor names of this project.
+OTHER_WORDS = {"lint-imports", "json", "frame"}
+
+
+def commands_of(group: click.Command, name: tuple[str, ...] = ()) -> Iterator[Any]:
+    """Yield the words and the command of a group and all commands in it."""
+    yield name, group
+    if isinstance(group, click.Group):
+        for word in group.list_commands(click.Context(group)):
+            yield from commands_of(group.commands[word], (*name, word))
+
+
+COMMANDS = dict(commands_of(cli))
+
+
+def options_of(command: click.Command) -> set[str]:
+    """Spellings of the options of a command."""
+    flags = {flag for entry in command.params for flag in (*entry.opts, *entry.secondary_opts)}
+    return flags | {"--help", "-h"}
+
+
+class Asked(BaseException):
+    """Raised by a parser of arguments in place of parsing, so that its program ends."""
+
+
+@cache
+def parser_of(module: str) -> argparse.ArgumentParser:
+    """The parser of arguments of a program that is run as a module."""
+
+    def ask(parser: argparse.ArgumentParser, *_: object) -> None:
+        raise Asked(parser)
+
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a test has perhaps imported the module
+        patch.setattr(argparse.ArgumentParser, "parse_args", ask)
+        with pytest.raises(Asked) as asked:
+            runpy.run_module(module, run_name="__main__")
+    parser = asked.value.args[0]
+    assert isinstance(parser, argparse.ArgumentParser)
+    return parser
+
+
+def options_of_module(module: str) -> set[str] | None:
+    """Options of a program of this repository that is run as a module; None for others."""
+    spec = importlib.util.find_spec(module)
+    assert spec is not None, module
+    if module.split(".")[0] not in ("benchmarks", "docs", "tests"):
+        return None
+    return {*parser_of(module)._option_string_actions, "-m"}
+
+
+def options_named_with(words: list[str]) -> set[str] | None:
+    """Options of the command that words begin with; None for a program that is not known here."""
+    match words:
+        case ["lidarpool", *arguments]:
+            name: tuple[str, ...] = ()
+            for word in arguments:
+                if (*name, word) not in COMMANDS:
+                    break
+                name = (*name, word)
+            rest = arguments[len(name) :]
+            is_group = isinstance(COMMANDS[name], click.Group)
+            assert not (is_group and rest and re.match(r"[a-z]", rest[0])), f"no command {rest[0]}"
+            return options_of(COMMANDS[name])
+        case ["dask", kind, *_] if kind in DASK:
+            return options_of(DASK[kind])
+        case ["python" | "python3" | "$PYTHON", "-m", module, *_] if "NAME" not in module:
+            return options_of_module(module)
+        case ["make", target, *_]:
+            assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M), target
+        case [word, *_] if (word,) in COMMANDS:
+            return options_named_with(["lidarpool", *words])
+    return None
+
+
+def check_options(words: list[str], known: set[str]) -> None:
+    flags = [re.match(r"-{1,2}[A-Za-z][\w.-]*", word) for word in words]
+    named = {flag[0] for flag in flags if flag is not None}
+    assert named <= known, f"{' '.join(words)}: no option {', '.join(named - known)}"
+
+
+def inline_code(text: str) -> list[list[str]]:
+    """Words of each inline code of a page."""
+    prose = _FENCED.sub("", text)
+    codes = [match[2].replace("`", "").replace(r"\|", "|") for match in _INLINE.finditer(prose)]
+    return [code.split() for code in codes]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_and_options_of_a_page_exist(path):
+    """In blocks and in prose; an option that is named alone is one of a command on the page.
+
+    Or of the commands that nearly all pages are about.
+    """
+    languages = _SHELL if path in DOCUMENTS else ("sh", "console")
+    blocks = [block for block in blocks_of(path) if block.language in languages]
+    lines = [words for block in blocks for words in commands(block)]
+    codes = inline_code(path.read_text("utf-8"))
+    on_page = {*OF_OTHERS, *options_of(COMMANDS["run",]), *options_of(DASK["worker"])}
+    for words in (*lines, *codes):
+        known = options_named_with(words)
+        if known is not None:
+            if words[0] not in ("dask",) or words in codes:
+                check_options(words, known)
+            on_page |= known
+    for words in codes:
+        if words and words[0].startswith("--"):
+            check_options(words, on_page)
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("examples/**/*.*")), ids=lambda path: path.name)
+def test_commands_in_remarks_of_examples_exist(path):
+    if path.suffix not in (".yaml", ".py"):
+        return
+    for line in re.findall(r"^#?\s+\$?\s*(lidarpool .*)$", path.read_text("utf-8"), re.M):
+        words = shlex.split(line, comments=True)
+        known = options_named_with(words)
+        assert known is not None
+        check_options(words, known)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*sorted(ROOT.glob("benchmarks/*.py")), *sorted(ROOT.glob("docs/pictures/**/*.py"))],
+    ids=lambda path: path.stem,
+)
+def test_options_in_docstrings_of_benchmarks_exist(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+    for line in re.findall(r"^ +(python -m .*)$", docstring, re.M):
+        words = re.sub(r"[\[\]|]", " ", line).split()
+        known = options_named_with(words)
+        assert known is not None
+        check_options(words, known)
+
+
+def words_of_schema(schema: Any) -> Iterator[str]:
+    """Yield the names and texts in a JSON schema."""
+    if isinstance(schema, dict):
+        yield from schema
+        schema = list(schema.values())
+    for entry in schema if isinstance(schema, list) else ():
+        yield from words_of_schema(entry)
+    if isinstance(schema, str):
+        yield schema
+
+
+def known_words() -> set[str]:
+    """Names of this project and of Dask that pages write as code: fields, columns, functions, …"""
+    words = {*EXPORTS, *LAYOUTS, *DATA_SETS}
+    for schema in (scenario_schema(), campaign_schema(), SensorModel.model_json_schema()):
+        words |= {*words_of_schema(schema)}
+    for column in TABLE.values():
+        words |= {column.name, column.in_files}
+    for command in COMMANDS.values():
+        words |= {entry.name for entry in command.params if entry.name}
+        words |= {
+            str(choice)
+            for entry in command.params
+            if isinstance(entry.type, click.Choice)
+            for choice in entry.type.choices
+        }
+    for module in (lidarpool, lidarsim, lidarsim.packets, poolpart, raybeam, distributed):
+        words |= {module.__name__}
+        for name in {*dir(module), *getattr(module, "__all__", ())}:
+            thing = getattr(module, name)
+            words |= {name, *(dir(thing) if isinstance(thing, type) else ())}
+            words |= {*getattr(thing, "__annotations__", ())}
+            with suppress(TypeError, ValueError):
+                words |= {*inspect.signature(thing).parameters}
+    return words
+
+
+def test_words_that_read_as_commands_are_known():
+    """As in «`check` lists»: the word is a command, or a name of the project."""
+    pattern = re.compile(r"`([a-z][a-z-]+)`,? (?:also |then |now )?([a-z]+s)\b")
+    known = known_words() | {name for (name, *_) in filter(None, COMMANDS)} | OTHER_WORDS
+    unknown = {
+        f"{path.relative_to(ROOT)}: {match[0]}"
+        for path in PAGES
+        for match in pattern.finditer(_FENCED.sub("", path.read_text("utf-8")))
+        if match[1] not in known and match[2] not in ("is", "has", "does", "was", "its", "as")
+    }
+    assert unknown == set()
 
 
 def parse(command: click.Command, name: str, arguments: list[str]) -> None:

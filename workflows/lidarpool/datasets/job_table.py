@@ -49,7 +49,6 @@ _TAIL = {
     "rays": int,
     "hits": int,
     "points": int,
-    "seconds": float,
     "sha256": str,
 }
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
@@ -81,7 +80,8 @@ class JobRow:
     scans, sweeps, rays, hits, points
         Numbers of scans, sweeps, rays, hits and points.
     seconds
-        Casting time of all its tasks. The only entry that differs between runs.
+        Casting time of all its tasks. The only entry that differs between runs: the table has no
+        such column, see `job_seconds`.
     sha256
         Hash of its points, see `Tally`: the same on any cluster.
     classes

@@ -22,6 +22,7 @@ from lidarview.viewer.server import Answer, Arguments, announced, page_server
 from lidarview.viewer.view import View, wait_for_interrupt
 
 from ..datasets.dataset import job_file
+from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import JobRow, Value, read_table
 from ..datasets.loader import read_index, sweeps
 from .downloads import downloads
@@ -42,6 +43,7 @@ class JobList:
         self.location = self._storage.url if isinstance(location, Storage) else str(location)
         self._index = read_index(self._storage)
         self.rows = [*read_table(self._storage, self._index["table"])]
+        self._seconds = known_seconds(self._storage)
         self._rows = {row.number: row for row in self.rows}
         self._names = list(dict.fromkeys(name for row in self.rows for name in row.values))
         self._views: OrderedDict[int, View] = OrderedDict()
@@ -95,7 +97,7 @@ class JobList:
             "name": row.name,
             "error": row.error,
             "points": row.points,
-            "seconds": row.seconds,
+            "seconds": self._seconds.get(row.number),
             "values": [_in_words(row.values.get(name, "")) for name in self._names],
             "opens": row.done,
         }

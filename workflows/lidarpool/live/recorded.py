@@ -13,7 +13,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import TABLE, Column
+from lidarsim.columns.table import TABLE, Column, Kind, Scale
 from lidarsim.sensor.trajectory import quaternions_of
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
@@ -113,7 +113,9 @@ def _described(name: str, values: AnyArray) -> Column:
     if known is not None and np.dtype(known.dtype) == values.dtype:
         return known
     is_label = known is not None and known.kind == "label" and values.dtype.kind in "iu"
-    return Column(name, values.dtype.name, "", "", kind="label" if is_label else "number")
+    scale: Scale = "linear" if known is None else known.scale
+    kind: Kind = "label" if is_label else "number"
+    return Column(name, values.dtype.name, "", "", kind=kind, scale=scale)
 
 
 def recorded_view(

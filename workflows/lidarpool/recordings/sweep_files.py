@@ -21,6 +21,7 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import need
 from lidarsim.base.input_files import input_size, read_input, read_input_text
+from lidarsim.base.time_units import seconds_of
 from lidarsim.base.words import natural
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.e57_system import e57_system
@@ -150,7 +151,8 @@ def _kitti_sequence(folder: Path, inner: str) -> SweepFiles:
         poses = np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
     times_ns: Floats | None = None
     if (folder / "times.txt").exists():
-        times_ns = 1e9 * np.loadtxt(folder / "times.txt", ndmin=1)
+        seconds = np.loadtxt(folder / "times.txt", ndmin=1)
+        times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds into times.txt")
     for kind, rows_of_kind in (("poses", poses), ("times", times_ns)):
         if rows_of_kind is not None and len(rows_of_kind) < len(files):
             raise ValueError(

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural
 
@@ -19,9 +19,10 @@ from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
+from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
-from ..export.folder import result_folder
+from ..export.folder import LAST_FILE, result_folder
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..run.run_result import CampaignRun
@@ -41,13 +42,12 @@ _RECORDED: dict[str, type] = {
     "files": list,
     "campaign": dict,
     "shards": list,
-    "notes": list,
 }
 
 # Files of jobs, and the files of `write_shared`, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     JOB_FILES.pattern
-    + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
+    + r"|(campaign|dataset|report)\.json|README\.md|report\.(html|csv)|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
 )
 # The run, results of single jobs, and files of writers that have not yet noticed the end.
@@ -127,8 +127,12 @@ class DataSetOutput(Output[CampaignRun]):
         storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
             rows = (row for row, _ in self.dataset.rows())
-            self._rows += sorted(rows, key=lambda row: row.number)
-        has_table = with_seconds(storage, self._rows)
+            seconds = known_seconds(storage)
+            self._rows += sorted(
+                (replace(row, seconds=seconds.get(row.number, 0.0)) for row in rows),
+                key=lambda row: row.number,
+            )
+        has_table = _is_tabled(storage, self._rows)
         intact_count, self._wrong = _check_jobs(self.dataset, self._rows, verify, self.campaign)
         numbers = {row.number for row in self._rows}
         for number in self.campaign.shard.jobs(record["campaign"]["count"]):
@@ -208,7 +212,7 @@ class DataSetOutput(Output[CampaignRun]):
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"backend": store.backend, "sensors": sums.sensors}
         record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
-        record |= {"shards": [str(self.campaign.shard)], "notes": [*sums.notes]}
+        record |= {"shards": [str(self.campaign.shard)]}
         write_record(self.dataset.storage, record)  # before the files that it assigns to a campaign
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         sums, _ = write_shared(self.dataset, record, sums, store.rows)
@@ -255,22 +259,24 @@ def read_record(storage: Storage) -> dict[str, Any]:
     return record
 
 
-def with_seconds(storage: Storage, rows: list[JobRow]) -> bool:
-    """Add the seconds of casting, which only the table of jobs has, to rows of manifests.
-
-    `rows` are in the order of their numbers. Returns True if the table has these rows and the
-    checksum in `dataset.json`.
-    """
+def _is_tabled(storage: Storage, rows: Sequence[JobRow]) -> bool:
+    """Return True if the table of jobs has these rows, and the checksum in `dataset.json`."""
     with suppress(LidarError):
-        table_rows = {row.number: row for row in read_table(storage, read_index(storage)["table"])}
-        is_same = table_rows.keys() == {row.number for row in rows}
-        for index, row in enumerate(rows):
-            timed = table_rows.get(row.number, row)
-            if timed.sha256 == row.sha256:
-                rows[index] = replace(row, seconds=timed.seconds)
-            is_same &= timed.sha256 == row.sha256
-        return is_same
+        table = read_table(storage, read_index(storage)["table"])
+        return {row.number: row.sha256 for row in table} == {row.number: row.sha256 for row in rows}
     return False
+
+
+def read_notes(storage: Storage) -> list[str]:
+    """Return the notes in the report of a data set; a note says if the report is unusable."""
+    try:
+        notes = json.loads(storage.read(LAST_FILE))["notes"]
+        if isinstance(notes, list):
+            return [*map(str, notes)]
+        reason = "its entry notes is no list"
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        reason = message_of(error).rstrip(".")
+    return [f"{storage.path(LAST_FILE)} is damaged ({reason}): its notes are lost"]
 
 
 def write_shared(

@@ -14,10 +14,11 @@ from lidarsim.base.storage import Storage
 from lidarview.render.picture_page import Page
 
 from ..datasets.figures import Figures
+from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE
 from ..run.run_result import CampaignRun
-from .charts import draw_results, draw_varied
+from .charts import draw_results, draw_times, draw_varied
 from .page.rendering import rendered
 from .report import stage_figures
 
@@ -29,8 +30,10 @@ VALUES_SHOWN = 12  # of a quantity with labels
 _CAPTIONS = {
     "job": "One of the jobs.",
     "varied": "What was varied: jobs by value, and the points of each job against it.",
-    "results": "What came of it: jobs by points, share of rays that hit, and time of casting.",
+    "results": "What came of it: jobs by points, and share of rays that hit.",
 }
+# Of the page alone: the card and the files of pictures are the same in every run.
+_PAGE_CAPTIONS = {**_CAPTIONS, "times": "Jobs by casting time, the sum of all tasks of a job."}
 
 
 def write_card(
@@ -41,7 +44,9 @@ def write_card(
     versions: Mapping[str, str],
     picture: Page | None = None,
 ) -> dict[str, Any]:
-    """Write README.md, report.html, pictures and splits of a data set, and report.json last.
+    """Write README.md, report.html, report.csv, pictures and splits, and report.json last.
+
+    Casting times are in the files of the report alone: report.html, report.csv and report.json.
 
     The rows of the table are read once; a few numbers of each job are held in memory.
 
@@ -69,7 +74,8 @@ def write_card(
     """
     with explained(f"The data set's card cannot be written to {storage}", "make room"):
         storage.remove([LAST_FILE])
-        figures = Figures(campaign["names"], _with_splits(storage, jobs))
+        rows = writing_seconds(storage, _with_splits(storage, jobs))
+        figures = Figures(campaign["names"], rows)
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
         for name, drawing in drawn.items():
@@ -79,20 +85,22 @@ def write_card(
         report = campaign_report(campaign, run, versions, figures)
         values: dict[str, Any] = {
             "report": report,
-            "captions": _CAPTIONS,
             "command": campaign["command"],
             "VALUES_SHOWN": VALUES_SHOWN,
         }
+        on_page = {name: pages[name] for name in ("varied", "results")}
+        on_page["times"] = draw_times(figures)
         page = rendered(
             "campaign.html",
-            pictures={name: drawn[name].svg() for name in ("varied", "results") if name in drawn},
+            captions=_PAGE_CAPTIONS,
+            pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
             slowest=figures.slowest,
             description=campaign["description"],
             **values,
             stages=run.stages,
         )
         storage.write(PAGE, page.encode())
-        card = rendered("card.md", drawn=[*drawn], **values)
+        card = rendered("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
         storage.write(CARD, card.encode("utf-8", "backslashreplace"))
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         storage.write(LAST_FILE, text.encode())

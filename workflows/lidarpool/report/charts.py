@@ -181,26 +181,35 @@ def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) 
 
 
 def draw_results(figures: Figures) -> Page | None:
-    """Draw how points, hits and seconds of casting are distributed over jobs; None without any."""
+    """Draw how points and hits are distributed over jobs; None if no job is done."""
     is_done = ~figures.failures
-    if not is_done.any():
-        return None
-    points, rays, hits, seconds = (
-        figures.per_job(name)[is_done] for name in ("points", "rays", "hits", "seconds")
-    )
+    points, rays, hits = (figures.per_job(name)[is_done] for name in ("points", "rays", "hits"))
     with np.errstate(invalid="ignore"):
         quantities = (
             Varied("points of a job", points),
             Varied("rays that hit, per cent", 100 * hits / rays),
-            Varied("casting a job, all its tasks, s", seconds),
         )
+    return _draw_distributions(quantities, "What came of it", "Jobs by points and hits")
+
+
+def draw_times(figures: Figures) -> Page | None:
+    """Draw how casting times are distributed over jobs; None if no job is done."""
+    seconds = figures.per_job("seconds")[~figures.failures]
+    quantity = Varied("casting a job, all its tasks, s", seconds)
+    return _draw_distributions((quantity,), "What it took", "Jobs by casting time")
+
+
+def _draw_distributions(quantities: Sequence[Varied], title: str, caption: str) -> Page | None:
+    """Draw the numbers of jobs by quantities, side by side; None without any job."""
+    if not len(quantities[0].values):
+        return None
     height = 250
     top = 128
     page = Page((WIDTH, top + height + 92))
-    width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * 2) / 3
+    width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (len(quantities) - 1)) / len(quantities)
     for column, quantity in enumerate(quantities):
         axes = _chart(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
-        _draw_counts(axes, quantity, np.zeros(len(points), np.bool_), [BAR])
+        _draw_counts(axes, quantity, np.zeros(len(quantity.values), np.bool_), [BAR])
         _set_labels(page, axes, quantity, width)
         axes.set_xlabel(quantity.name)
         if len(quantity.known_values):
@@ -208,7 +217,7 @@ def draw_results(figures: Figures) -> Page | None:
                 float(np.median(quantity.known_values)), color=theme.INK, lw=1.1 * page.unit
             )
     page.figure.axes[0].set_ylabel("jobs")
-    page.title("What came of it", "Jobs by points, hits and time; the line is the median.")
+    page.title(title, f"{caption}; the line is the median.")
     return page
 
 

@@ -24,8 +24,8 @@ from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
-from ..datasets.job_table import TABLE_FILE, JobRow, read_table
-from ..datasets.loader import read_index
+from ..datasets.job_seconds import known_seconds, read_seconds
+from ..datasets.job_table import JobRow
 from ..export.folder import LAST_FILE, output_place, result_folder
 from ..plan import Trial
 from ..run.job_source import OneJob
@@ -42,7 +42,14 @@ from ..run.store.run_store import RUN_FOLDER, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
-from .campaign_output import CAMPAIGN_FILE, dataset_files, read_record, write_record, write_shared
+from .campaign_output import (
+    CAMPAIGN_FILE,
+    dataset_files,
+    read_notes,
+    read_record,
+    write_record,
+    write_shared,
+)
 from .output import SurveyOutput
 
 MAX_NAMED = 20  # shards or files in a message
@@ -54,13 +61,15 @@ _AGAIN = "run their shards again with --resume (of a campaign --verify), and mer
 class _Part:
     """Shards of a run in a folder; `record` is the content of CAMPAIGN_FILE of a data set.
 
-    `run_size` is the number of all jobs or scans of the run; points and trials are of a survey.
+    `run_size` is the number of all jobs or scans of the run; `told` are the notes of its report;
+    points and trials are of a survey.
     """
 
     storage: Storage
     record: Mapping[str, Any]
     shards: Sequence[Shard]
     run_size: int
+    told: Sequence[str]
     points: Sequence[Receipt] = ()
     trials: Sequence[Trial] = ()
 
@@ -69,7 +78,7 @@ class _Part:
         """Remarks for the user, without that on missing shards."""
         return [
             note
-            for note in self.record["notes"]
+            for note in self.told
             if not note.startswith(_MISSING) and NO_POINTS not in note  # of an earlier merge
         ]
 
@@ -197,7 +206,8 @@ def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
         shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
-    return _Part(storage, record, shards, record["campaign"]["count"])
+    told = read_notes(storage) if LAST_FILE in storage.sizes() else ()
+    return _Part(storage, record, shards, record["campaign"]["count"], told)
 
 
 def _read_survey(storage: Storage, run: Storage) -> _Part:
@@ -211,7 +221,8 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
         try:
             with closing(RunDatabase(path, durable=False)) as db:
                 meta = {"casting": "{}"} | db.meta
-                texts = ("identity", "casting", "made_of", "notes")
+                texts = ("identity", "casting", "made_of")
+                told = json.loads(meta["notes"])
                 record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
                 shard = Shard.parse(record["identity"].pop("shard"))
                 scan_count = record["made_of"]["scans"]
@@ -221,7 +232,7 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
                 if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
-                return _Part(storage, record, [shard], scan_count, parts, job.trials)
+                return _Part(storage, record, [shard], scan_count, told, parts, job.trials)
         except DamagedError as error:
             raise LidarError(
                 f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
@@ -288,7 +299,7 @@ def _merge_dataset(
     earlier = _read_dataset(target, shard_count=parts[0].shards[0].total) if begun else None
     all_parts = [earlier, *parts] if earlier else parts
     notes = _check(all_parts, partial, earlier)
-    record = _merged_record(all_parts, parts[0]) | {"notes": notes}
+    record = _merged_record(all_parts, parts[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
     if earlier is None:  # from now on the files belong to the campaign
@@ -299,9 +310,8 @@ def _merge_dataset(
         with explained(f"{target} cannot be merged"):
             for part, file in zip(parts, files[-len(parts) :], strict=True):
                 file.write(part, _take_jobs(part, dataset, damaged), _seconds(part, notes))
-            if earlier:
-                # A killed merge leaves a table that differs from its index: no note.
-                files[0].write(earlier, _rows_of(earlier, dataset), _seconds(earlier, []))
+            if earlier:  # after a killed merge without casting times: no note
+                files[0].write(earlier, _rows_of(earlier, dataset), known_seconds(target))
         if not damaged:
             damaged += _lacking(all_parts, _merged(files))
         if damaged:
@@ -312,7 +322,6 @@ def _merge_dataset(
         if empty := [row for row in _merged(files) if row.done and not row.points]:
             notes.append(empty_jobs_warning(empty, ""))
             screen.warn(notes[-1])
-        record["notes"] = notes
         fields = {"sensors": record["sensors"], "notes": tuple(notes)}
         run = CampaignRun.from_rows(_merged(files), 0.0, 0, **fields)
         report = write_shared(dataset, record, run, lambda: _merged(files))[1]
@@ -341,10 +350,8 @@ class _RowFile:
         self._path = path
         self._offsets: dict[int, int] = {}  # {number of a job: first byte of its row}
 
-    def write(
-        self, part: _Part, rows: Iterator[JobRow], seconds: Mapping[int, tuple[str, float]]
-    ) -> None:
-        """Write rows with their seconds of casting.
+    def write(self, part: _Part, rows: Iterator[JobRow], seconds: Mapping[int, float]) -> None:
+        """Write rows with their casting times, {number: seconds}.
 
         LidarError if the part cannot have such a job, or two manifests are of one job.
         """
@@ -364,8 +371,7 @@ class _RowFile:
                         f"{path} is of job {number}, of which there is another manifest: move one "
                         "of them elsewhere, and merge again."
                     )
-                sha256, casting_s = seconds.get(number, ("", 0.0))
-                row = replace(row, seconds=casting_s) if sha256 == row.sha256 else row
+                row = replace(row, seconds=seconds.get(number, 0.0))
                 self._offsets[number] = file.tell()
                 file.write(json.dumps(asdict(row)).encode() + b"\n")
 
@@ -394,22 +400,17 @@ def _rows_of(earlier: _Part, dataset: DataSet) -> Iterator[JobRow]:
             yield row
 
 
-def _seconds(part: _Part, notes: list[str]) -> dict[int, tuple[str, float]]:
-    """Return {number: hash of points and seconds of casting}, which only jobs.csv has.
+def _seconds(part: _Part, notes: list[str]) -> Mapping[int, float]:
+    """Return the casting times of the jobs of a part, {number: seconds}.
 
-    A note says if the table is damaged; then nothing is known.
+    A note says if they are lost.
     """
     if not part.shards:
         return {}
     try:
-        finished = INDEX_FILE in part.storage.sizes()  # else an earlier merge was killed
-        table = read_table(part.storage, read_index(part.storage)["table"] if finished else None)
-        return {row.number: (row.sha256, row.seconds) for row in table}
-    except LidarError:
-        notes.append(
-            f"{part.storage.path(TABLE_FILE)} is damaged or edited: the rows of its jobs are those "
-            "of their manifests, without seconds"
-        )
+        return read_seconds(part.storage)
+    except LidarError as error:
+        notes.append(str(error).rstrip("."))
     return {}
 
 

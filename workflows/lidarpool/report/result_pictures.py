@@ -23,7 +23,7 @@ from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.table import TABLE, Z
+from lidarsim.columns.table import TABLE, X, Y, Z
 from lidarsim.scene.scene import Scene
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
@@ -135,7 +135,7 @@ def _picture_makers(
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
         columns_by_name = with_composed(
-            {name: c for c in (Z, *file.table) for name in (c.name, c.in_files)}
+            {name: c for c in (Z, X, Y, *file.table) for name in (c.name, c.in_files)}
         )
         if colour not in columns_by_name:
             available = list(dict.fromkeys(c.name for c in columns_by_name.values()))

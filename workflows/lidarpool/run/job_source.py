@@ -86,6 +86,10 @@ class Jobs(Protocol):
         """Return the values of a job that differ from job to job, by name."""
         ...
 
+    def without_folders(self, message: str) -> str:
+        """Return a message without the folders of the jobs' files on this machine."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class OneJob:
@@ -124,13 +128,18 @@ class OneJob:
         """Return the values of the only job."""
         return self.survey_job.values
 
+    def without_folders(self, message: str) -> str:
+        """Return a message as it is: no data set has it."""
+        return message
+
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
     """Return the row of a job that has failed, and perhaps cannot be made."""
     values: Mapping[str, Value] = {}
     with suppress(Exception):  # the values themselves may be the cause
         values = jobs.values(number)
-    return JobRow(number, jobs.name(number), jobs.split(number), dict(values), str(error))
+    message = jobs.without_folders(str(error))
+    return JobRow(number, jobs.name(number), jobs.split(number), dict(values), message)
 
 
 class JobMaker:

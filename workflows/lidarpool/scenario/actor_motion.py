@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import math
+import re
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
@@ -31,6 +32,7 @@ from lidarsim.base.declared import (
 )
 from lidarsim.base.errors import LidarError, message_of, prefixed
 from lidarsim.base.input_files import open_input
+from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
 from lidarsim.base.words import did_you_mean, plural, printable
 from lidarsim.base.xmlfile import refuse_entity
 from lidarsim.scene.actors import Actor
@@ -62,7 +64,9 @@ from .sections import (
     by_position,
 )
 
-_READING_OPTIONS = {"format", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s"}
+_READING_OPTIONS = {
+    "format", "time_unit", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s",
+}  # fmt: skip
 _ROBOT_FIELDS = {"file", "opacity"}  # fields of a mesh file that apply to robots
 
 
@@ -122,10 +126,17 @@ CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 class TimedPose(Section, Pose):
     """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
 
-    time_s: Annotated[Seconds, about("seconds, by the clock of the trajectory")]
+    # Any number: `seconds_of` names the unit that too large numbers probably have.
+    time_s: Annotated[float, about("seconds, by the clock of the trajectory", ge=-1e20, le=1e20)]
 
 
 Identity = Annotated[Text, BeforeValidator(lambda v: str(v) if type(v) is int else v)]
+
+
+TimeUnitEntry = Annotated[
+    TimeUnit | None,
+    about("unit of the times in the file, if it differs from the unit that the file states", "ns"),
+]
 
 
 class TrajectorySection(Section):
@@ -142,6 +153,7 @@ class TrajectorySection(Section):
         TrajectoryFormat | None, about("by default as the content of the file says")
     ] = None
     times: Annotated[Text | None, about("for KITTI poses: the file of times")] = None
+    time_unit: TimeUnitEntry = None
     columns: Annotated[
         dict[str, str] | None,
         about(
@@ -263,8 +275,12 @@ class TrajectorySection(Section):
         has_angles = any(
             {"yaw_deg", "pitch_deg", "roll_deg"} & p.model_fields_set for p in self.points
         )
+        try:
+            seconds = seconds_of(np.array([p.time_s for p in self.points]), self.time_unit)
+        except ValueError as error:
+            raise LidarError(f"points: {error}.") from error
         return Track(
-            np.array([p.time_s + self.offset_s for p in self.points]),
+            seconds + self.offset_s,
             np.array([p.position for p in self.points]) - origin,
             quaternions_of(rotations_of(np.array(angles))) if has_angles else None,
             **options,
@@ -278,6 +294,7 @@ class JointTable(Section):
     """Values of a robot's joints from a table; in YAML also just the file's name."""
 
     file: Annotated[Text, about("a table with a header, from the scenario's folder")]
+    time_unit: TimeUnitEntry = None
     ignore: IgnoredColumns = ()
 
 
@@ -411,6 +428,7 @@ class TrafficSection(Section):
     ignore: Annotated[
         TextOrTexts, about("names of attributes in the file to leave out, with * and ?", "battery*")
     ] = ()
+    time_unit: TimeUnitEntry = None
     offset_s: Annotated[Seconds, about("added to all times")] = 0.0
     translation: Annotated[Triple, about("added to all positions, metres")] = (0, 0, 0)
     surfaces: Annotated[
@@ -523,13 +541,47 @@ class Passage:
         return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
 
 
+class TrafficClock:
+    """Converts the times of a file of traffic to seconds, one after the other.
+
+    Raises ValueError for times that must have another unit, see `seconds_of`.
+    """
+
+    def __init__(self, time_unit: TimeUnit | None) -> None:
+        self._time_unit = time_unit
+        self._times: list[float] = []  # the first time, and the last one
+
+    def seconds(self, time: float) -> float:
+        """Return the next time in seconds."""
+        if self._time_unit is not None:
+            return time / SECONDS[self._time_unit]
+        if self._times and not are_plausible(self._times[0], time):
+            seconds_of(np.array([*self._times, time]), None)
+        self._times[1 if self._times else 0 :] = [time]
+        return time
+
+
+# Days, hours, minutes and seconds, which SUMO writes with --human-readable-time.
+_READABLE_TIME = re.compile(r"(-?)(?:(\d+):)?(\d+):(\d\d):(\d\d(?:\.\d*)?)")
+
+
+def _readable_seconds(text: str) -> float | None:
+    """Return the seconds of a time such as 1:02:30:00.50, with days or without; None for others."""
+    match = _READABLE_TIME.fullmatch(text.strip())
+    if match is None:
+        return None
+    sign, days, hours, minutes, seconds = match.groups()
+    whole_s = ((int(days or 0) * 24 + int(hours)) * 60 + int(minutes)) * 60
+    return (whole_s + float(seconds)) * (-1.0 if sign else 1.0)
+
+
 class _PassageCollector:
     """Collects passages from the elements of floating car data, time step by time step.
 
     Rows before the first time are dropped, but for the last.
     """
 
-    def __init__(self, first_s: float, ignore: Sequence[str], choice: TravellerChoice) -> None:
+    def __init__(self, section: TrafficSection, first_s: float, choice: TravellerChoice) -> None:
         self.passages: list[Passage] = []
         self.left_out: set[str] = set()  # identities that are not in `choice`
         # {(tag, identity): (last step, passage)}
@@ -537,13 +589,20 @@ class _PassageCollector:
         self.step = -1
         self.time_s = -math.inf
         self._first_s = first_s
-        self._ignore = ignore
+        self._time_unit = section.time_unit
+        self._clock = TrafficClock(section.time_unit)
+        self._ignore = section.ignore
         self._choice = choice
         self._known_attributes = set(_KNOWN)
         self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
 
-    def begin_step(self, time_s: float) -> None:
+    def begin_step(self, text: str) -> None:
         """Begin a time step; ValueError if its time is not after the last time step's."""
+        time_s = _readable_seconds(text)
+        if time_s is not None and self._time_unit is not None:
+            raise ValueError("its times are hours, minutes and seconds: leave out time_unit")
+        if time_s is None:
+            time_s = self._clock.seconds(_number("a timestep", "time", text))
         if not self.time_s < time_s < math.inf:
             raise ValueError(f"the time {time_s} does not come after the one before")
         self.time_s = time_s
@@ -567,11 +626,12 @@ class _PassageCollector:
         passage = self._passage(tag, attributes)
         if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
             del passage.times_s[:], passage.rows[:]
-        row = [float(attributes[key]) for key in _ROW[:3]]
-        row += [float(attributes.get(key) or 0) for key in _ROW[3:]]
+        identity = attributes["id"]
+        named = f"{tag} {identity!r}"
+        row = [_number(named, key, attributes[key]) for key in _ROW[:3]]
+        row += [_number(named, key, attributes.get(key) or "0") for key in _ROW[3:]]
         if not all(map(math.isfinite, row)):
-            identity = attributes["id"]
-            raise ValueError(f"{tag} {identity!r} has no finite position at {self.time_s:g} s")
+            raise ValueError(f"{named} has no finite position at {self.time_s:g} s")
         passage.times_s.append(self.time_s)
         passage.rows.extend(row)
 
@@ -587,29 +647,36 @@ class _PassageCollector:
         return passage
 
 
+def _number(element: str, key: str, text: str) -> float:
+    """Return the number in an attribute; ValueError if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{element} has the {key} {printable(text)!r}; give a number") from None
+
+
 def read_fcd(
     path: Path,
+    section: TrafficSection,
     first_s: float,
     last_s: float,
-    ignore: Sequence[str] = (),
     choice: TravellerChoice = TravellerChoice(),  # noqa: B008 - it never changes
 ) -> TrafficContent:
     """Read the vehicles and persons between two times, with the time steps before and after.
 
-    The file may be of any length: only these rows stay in memory. `ignore` are names of attributes
-    to leave out, with * and ?.
+    The file may be of any length: only these rows stay in memory.
 
     Raises
     ------
     LidarError
         If the file cannot be read, is no floating car data, or has unknown attributes.
     """
-    collector = _PassageCollector(first_s, ignore, choice)
+    collector = _PassageCollector(section, first_s, choice)
     try:
         for tag, attributes in _elements(path):
             if tag == "timestep":
                 previous_s = collector.time_s
-                collector.begin_step(float(attributes["time"]))
+                collector.begin_step(attributes["time"])
                 if previous_s > last_s:  # the first time step after the last time is needed as well
                     break
             elif tag in _MOVING and collector.step >= 0:

@@ -294,7 +294,7 @@ def _traffic_content(
     file = scenario.path(section.file)
     if file.suffix.lower() in OSI_SUFFIXES:
         return read_osi(file, section, first_s, last_s, choice)
-    return read_fcd(file, first_s, last_s, section.ignore, choice)
+    return read_fcd(file, section, first_s, last_s, choice)
 
 
 def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
@@ -423,7 +423,11 @@ def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
     """Return the arguments of `Robot.path` and `Robot.actors` for an actor's table of joints."""
     if entry.joints is None:
         return {}
-    return {"joints": scenario.path(entry.joints.file), "ignore": entry.joints.ignore}
+    return {
+        "joints": scenario.path(entry.joints.file),
+        "ignore": entry.joints.ignore,
+        "time_unit": entry.joints.time_unit,
+    }
 
 
 def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | None) -> list[Actor]:

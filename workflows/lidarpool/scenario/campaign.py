@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from copy import copy
@@ -229,6 +230,17 @@ class CampaignSpec:
             )
         survey = with_laser_scans(job.survey, [self.keep.format])
         return job if survey is job.survey else replace(job, survey=survey)
+
+    def without_folders(self, message: str) -> str:
+        """Return a message without the folders of the campaign's files on this machine.
+
+        The messages of jobs that have failed are in the data set, whose bytes are the same on any
+        machine.
+        """
+        for folder in self._jobs.folders:
+            for path in {str(folder), str(folder.absolute()), str(folder.resolve())} - {".", "/"}:
+                message = re.sub(rf"(?<![\w./-]){re.escape(path)}/(?=\w|\.)", "", message)
+        return message
 
     def _checked_number(self, number: int) -> int:
         """Return the number of a job as an integer, or raise LidarError."""

@@ -52,6 +52,7 @@ class JobSource:
     names: tuple[str, ...] = ()
     choices: Mapping[str, str] = MappingProxyType({})
     files: Set[Path] = frozenset()
+    folders: Set[Path] = frozenset()  # of the campaign's own files
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
@@ -163,6 +164,7 @@ class ScenarioJobs(JobSource):
         if not paths:
             raise LidarError("a campaign needs a scenario at least: name one or more files.")
         self.paths = paths
+        self.folders = {path.parent for path in paths}
         self.count = len(paths)
         mistakes = Mistakes()
         files: set[Path] = set()
@@ -210,6 +212,7 @@ class VariedJobs(JobSource):
         self._vary = section.vary
         self._seed = section.seed
         self._source = str(path)
+        self.folders = {path.parent}
         mistakes = Mistakes()
         self._bases: list[_Base] = []
         tables: dict[Any, list[Any]] = {}  # {file and kind of entry: entries}

@@ -20,7 +20,14 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Track
 from lidarsim.sensor.trajectory import quaternions_of, rotations_of
 
-from .actor_motion import HOST, TrafficContent, TrafficSection, TravellerChoice, VehicleSection
+from .actor_motion import (
+    HOST,
+    TrafficClock,
+    TrafficContent,
+    TrafficSection,
+    TravellerChoice,
+    VehicleSection,
+)
 
 OSI_SUFFIXES = (".osi", ".mcap")
 _MAX_SIZE_M = 1e4  # of a moving object: ships and trains are shorter
@@ -83,6 +90,7 @@ class _PassageCollector:
         self.time_s = -np.inf
         self.message = -1
         self._section = section
+        self._clock = TrafficClock(section.time_unit)
         self._first_s = first_s
         self._choice = choice
         self.left_out: set[str] = set()  # identities that are not in `choice`
@@ -91,7 +99,7 @@ class _PassageCollector:
         """Add the moving objects of a message GroundTruth; ValueError if it is not valid."""
         if truth.timestamp is None:
             raise ValueError("a message has no timestamp")
-        time_s = truth.timestamp.seconds + truth.timestamp.nanos / 1e9
+        time_s = self._clock.seconds(truth.timestamp.seconds + truth.timestamp.nanos / 1e9)
         if time_s < self.time_s:
             raise ValueError(f"the time {time_s:g} comes before {self.time_s:g} s")
         if time_s == self.time_s:  # of another topic, or of another sensor

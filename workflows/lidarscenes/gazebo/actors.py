@@ -42,7 +42,7 @@ def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) 
             if mesh is None:
                 continue
             notes.further["has actors, whose skins are at rest"] = None
-            times_s, poses = _waypoints(element)
+            times_s, poses = _waypoints(element, name, notes)
             if len(times_s) < 2:
                 actors.standing.append(PlacedNode(mesh, poses[0], name))
             else:
@@ -64,7 +64,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
     return joined.moved("skin", scale * np.eye(3), np.zeros(3))
 
 
-def _waypoints(actor: Element) -> tuple[Floats, Floats]:
+def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
     """Return times (k,), seconds, and poses (k, 4, 4) of an actor; k is 1 if the actor stands."""
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
@@ -78,6 +78,11 @@ def _waypoints(actor: Element) -> tuple[Floats, Floats]:
     delay_s = numbers_of(script, "delay_start", 1, "0").item()
     if (script.findtext("loop") or "true").strip() in ("true", "1") and times_s[-1] > 0:
         times_s, poses = _repeated(times_s, poses)
+        if times_s[-1] < _LOOP_S:
+            notes.further[
+                f"has an actor, {name}, with so many waypoints that it loops for "
+                f"{times_s[-1]:.4g} s alone"
+            ] = None
     return times_s + delay_s, poses
 
 

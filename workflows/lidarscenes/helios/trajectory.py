@@ -14,6 +14,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.time_units import seconds_of
 from lidarsim.scene.transform import rotation_about
 from lidarsim.sensor.trajectory import quaternions_of
 
@@ -160,6 +161,10 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     for leg in reversed(legs):
         settings |= leg.platform
     columns = _columns(read(path).decode("utf-8", "replace"), settings)
+    try:
+        columns["t"] = seconds_of(columns["t"], None, advice="HELIOS++ expects seconds")
+    except ValueError as error:
+        raise LidarError(f"{path} is not a usable trajectory: {error}.") from error
     times, first = np.unique(columns["t"], return_index=True)
     if len(times) < 2:
         raise LidarError(f"{path} is no trajectory: all its rows have one time.")

@@ -18,6 +18,7 @@ from lidarsim.base.errors import LidarError, message_of
 from lidarsim.base.signatures import ReadableSignature, shown_readably
 from lidarsim.base.tables import METRES, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
+from lidarsim.base.time_units import TimeUnit
 from lidarsim.base.validation import as_array, checked
 from lidarsim.base.vectors import applied, matmul
 from lidarsim.base.words import did_you_mean, plural
@@ -133,11 +134,12 @@ class Robot:
         joints: Joints | None = None,
         *,
         ignore: Sequence[str] = (),
+        time_unit: TimeUnit | None = None,
     ) -> Trajectory:
         """Return the trajectory of a link, by the trajectory of the root.
 
         `joints` are values of joints, see `Robot`; `ignore` are names of columns of a table of
-        joints to leave out, with * and ?.
+        joints to leave out, with * and ?; `time_unit` is as for `actors`.
 
         Raises
         ------
@@ -146,7 +148,7 @@ class Robot:
         """
         if link not in self.joints and link != self.links[0]:
             raise LidarError(f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}")
-        return self._path(link, trajectory, *self._values(joints, ignore))
+        return self._path(link, trajectory, *self._values(joints, ignore, time_unit))
 
     @checked
     @shown_readably
@@ -158,6 +160,7 @@ class Robot:
         name: str | None = None,
         without: Collection[str] = (),
         ignore: Sequence[str] = (),
+        time_unit: TimeUnit | None = None,
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
         """Return an actor for each link that a joint moves, with the links fixed to the link.
@@ -174,6 +177,10 @@ class Robot:
             Links to leave out.
         ignore
             Names of columns of a table of joints to leave out, with * and ?.
+        time_unit
+            Unit of the times of a file, "s", "ms", "us" or "ns", if it is not the unit that its
+            header states. Without `time_unit`, times of 1e11 s and more, and times that span more
+            than a year, are refused.
         tell
             Called with a line on values beyond limits.
 
@@ -182,7 +189,7 @@ class Robot:
         LidarError
             If the joints cannot be used.
         """
-        times_s, values = self._values(joints, ignore, tell)
+        times_s, values = self._values(joints, ignore, time_unit, tell)
         robot_name = self.name if name is None else name
         return tuple(
             Actor(
@@ -255,12 +262,15 @@ class Robot:
         self,
         joints: Joints | None,
         ignore: Sequence[str],
+        time_unit: TimeUnit | None,
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
         """Return times (k,), seconds, and values {joint: (k,)} of all joints that move."""
         table: dict[str, Any] = {}
         if isinstance(joints, (str, Path)):
-            table = self._read_values(Path(joints), ignore)
+            table = self._read_values(Path(joints), ignore, time_unit)
+        elif time_unit is not None:
+            raise LidarError("time_unit is of a file of joints: give time_s in seconds.")
         elif joints is not None:
             table = {name: as_array(name, value).reshape(-1) for name, value in joints.items()}
         times = table.pop("time_s", np.zeros(1))
@@ -317,7 +327,9 @@ class Robot:
                     f"beyond its limits of {lower:.4g} to {upper:.4g}"
                 )
 
-    def _read_values(self, path: Path, ignore: Sequence[str]) -> dict[str, Floats]:
+    def _read_values(
+        self, path: Path, ignore: Sequence[str], time_unit: TimeUnit | None
+    ) -> dict[str, Floats]:
         """Return the values in a file with a table of joints; LidarError for an unusable file."""
         quantities = [
             Quantity(
@@ -337,6 +349,7 @@ class Robot:
                 required=lambda columns: ("time_s",),
                 ignore=ignore,
                 unused=[joint.name for joint in self.joints.values() if not joint.moves],
+                time_unit=time_unit,
             )
         except (OSError, ValueError, LidarError) as error:
             raise LidarError(

@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from .arrays import Floats
+from .time_units import SECONDS, TimeUnit, seconds_of
 from .words import did_you_mean, printable
 
 # {unit: number of these units in the first unit}
-SECONDS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
 DEGREES = {"deg": 1.0, "rad": np.pi / 180}
 RADIANS = {"rad": 1.0, "deg": 180 / np.pi}
@@ -231,6 +231,7 @@ def read_table(
     unused: Sequence[str] = (),
     refused: Mapping[str, str] | None = None,
     bare: Mapping[str, str] | None = None,
+    time_unit: TimeUnit | None = None,
 ) -> dict[str, Floats]:
     """Read a table of numbers; refuse each column that is not understood.
 
@@ -256,6 +257,8 @@ def read_table(
         {spelling: why such a column cannot be used}.
     bare
         {quantity: unit of a column whose header states no unit}.
+    time_unit
+        Unit of times that the user states, which counts instead of the header's.
 
     Returns
     -------
@@ -266,7 +269,7 @@ def read_table(
     ------
     ValueError
         If there is no header, a column is not known, missing or not unique, a unit is missing or
-        not known, or a cell holds no finite number.
+        not known, a cell holds no finite number, or times have another unit than the header states.
     """
     lines = text.splitlines()
     spellings = {_letters(name): quantity for quantity in quantities for name in quantity.spellings}
@@ -278,7 +281,7 @@ def read_table(
     if header is None:
         example = ",".join(quantity.name for quantity in quantities[:4])
         raise ValueError(f"it has no header: name its columns in its first line, as in {example}")
-    reader = _ColumnReader(header, quantities, spellings, exact)
+    reader = _ColumnReader(header, quantities, spellings, exact, time_unit)
     reader.choose(columns)
     reader.leave_out(ignore)
     reader.assign(formats, unused, refused or {}, bare or {})
@@ -299,11 +302,13 @@ class _ColumnReader:
         quantities: Sequence[Quantity],
         spellings: Mapping[str, Quantity],
         exact: Mapping[str, Quantity],
+        time_unit: TimeUnit | None,
     ) -> None:
         self.cells = [cell.lstrip("#%").strip() for cell in header.cells]
         self.quantities = quantities
         self.spellings = spellings
         self.exact = exact
+        self.time_unit = time_unit
         # {name of a quantity: index of its column, and the unit; None if no header states it}
         self.assigned: dict[str, tuple[int, str | None]] = {}
         self.left_out: set[int] = set()  # indices of columns
@@ -340,6 +345,11 @@ class _ColumnReader:
                 )
             if unit is None:
                 unit = self._unit(quantity, file_name, stated, {})
+            elif quantity.units is SECONDS and self.time_unit not in (None, unit):
+                raise ValueError(
+                    f"columns reads {file_name!r} as {name}, and time_unit is {self.time_unit}: "
+                    "give one of the two"
+                )
             self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
@@ -386,6 +396,8 @@ class _ColumnReader:
         self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
     ) -> str | None:
         """Return the unit of a column, or None for the bare unit, which is yet to be checked."""
+        if quantity.units is SECONDS and self.time_unit is not None:
+            return self.time_unit
         if unit is not None:
             if unit not in quantity.units:
                 units_read = " or ".join(name or "none" for name in quantity.units)
@@ -399,10 +411,11 @@ class _ColumnReader:
             first, *other_units = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
             choice = f", or give columns: {{{quantity.name}: {cell}}}" * self.can_choose
+            unit_option = ", or give time_unit" * (quantity.units is SECONDS)
             names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
             raise ValueError(
                 f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well"
+                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well{unit_option}"
             )
         return None
 
@@ -434,6 +447,8 @@ class _ColumnReader:
                     f"{largest:.3g} may have any: call it {names}"
                 )
         assert unit is not None  # set above
+        if quantity.units is SECONDS:
+            return seconds_of(values, self.time_unit, cast(TimeUnit, unit))
         count = quantity.units[unit]
         return values if count == 1 else values / count
 

@@ -19,6 +19,7 @@ from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
 Kind = Literal["number", "label"]  # a colour scale, or a colour for each value
+Scale = Literal["linear", "logarithmic"]
 
 NO_SURFACE = "no surface"  # instead of an object's name
 CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
@@ -57,6 +58,10 @@ class Column:
         Display of the values: "number" on a colour scale, "label" with a colour for each value.
     file_name
         Usual name of the column in files.
+    scale
+        Colour scale of numbers. "linear", for positions, angles, times and numbers of things; or
+        "logarithmic", for energies and the like: where the values differ by large factors, equal
+        factors have equal distances on the scale.
 
     Raises
     ------
@@ -72,6 +77,7 @@ class Column:
     coordinates: str = ""
     kind: Kind = "number"
     file_name: str = ""
+    scale: Scale = "linear"
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -141,6 +147,7 @@ OPTIONAL = (
         "float32",
         "",
         "energy received; 1 is a white surface 10 m away at right angles in clear air",
+        scale="logarithmic",
     ),
     Column(
         "reflectance",
@@ -149,7 +156,13 @@ OPTIONAL = (
         "intensity without the loss by distance and air: the surface's times cosine of incidence",
     ),
     Column("reflectivity", "uint8", "", "reflectance on the scale of the sensor's maker"),
-    Column("signal", "uint16", "", "counts: 10,000 for an intensity of 1, 65,535 at most"),
+    Column(
+        "signal",
+        "uint16",
+        "",
+        "counts: 10,000 for an intensity of 1, 65,535 at most",
+        scale="logarithmic",
+    ),
     Column(
         VELOCITY,
         "float32",
@@ -162,6 +175,7 @@ OPTIONAL = (
         "",
         "height of the echo in the waveform, clipped at the saturation of the receiver; of one as "
         "narrow as the pulse its intensity",
+        scale="logarithmic",
     ),
     Column(
         "pulse_width",

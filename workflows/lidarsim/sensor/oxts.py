@@ -8,6 +8,7 @@ x ahead, y left and z up.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from .trajectory import quaternions_of, rotations_of
 WIDTH = 30  # numbers of a row
 _RADIUS_M = 6378137.0  # of KITTI's Mercator projection
 OXTS_TIMES = "timestamps.txt"
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d*)?")
 
 
 def find_oxts(path: Path) -> Path | None:
@@ -60,11 +62,22 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
         if len(numbers) != WIDTH:
             raise ValueError(f"data/{file.name} has {len(numbers)} numbers, not {WIDTH}")
         rows.append([float(number) for number in numbers])
-    lines = read_input_text(folder / OXTS_TIMES).split("\n")
-    times = np.array([line.strip() for line in lines if line.strip()], "datetime64[ns]")
-    if len(times) != len(files):
-        raise ValueError(f"it has {len(files)} files of data, and {OXTS_TIMES} {len(times)} times")
-    return times.astype(np.int64) / 1e9, *oxts_poses(np.array(rows), origin)
+    seconds = dates_of(read_input_text(folder / OXTS_TIMES))
+    if seconds is None:
+        raise ValueError(f"{OXTS_TIMES} has rows that are no dates, as 2011-09-26 13:02:25.964")
+    if len(seconds) != len(files):
+        raise ValueError(
+            f"it has {len(files)} files of data, and {OXTS_TIMES} {len(seconds)} times"
+        )
+    return seconds, *oxts_poses(np.array(rows), origin)
+
+
+def dates_of(text: str) -> Floats | None:
+    """Return the seconds since 1970 (k,) of the dates in a text, one a line; None for others."""
+    lines = [line.strip() for line in text.split("\n") if line.strip()]
+    if not all(_DATE.fullmatch(line) for line in lines):
+        return None
+    return np.array(lines, "datetime64[ns]").astype(np.int64) / 1e9
 
 
 def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:

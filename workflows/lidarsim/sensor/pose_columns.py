@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.tables import DEGREES, METRES, NUMBERS, SECONDS, Quantity, TableFormat
+from ..base.tables import DEGREES, METRES, NUMBERS, Quantity, TableFormat
+from ..base.time_units import SECONDS
 
 # Prefixes that programs write before x, y and z of a position, and before the letters of a
 # quaternion.

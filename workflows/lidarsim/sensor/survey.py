@@ -537,9 +537,16 @@ class Survey(CloudOptions, Weather):
             if steps := carried.steps or self.steps:
                 counts.append(steps)
                 continue
-            candidates = range(1, MAX_STEPS + 1)
+            candidates = range(1, MAX_STEPS + 2)
             end_ns = partial(_last_firing_ns, carried.sensor)
             counts.append(bisect_right(candidates, self.path.duration_ns, key=end_ns))
+            if counts[-1] > MAX_STEPS:
+                raise LidarError(
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and "
+                    f"{MAX_STEPS:,} time steps of the sensor, the limit of a survey, take "
+                    f"{end_ns(MAX_STEPS) / 1e9:.6g} s: give duration_s or steps for a part of it, "
+                    "or a larger step_deg."
+                )
             if not counts[-1]:
                 raise LidarError(
                     f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "

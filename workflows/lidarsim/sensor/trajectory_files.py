@@ -14,11 +14,12 @@ from ..base.arrays import Floats
 from ..base.errors import LidarError, message_of
 from ..base.tables import column_name, find_header, read_table
 from ..base.textfile import read_text
+from ..base.time_units import TimeUnit, seconds_of
 from ..base.validation import checked
 from ..base.vectors import turned
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
-from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, read_oxts
+from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
 from .pose_columns import (
     ANGLES,
     POSE_TABLES,
@@ -58,12 +59,20 @@ class PoseTable(NamedTuple):
     quaternions: Floats | None  # (k, 4): x, y, z, w; None if the file has no orientations
 
 
+class TimeOptions(NamedTuple):
+    """What a user states of the times of a file of poses."""
+
+    file: str | Path | None  # file of the times of KITTI's poses
+    unit: TimeUnit | None
+
+
 @checked
 def load_trajectory(
     path: str | Path,
     *,
     format: TrajectoryFormat | None = None,  # noqa: A002 - its name in scenarios
     times: str | Path | None = None,
+    time_unit: TimeUnit | None = None,
     columns: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
     topic: str | None = None,
@@ -89,7 +98,12 @@ def load_trajectory(
     format
         "tum", "kitti", "csv", "oxts" or "bag"; by default by the content.
     times
-        For a KITTI file, or a file of rows of oxts: the file with the seconds of its rows.
+        For a KITTI file, or a file of rows of oxts: the file with the seconds of its rows, or with
+        their dates, as KITTI's timestamps.txt.
+    time_unit
+        Unit of the times in the file, "s", "ms", "us" or "ns", if it is not the unit that the
+        header or the format states. Without `time_unit`, times of 1e11 s and more, and times that
+        span more than a year, are refused.
     columns
         For a table, {name as above: name in the file}, if the names differ.
     ignore
@@ -121,13 +135,14 @@ def load_trajectory(
         names the file.
     """
     path = Path(path)
+    timing = TimeOptions(times, time_unit)
     try:
         if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
-            kind, poses = _of_container(path, format, times, topic, origin)
+            kind, poses = _of_container(path, format, timing, topic, origin)
         else:
             _refuse_topic(topic)
             text = read_text(path)
-            kind, poses = _of_text(text, format, times, columns or {}, ignore, origin)
+            kind, poses = _of_text(text, format, timing, columns or {}, ignore, origin)
         if (columns or ignore) and kind != "csv":
             raise ValueError(f"columns and ignore are of tables with a header, and it is {kind}")
         if origin is not None and kind not in ("oxts", "bag"):
@@ -162,7 +177,7 @@ def _refuse_topic(topic: str | None) -> None:
 def _of_container(
     path: Path,
     kind: TrajectoryFormat | None,
-    times: str | Path | None,
+    timing: TimeOptions,
     topic: str | None,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
@@ -170,17 +185,19 @@ def _of_container(
     if not path.exists():
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
-        if times is not None:
+        if timing.file is not None:
             raise ValueError("a bag has times of its own: leave out times")
-        return "bag", PoseTable(*read_bag(path, topic, origin))
+        poses = PoseTable(*read_bag(path, topic, origin))
+        return "bag", poses._replace(seconds=seconds_of(poses.seconds, timing.unit))
     _refuse_topic(topic)
     folder = find_oxts(path)
     if folder is not None and kind in (None, "oxts"):
-        if times is not None:
+        if timing.file is not None:
             raise ValueError("a folder of oxts has times of its own: leave out times")
-        return "oxts", PoseTable(*read_oxts(folder, origin))
+        poses = PoseTable(*read_oxts(folder, origin))
+        return "oxts", poses._replace(seconds=_seconds_of_dates(poses.seconds, timing.unit))
     if path.is_file() and kind == "oxts":
-        return _of_text(read_text(path), kind, times, {}, (), origin)
+        return _of_text(read_text(path), kind, timing, {}, (), origin)
     raise ValueError(
         "a folder is one of KITTI, with timestamps.txt and data, or a bag of ROS 2, with "
         f"metadata.yaml{'' if kind is None else f'; format says {kind}'}"
@@ -190,56 +207,77 @@ def _of_container(
 def _of_text(
     text: str,
     kind: TrajectoryFormat | None,
-    times: str | Path | None,
+    timing: TimeOptions,
     columns: Mapping[str, str],
     ignore: Sequence[str],
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
     """Return the format and the poses of a text file."""
     lines = text.splitlines()
-    if times is not None and kind not in (None, "kitti", "oxts"):
+    if timing.file is not None and kind not in (None, "kitti", "oxts"):
         raise ValueError(f"times are of KITTI's poses, and format says {kind}")
-    header = find_header(lines, _is_pose_column) if times is None else None
+    header = find_header(lines, _is_pose_column) if timing.file is None else None
     if kind == "csv" or (kind in (None, "tum") and header is not None):
         # Rows of TUM are separated by spaces, and may have their header in a remark.
-        seconds_by_default = header is not None and header.comment and header.separator is None
-        return "csv", _table(text, columns, ignore, seconds_by_default or kind == "tum")
-    return _of_rows(_numbers(text), kind, times, origin)
+        in_remark = header is not None and header.comment and header.separator is None
+        bare = {"time_s": "s"} if in_remark or kind == "tum" else {}
+        return "csv", _table(text, columns, ignore, bare, timing.unit)
+    return _of_rows(_numbers(text), kind, timing, origin)
 
 
 def _of_rows(
     rows: Floats,
     kind: TrajectoryFormat | None,
-    times: str | Path | None,
+    timing: TimeOptions,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
     """Return the format and the poses of rows of numbers (k, n) without header."""
     width = rows.shape[1]
     if kind is None:
-        kind = "oxts" if width == WIDTH else "kitti" if times or width == 12 else "tum"
+        kind = "oxts" if width == WIDTH else "kitti" if timing.file or width == 12 else "tum"
     if kind == "tum":
         if width != 8:
             raise ValueError(
                 f"its rows have {width} numbers and no header: rows of TUM have 8, those of KITTI "
                 "12; give a table a header, as in time_s,x,y,z,yaw_deg"
             )
-        return kind, PoseTable(rows[:, 0], rows[:, 1:4], rows[:, 4:])
-    if times is None:
+        return kind, PoseTable(seconds_of(rows[:, 0], timing.unit), rows[:, 1:4], rows[:, 4:])
+    if timing.file is None:
         raise ValueError("KITTI's poses have no times: give their file as times")
-    try:
-        seconds = _numbers(read_text(Path(times)), 1)[:, 0]
-    except ValueError as error:
-        raise ValueError(f"{times} has no times: {message_of(error)}") from error
+    seconds = _seconds_in_file(Path(timing.file), timing.unit)
     expected = WIDTH if kind == "oxts" else 12
     if width != expected:
         raise ValueError(f"its rows have {width} numbers, not {expected}")
     if len(rows) != len(seconds):
-        raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
+        raise ValueError(f"it has {len(rows)} poses and {timing.file} {len(seconds)} times")
     if kind == "oxts":
         return kind, PoseTable(seconds, *oxts_poses(rows, origin))
     poses = rows.reshape(-1, 3, 4)
     check_rotations(poses[..., :3], slack=2 * QUATERNION_SLACK)
     return kind, PoseTable(seconds, poses[..., 3], quaternions_of(poses[..., :3]))
+
+
+def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
+    """Return the seconds (k,) in a file of times: a number or a date in each row."""
+    try:
+        text = read_text(path)
+        dates = dates_of(text)
+        has_dates = dates is not None and len(dates) > 0
+        times = dates if has_dates else _numbers(text, 1)[:, 0]
+    except ValueError as error:
+        raise ValueError(f"{path} has no times: {message_of(error)}") from error
+    assert times is not None  # of dates, or of numbers
+    try:
+        return _seconds_of_dates(times, unit) if has_dates else seconds_of(times, unit)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
+    """Return the seconds (k,) of dates; ValueError if the user states their unit."""
+    if unit is not None:
+        raise ValueError("its times are dates: leave out time_unit")
+    return seconds_of(seconds, None, advice="correct them")
 
 
 def _is_pose_column(cell: str) -> bool:
@@ -271,9 +309,13 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
 
 
 def _table(
-    text: str, names: Mapping[str, str], ignore: Sequence[str], seconds_by_default: bool
+    text: str,
+    names: Mapping[str, str],
+    ignore: Sequence[str],
+    bare: Mapping[str, str],
+    time_unit: TimeUnit | None,
 ) -> PoseTable:
-    """Return the poses of a table with a header; `seconds_by_default` is for times without unit."""
+    """Return the poses of a table with a header; `bare` are units of columns without a unit."""
     quaternion = [quantity.name for quantity in QUATERNION]
 
     def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
@@ -290,7 +332,8 @@ def _table(
             ignore=ignore,
             formats=POSE_TABLES,
             refused=REFUSED_COLUMNS,
-            bare={"time_s": "s"} if seconds_by_default else {},
+            bare=bare,
+            time_unit=time_unit,
         )
     )
     seconds = columns["time_s"]

@@ -29,8 +29,9 @@ MATERIAL = "material"  # name of the column
 NO_MATERIAL = "no material"
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
-# The scale is logarithmic if numbers differ by the first factor and the median is this low in their
-# range, or if numbers without a unit, such as intensities, differ by the second factor.
+# The scale of energies is logarithmic if they differ by the first factor and the median is this low
+# in their range, or if they differ by the second factor. The scale of other columns is linear: of
+# heights from 0.1 to 20 m, half of a logarithmic scale is for the lowest 1.4 m.
 _SKEWED_RATIO = 10.0
 _SKEWED_MEDIAN = 0.1
 _WIDE_RATIO = 30.0
@@ -103,9 +104,10 @@ def colours_of(
     `limits` are the ends of a scale of numbers in its unit, in place of those of the values.
 
     `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
-    without names and with too many values for a legend are on a scale like numbers. Numbers that
-    are mostly small with a few large numbers, and intensities of a wide range, have a logarithmic
-    scale. Velocities are blue below 0 and red above. NaN is grey, and so are points on no surface.
+    without names and with too many values for a legend are on a scale like numbers. Columns with
+    `Column.scale` "logarithmic", such as intensities, have that scale if their values differ by
+    large factors. Velocities are blue below 0 and red above. NaN is grey, and so are points on no
+    surface.
     """
     if column in (RGB, NORMALS):
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
@@ -147,11 +149,12 @@ class _Range(NamedTuple):
     middle: float  # median
     upper: float
 
-    def is_logarithmic(self, unit: str) -> bool:
-        """Return True if numbers of a unit, "" for none, need a logarithmic scale."""
+    @property
+    def has_large_factors(self) -> bool:
+        """True if the numbers are positive, and differ by factors that a linear scale hides."""
         is_low = self.middle - self.lower < _SKEWED_MEDIAN * (self.upper - self.lower)
         is_skewed = self.upper > _SKEWED_RATIO * self.lower and is_low
-        is_wide = not unit and self.upper > _WIDE_RATIO * self.lower
+        is_wide = self.upper > _WIDE_RATIO * self.lower
         return bool(self.lower > 0 and (is_skewed or is_wide))
 
 
@@ -182,7 +185,7 @@ def _number_colouring(
         max_speed = max(-limits.lower, limits.upper)
         limits = _Range(-max_speed, limits.middle, max_speed)
         scale = DIVERGING
-    logarithmic = limits.is_logarithmic(unit)
+    logarithmic = column.scale == "logarithmic" and limits.has_large_factors
     if chosen_limits is not None:
         limits = _Range(chosen_limits[0], limits.middle, chosen_limits[1])
         logarithmic = logarithmic and limits.lower > 0

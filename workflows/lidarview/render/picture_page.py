@@ -349,7 +349,12 @@ class Page:
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
         bar.set_label(
-            title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT, parse_math=False
+            title,
+            fontsize=7.6 * self.unit,
+            color=theme.INK,
+            family=FONT,
+            parse_math=False,
+            labelpad=4 * self.unit,
         )
         axes.tick_params(
             which="both",
@@ -359,10 +364,13 @@ class Page:
             labelcolor=theme.MUTED,
             labelfontfamily=FONT,
             length=2.5 * self.unit,
+            pad=3.5 * self.unit,
         )
         if isinstance(norm, LogNorm):
             is_narrow = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
             label_logarithms(axes.yaxis, is_narrow)
+        else:
+            _label_in_full(axes.yaxis)
 
     def save(self, path: Path) -> None:
         """Write the page as a PNG, in its light colours; a link at the path is replaced.
@@ -404,6 +412,16 @@ def label_logarithms(axis: Axis, is_narrow: bool) -> None:
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())
+
+
+def _label_in_full(axis: Axis) -> None:
+    """Write the numbers at a linear axis in full, as 1,497.005: never as a sum with an offset."""
+    ticks = axis.get_majorticklocs()
+    step = float(np.diff(ticks[:2])[0]) if len(ticks) > 1 else 1.0
+    decimals = next((n for n in range(12) if math.isclose(step, round(step, n))), 12)
+    axis.set_major_formatter(
+        lambda value, _: f"{round(value, decimals) + 0.0:,.{decimals}f}".replace("-", "−")
+    )
 
 
 def _grid(shot: SurfaceView) -> Floats:

@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
 from lidarsim.base.words import plural, without_common_prefix
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import Column, Z
+from lidarsim.columns.table import AXES, Column, Z
 from lidarsim.scene.scene import Scene
 
 from . import theme
@@ -122,20 +122,25 @@ def draw_cloud(
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
     if len(cloud):
-        values = cloud.positions[:, 2] if column is Z else values_of(column, cloud.__getitem__)
+        if column in AXES:
+            values = cloud.positions[:, AXES.index(column)]
+        else:
+            values = values_of(column, cloud.__getitem__)
         coloured = colours_of(values, column, names)
         positions = cloud.positions - shot.scene.origin
         image = with_points(image, shot, positions, coloured.paint(values), solid)
         if coloured.limits is None:
             page.legend(coloured.labels)
         else:
-            unit = f" ({coloured.unit})" if coloured.unit else f"\n{fill(coloured.meaning, 42)}"
+            unit = f" ({coloured.unit})"
+            if not coloured.unit:
+                unit = "\n" + fill(coloured.meaning, 46, max_lines=2, placeholder=" …")
             lower, upper = coloured.limits
             scale = LogNorm if coloured.logarithmic else Normalize
             norm = scale(lower, upper if upper > lower else lower + 1)
             page.colour_bar(coloured.scale, norm, (coloured.name + unit).rstrip())
     page.show(shot, image)
-    by = "height" if column is Z else column.name.replace("_", " ")
+    by = "height" if column is Z else column.name.removesuffix("_deg").replace("_", " ")
     page.title(f"Point cloud by {by}", f"{plural(count, 'point')} · {shot.caption}", shot.models)
     return page
 

@@ -17,7 +17,7 @@ function short(value) {
   return whole(value);
 }
 
-const inSeconds = (value) => `${value >= 100 ? whole(value) : value.toPrecision(2)} s`;
+const inSeconds = (value) => value === null ? "–" : `${value >= 100 ? whole(value) : value.toPrecision(2)} s`;
 
 // -- the run -----------------------------------------------------------------------------
 

@@ -1,0 +1,57 @@
+"""Casting times of the jobs of a data set, in a file of its report.
+
+Times differ from run to run. The table of jobs, whose bytes are those of any run, has none.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator, Mapping
+
+from lidarsim.base.errors import LidarError, message_of
+from lidarsim.base.storage import Storage
+
+from .job_table import JobRow
+
+SECONDS_FILE = "report.csv"
+_HEADER = ["number", "seconds"]
+
+
+def writing_seconds(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
+    """Yield the rows of jobs, and write their casting times into SECONDS_FILE.
+
+    The file appears after the last row.
+    """
+    with storage.writing(SECONDS_FILE) as file:
+        file.write(f"{','.join(_HEADER)}\n".encode())
+        for row in jobs:
+            file.write(f"{row.number},{row.seconds!r}\n".encode())
+            yield row
+
+
+def read_seconds(storage: Storage) -> Mapping[int, float]:
+    """Return the casting times of jobs, {number: seconds}.
+
+    Raises
+    ------
+    LidarError
+        If the file is missing or damaged.
+    """
+    try:
+        header, *rows = csv.reader(io.StringIO(storage.read(SECONDS_FILE).decode()), strict=True)
+        if header != _HEADER:
+            raise ValueError("it has another header")
+        return {int(number): float(seconds) for number, seconds in rows}
+    except (OSError, ValueError, csv.Error) as error:
+        raise LidarError(
+            f"{storage.path(SECONDS_FILE)} has no casting times of jobs: {message_of(error)}"
+        ) from error
+
+
+def known_seconds(storage: Storage) -> Mapping[int, float]:
+    """Return the casting times of jobs as `read_seconds`; empty if the file is unusable."""
+    try:
+        return read_seconds(storage)
+    except LidarError:
+        return {}
