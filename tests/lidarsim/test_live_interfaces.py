@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager, suppress
@@ -267,6 +270,39 @@ def test_a_browser_reads_what_it_may_not_change():
         assert ask(service, "GET", "/api/v1/sensor/config", headers=BROWSER)[0] == 200
         get_config = "/api/v1/sensor/cmd/get_config_param?args=active"
         assert ask(service, "GET", get_config, headers=BROWSER)[0] == 200
+
+
+# The SDK holds Python's lock while it waits for an answer, so it has a process of its own.
+SDK = """
+from ouster.sdk.core import SensorConfig
+from ouster.sdk.sensor import get_config, set_config
+print(get_config("127.0.0.1").udp_port_lidar)
+config = SensorConfig()
+config.udp_dest = "127.0.0.7"
+config.udp_port_lidar = 7702
+set_config("127.0.0.1", config)
+config = SensorConfig()
+config.udp_port_lidar = 7802
+set_config("127.0.0.1", config, udp_dest_auto=True)
+try:
+    get_config("site.example")
+except RuntimeError as error:
+    print("not a name of this service" in str(error))
+"""
+
+
+@pytest.mark.slow
+def test_ouster_sdk_configures_the_sensor_through_a_proxy():
+    pytest.importorskip("ouster.sdk.sensor")
+    with interface("ouster/os0-32") as (service, asked):
+        environment = os.environ | {"http_proxy": f"http://127.0.0.1:{service.port}"}
+        command = [sys.executable, "-c", SDK]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["7502", "True"]
+        assert asked == [
+            Destination("127.0.0.7", {7502: 7702, 7503: 7503}),
+            Destination("127.0.0.1", {7502: 7802, 7503: 7503}),
+        ]
 
 
 @pytest.mark.parametrize("digits", ["9" * 5000, "\u0662", "-1", "65536", "", "1e3"])
