@@ -5,7 +5,12 @@ The scheduler makes it, and it reloads every two seconds, without scripts.
 
 from __future__ import annotations
 
+import asyncio
+import os
+from collections.abc import Collection
+from http import HTTPStatus
 from typing import Any
+from urllib.parse import urlsplit
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -16,14 +21,17 @@ from .errors import PipeClosed, PoolError
 from .fence import fences_of
 from .internals.names import PAGE, require
 from .internals.scheduler import serve, serve_no_longer
+from .other_sites import names_of_machine, refusal
 from .pipe_states import pipes_of
 from .stats import NAME as STATISTICS
 from .stats import StageStats, forget_statistics, running_on, slots_of, statistics_of, stats_of
 from .steward import NAME as STEWARD
-from .workers import on_scheduler
+from .workers import check_client, on_scheduler
 
 NAME = "poolpart-page"
 PATH = "partitions"
+_ANY_ADDRESS = "0.0.0.0"  # dashboards listen on the network unless they are told otherwise
+_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable behind the proxy of a JupyterHub
 
 # Names come from users: tornado escapes all that is written into a template.
 _PAGE = Template("""<!doctype html>
@@ -99,10 +107,19 @@ def _worker(worker: Any) -> list[object]:
 
 
 class _Handler(web.RequestHandler):
-    """Sends the page; the browser may load and run the page alone."""
+    """Sends the page, but to no other website; the browser may load and run the page alone."""
 
-    def initialize(self, scheduler: Any) -> None:
+    def initialize(self, scheduler: Any, owners: PageOwners) -> None:
         self.scheduler = scheduler
+        self.names = owners.names
+
+    def prepare(self) -> None:
+        """Refuse requests of other websites; only links to the page are followed."""
+        reason = refusal(self.request.headers, self.names, is_page=True)
+        if reason:
+            self.set_status(HTTPStatus.FORBIDDEN)
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish(f"{reason}; distributed.dashboard.link may have another name")
 
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
@@ -115,13 +132,24 @@ class PageOwners(SchedulerPlugin):
 
     name = NAME
 
-    def __init__(self, scheduler: Any) -> None:
+    def __init__(self, scheduler: Any, names: Collection[str]) -> None:
         self.owners: set[str] = set()  # clients, by id
+        # Names that the page is asked by; None where a proxy has a name that is not known here.
+        self.names: set[str] | None = None if _HUB in os.environ else {*names}
         self.began_to_count = STATISTICS not in scheduler.plugins
         # A `dask scheduler --dashboard-prefix` is part of the path.
-        handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler})]
+        handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler, "owners": self})]
         self.page = web.Application(handlers)
         serve(scheduler, self.page)
+
+    def add(self, owner: str, link: str | None) -> None:
+        """Add a client that wants the page, with its link to the dashboard, None if unknown."""
+        self.owners.add(owner)
+        host = urlsplit(link or "").hostname
+        if link and not host:  # relative to the page of a notebook
+            self.names = None
+        elif host and self.names is not None:
+            self.names.add(host)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Record that a client has gone, or no longer wants the page."""
@@ -134,11 +162,12 @@ class PageOwners(SchedulerPlugin):
 
 def partitions_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
-    on_scheduler(client, _open, owner=client.id)
+    check_client(client)
     try:
         link = client.dashboard_link
     except KeyError:  # no such service
         link = None
+    on_scheduler(client, _open, owner=client.id, link=link)
     if not link:
         raise PoolError(
             f"The scheduler at {client.scheduler.address} has no HTTP server for a page: start "
@@ -147,13 +176,15 @@ def partitions_page(client: Client) -> str:
     return f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
 
 
-async def _open(owner: str, dask_scheduler: Any = None) -> None:
+async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> None:
     require(PAGE)
+    # Looking up the domain may take seconds.
+    names = await asyncio.to_thread(names_of_machine, _ANY_ADDRESS)
     if owner not in dask_scheduler.clients:  # killed, and already removed
         return
     if NAME not in dask_scheduler.plugins:
-        dask_scheduler.add_plugin(PageOwners(dask_scheduler))
-    dask_scheduler.plugins[NAME].owners.add(owner)
+        dask_scheduler.add_plugin(PageOwners(dask_scheduler, names))
+    dask_scheduler.plugins[NAME].add(owner, link)
     statistics_of(dask_scheduler)
 
 

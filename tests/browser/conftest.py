@@ -44,6 +44,8 @@ OPTIONS = (
     "--disable-renderer-backgrounding",
     "--window-size=1280,800",
     "--remote-debugging-port=0",
+    # Sites of others, and an address of a network, which is not loopback for the browser.
+    "--host-resolver-rules=MAP site.example 127.0.0.1, MAP 203.0.113.50 127.0.0.1",
 )
 
 

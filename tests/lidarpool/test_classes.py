@@ -86,6 +86,21 @@ def test_a_path_of_a_campaign_leads_to_the_name_of_a_class():
         find_field(scenario, "classes.41")
 
 
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("poses.1.position", "1 entry, counted from 0, and no entry 1"),
+        (f"poses.{'9' * 5000}", "999…999"),
+    ],
+)
+def test_an_entry_beyond_a_list_is_named_in_a_line(path, words):
+    scenario = Scenario.from_data({"poses": [[0, 0, 1]]})
+    assert [key for key, _ in find_field(scenario, "poses.00.position")[0]][1] == 0
+    with pytest.raises(LidarError) as raised:
+        find_field(scenario, path)
+    assert words in str(raised.value) and len(str(raised.value)) < 200
+
+
 def test_without_names_sweeps_have_the_bytes_that_they_had(scene, sweeps):
     plain = replace(sweeps, classes={})
     assert b"classes" not in plain.packed()

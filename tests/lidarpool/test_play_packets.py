@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import random
@@ -40,6 +41,7 @@ from lidarpool.export.formats import Format
 from lidarpool.playback.packets import RepeatedInstruments
 from lidarpool.playback.recording import Recording
 from lidarpool.playback.sources import open_source, scenario_job
+from lidarpool.playback.transmitter import Transmitter, sensor_streams
 from lidarsim.columns.cloud import Cloud
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
@@ -255,6 +257,10 @@ steps: 36
         (TWO, ["--to", "front=127.0.0.1"], "there is no sensor 'front'; there are roof, rear."),
         (VLP16, ["--to", "::1"], "is of IPv6"),
         (VLP16, ["--to", "lidar=239.1.1.1"], "a multicast address"),
+        (VLP16, ["--to", "255.255.255.255"], "no address of a receiver"),
+        (VLP16, ["--to", "127.255.255.255"], "no address of a receiver"),
+        (VLP16, ["--to", f"127.0.0.1:{'9' * 5000}"], "is no address: give HOST or HOST:PORT"),
+        (VLP16, ["--api", f"127.0.0.1:{'9' * 5000}"], "is no address: give HOST or HOST:PORT"),
         (VLP16, ["--to", "127.0.0.1:65535"], "would go to port 65536: give a port nearer"),
         (VLP16, ["--api", "203.0.113.1"], "cannot listen at 203.0.113.1:80"),
         (VLP16, ["--as", "radar"], "'radar' is no bridge: use packets"),
@@ -289,6 +295,25 @@ def test_a_port_of_the_interface_that_is_in_use_is_refused(tmp_path):
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--api", address)
     assert f"cannot listen at {address} (Address already in use)" in str(outcome.exception)
+
+
+def test_the_name_given_for_the_interface_is_one_of_its_names(monkeypatch):
+    resolve = socket.getaddrinfo
+
+    def getaddrinfo(host, *arguments):
+        return resolve("127.0.0.1" if host == "Lab.example" else host, *arguments)
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    encoder = encoder_of(PacketSource(load_sensor("velodyne/vlp16"), "strongest", "roof"))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    (stream,) = sensor_streams([encoder], [], [f"Lab.example:{port}"])
+    with Transmitter([stream], print):
+        for host, status in (("lab.example", 200), ("lab.example.site.example", 403)):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+            connection.request("GET", "/cgi/info.json", headers={"Host": host})
+            assert connection.getresponse().status == status
+            connection.close()
 
 
 def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(

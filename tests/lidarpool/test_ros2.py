@@ -193,6 +193,7 @@ def test_messages_of_all_types_are_read(dds):
     [
         ((), {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233': set it to a number from 0 to 232"),
         ((), {"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
+        ((), {"ROS_DOMAIN_ID": "9" * 5000}, "ROS_DOMAIN_ID is '9999.*': set it to a number"),
         (("127.0.0.1:7400",), {}, "--to 127.0.0.1:7400: no such host: give a host or an IPv4 add"),
         (("239.255.0.1",), {}, "--to 239.255.0.1 is a multicast address"),
         (("::1",), {}, "--to ::1: no such host"),

@@ -268,6 +268,14 @@ def test_a_port_in_use_is_refused_and_by_default_another_is_taken(played):
         bridge_class("foxglove")(played[0], Schedule(), options, print)
 
 
+@needs_foxglove
+@pytest.mark.parametrize("to", ["0.0.0.0:0", "[::]:0"])
+def test_foxglove_is_served_to_this_machine_only(to):
+    with pytest.raises(LidarError, match="listens on this machine only") as raised:
+        open_viewer("foxglove", to)
+    assert "ssh -L" in str(raised.value)
+
+
 @pytest.mark.parametrize(
     ("text", "address"),
     [("localhost", "localhost:8765"), (":90", "127.0.0.1:90"), ("[::1]", "[::1]:8765")],
@@ -277,10 +285,16 @@ def test_addresses_have_defaults(text, address, monkeypatch):
     assert str(Address.choose(text, 8765)) == address
 
 
-@pytest.mark.parametrize("text", ["127.0.0.1:http", "127.0.0.1:99999", "a:-1"])
+@pytest.mark.parametrize("text", ["127.0.0.1:http", "127.0.0.1:99999", "a:-1", "a:\u0661"])
 def test_what_is_no_address_is_refused(text):
     with pytest.raises(LidarError, match=f"'{text}' is not an address: give ADDRESS:PORT"):
         Address.choose(text, 8765)
+
+
+def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
+    with pytest.raises(LidarError, match="is not an address: give ADDRESS:PORT") as raised:
+        Address.choose(f"127.0.0.1:{'9' * 5000}", 8765)
+    assert len(str(raised.value)) < 200
 
 
 def test_what_is_missing_names_its_extra(room, monkeypatch, tmp_path):

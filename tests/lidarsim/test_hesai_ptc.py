@@ -101,7 +101,9 @@ def test_datagrams_go_where_a_command_says(asked):
         assert asked(port, 0x20, parameter) == (0, b"")
         assert redirected == [Destination("127.0.0.1", {2368: 41_000})]
         assert struct.unpack(">H", asked(port, 0x08)[1][16:18]) == (41_000,)
-        for wrong in (b"", parameter[:7], bytes(8), bytes([239, 0, 0, 1]) + parameter[4:]):
+        several = [[239, 0, 0, 1], [255] * 4, [127, 255, 255, 255]]
+        addresses = [bytes(address) + parameter[4:] for address in several]
+        for wrong in (b"", parameter[:7], bytes(8), *addresses):
             assert asked(port, 0x20, wrong) == (INVALID, b"")
     assert len(redirected) == 1
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import socket
+import subprocess
+import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from urllib.parse import quote
 
 import pytest
@@ -188,6 +191,10 @@ def test_a_request_in_absolute_form_is_answered_as_by_a_proxy():
         (b"POST /api/v1/sensor/config HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n", 411),
         (b"GET / HTTP/1.1\r\nX: " + b"x" * 40_000 + b"\r\n\r\n", 431),
         (b"POST /api/v1/sensor/config HTTP/1.1\r\nOrigin: http://a.b\r\n\r\n", 403),
+        (b"GET http://site.example/api/v1/sensor/cmd/reinitialize HTTP/1.1\r\n\r\n", 403),
+        (b"GET //site.example/api/v1/sensor/cmd/reinitialize HTTP/1.1\r\n\r\n", 403),
+        (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: site.example\r\n\r\n", 403),
+        (b"POST / HTTP/1.1\r\nContent-Length: 1\r\nContent-Length: 1\r\n\r\n", 400),
     ],
 )
 def test_what_is_not_understood_is_refused(content, status):
@@ -195,6 +202,135 @@ def test_what_is_not_understood_is_refused(content, status):
         assert raw(service, content).startswith(f"HTTP/1.1 {status} ".encode())
         assert ask(service, "GET", "/api/v1/system/firmware")[0] == 200
         assert not asked
+
+
+CROSS_SITE = {"Sec-Fetch-Site": "cross-site"}
+BROWSER = {"User-Agent": "Mozilla/5.0 (X11; Linux x86_64) Chrome/148.0"}
+REDIRECTIONS = {
+    "ouster/os1-64": [
+        ("GET", "/api/v1/sensor/cmd/set_config_param?args=udp_dest+127.0.0.77", None),
+        ("GET", "/api/v1/sensor/cmd/set_udp_dest_auto", None),
+        ("HEAD", "/api/v1/sensor/cmd/reinitialize", None),
+        ("GET", "/api/v1/sensor/cmd/reinitialize/", None),
+        ("POST", "/api/v1/sensor/config", '{"udp_dest": "127.0.0.77"}'),
+        ("DELETE", "/api/v1/user/data", None),
+    ],
+    "velodyne/vlp16": [
+        ("POST", "/cgi/setting/host", "addr=127.0.0.77"),
+        ("POST", "/cgi/setting", "laser=off"),
+    ],
+}
+
+
+@pytest.mark.parametrize("model", REDIRECTIONS)
+@pytest.mark.parametrize(
+    "headers",
+    [
+        CROSS_SITE,
+        {"Sec-Fetch-Site": "same-site"},
+        {"Origin": "http://site.example"},
+        {"Origin": "null"},
+        {"Host": "site.example"},
+        {"Host": "site.example:80"},
+        CROSS_SITE | {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
+        BROWSER,
+        BROWSER | {"Referer": "http://site.example/"},
+    ],
+)
+def test_requests_of_other_websites_change_nothing(model, headers):
+    with interface(model) as (service, asked):
+        before = service.destination
+        for method, path, body in REDIRECTIONS[model]:
+            assert ask(service, method, path, body, headers)[0] == 403
+        assert (service.destination, asked) == (before, [])
+
+
+@pytest.mark.parametrize("model", REDIRECTIONS)
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "127.0.0.1"},
+        {"Host": "localhost:8080"},
+        {"Host": socket.gethostname()},
+        {"User-Agent": "curl/8.5.0"},
+        BROWSER | {"Sec-Fetch-Site": "none"},
+        BROWSER | {"Referer": "http://127.0.0.1:{port}/cgi/settings.json"},
+    ],
+)
+def test_clients_and_the_user_in_a_browser_set_the_receiver(model, headers):
+    with interface(model) as (service, asked):
+        own = {name: value.format(port=service.port) for name, value in headers.items()}
+        for method, path, body in REDIRECTIONS[model]:
+            assert ask(service, method, path, body, own)[0] in (200, 204)
+        assert asked
+
+
+def test_a_browser_reads_what_it_may_not_change():
+    with interface("ouster/os1-64") as (service, _):
+        assert ask(service, "GET", "/api/v1/sensor/config", headers=BROWSER)[0] == 200
+        get_config = "/api/v1/sensor/cmd/get_config_param?args=active"
+        assert ask(service, "GET", get_config, headers=BROWSER)[0] == 200
+
+
+# The SDK holds Python's lock while it waits for an answer, so it has a process of its own.
+SDK = """
+from ouster.sdk.core import SensorConfig
+from ouster.sdk.sensor import get_config, set_config
+print(get_config("127.0.0.1").udp_port_lidar)
+config = SensorConfig()
+config.udp_dest = "127.0.0.7"
+config.udp_port_lidar = 7702
+set_config("127.0.0.1", config)
+config = SensorConfig()
+config.udp_port_lidar = 7802
+set_config("127.0.0.1", config, udp_dest_auto=True)
+try:
+    get_config("site.example")
+except RuntimeError as error:
+    print("not a name of this service" in str(error))
+"""
+
+
+@pytest.mark.slow
+def test_ouster_sdk_configures_the_sensor_through_a_proxy():
+    pytest.importorskip("ouster.sdk.sensor")
+    with interface("ouster/os0-32") as (service, asked):
+        environment = os.environ | {"http_proxy": f"http://127.0.0.1:{service.port}"}
+        command = [sys.executable, "-c", SDK]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["7502", "True"]
+        assert asked == [
+            Destination("127.0.0.7", {7502: 7702, 7503: 7503}),
+            Destination("127.0.0.1", {7502: 7802, 7503: 7503}),
+        ]
+
+
+@pytest.mark.parametrize("digits", ["9" * 5000, "\u0662", "-1", "65536", "", "1e3"])
+def test_a_port_that_is_none_is_refused(digits):
+    with interface("velodyne/vlp16") as (service, asked):
+        body = f"dport={quote(digits)}"
+        assert ask(service, "POST", "/cgi/setting/host", body)[0] == 400
+    with interface("ouster/os1-64") as (service, _):
+        path = f"/api/v1/sensor/cmd/set_config_param?args=udp_port_lidar+{quote(digits)}"
+        assert ask(service, "GET", path)[0] == 400
+    assert not asked
+
+
+def test_beyond_the_limit_the_oldest_unfinished_connection_gives_way():
+    with interface("ouster/os1-64") as (service, _), ExitStack() as stack:
+        address = ("127.0.0.1", service.port)
+        slow = []
+        for number in range(200):
+            slow.append(stack.enter_context(socket.create_connection(address, 10)))
+            slow[-1].send(b"GET /api/v1/system/firmware HTTP/1.1\r\n")
+            if number % 50 == 49:
+                assert ask(service, "GET", "/api/v1/system/firmware")[0] == 200
+        closed = len(slow) - service.max_connections
+        for connection in slow[:closed]:
+            with suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+        slow[-1].send(b"\r\n")
+        assert slow[-1].recv(12) == b"HTTP/1.1 200"
 
 
 def test_connections_that_never_end_and_floods_leave_the_interface_alive(monkeypatch):

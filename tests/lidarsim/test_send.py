@@ -180,6 +180,10 @@ def test_the_process_imports_nothing_that_takes_time_to_start():
         ("127.0.0.1:0", "give HOST or HOST:PORT"),
         ("127.0.0.1:70000", "give HOST or HOST:PORT"),
         ("127.0.0.1:x", "give HOST or HOST:PORT"),
+        ("127.0.0.1:" + "9" * 5000, "give HOST or HOST:PORT"),
+        ("127.0.0.1:\u0662", "give HOST or HOST:PORT"),
+        ("255.255.255.255:2368", "no address of a receiver"),
+        ("127.255.255.255", "no address of a receiver"),
         ("no-such-host.invalid", "has no IPv4 address"),
         ("", "has no IPv4 address"),
         ("a" * 70 + ".b", "has no IPv4 address"),
@@ -189,6 +193,7 @@ def test_an_address_that_packets_cannot_go_to_is_refused_in_a_line(text, words):
     with pytest.raises(LidarError, match=words) as raised:
         Address.parse(text)
     assert "\n" not in str(raised.value)
+    assert len(str(raised.value)) < 250
 
 
 def test_addresses_are_parsed():

@@ -10,12 +10,13 @@ import time
 import types
 import urllib.error
 import urllib.request
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
 from tests.pages import ask
 
+from lidarview.viewer.guarded_server import MAX_CONNECTIONS
 from lidarview.viewer.point_selection import Abandoned
 from lidarview.viewer.server import MAX_SLOW, MAX_WAITING, announced, page_server
 
@@ -66,10 +67,11 @@ def served():
         yield page, source
 
 
-def said(page, method, what, path=None):
-    """Return the status and the body of an answer."""
+def said(page, method, what, path=None, **headers):
+    """Return the status and the body of an answer; _ of the names of headers is -."""
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=120)
-    connection.request(method, f"/{page.token}/{what}" if path is None else path)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, f"/{page.token}/{what}" if path is None else path, headers=named)
     answer = connection.getresponse()
     body = answer.read()
     connection.close()
@@ -156,6 +158,146 @@ def test_an_answer_that_nobody_waits_for_is_given_up(served):
     assert source.abandoned.wait(120)
 
 
+# -- other websites and programs that do not behave ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "cors"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Origin": "null"},
+        {"Host": "site.example"},
+    ],
+)
+def test_other_websites_are_refused_whatever_they_know(served, headers):
+    page, source = served
+    for method, what in (("GET", ""), ("GET", "secret"), ("GET", "page.js"), ("POST", "stop")):
+        status, body = said(page, method, what, **headers)
+        assert (status, b"secret" in body) == (403, False)
+        assert said(page, method, what, "/wrong/", **headers)[0] == 404
+    once = page.once()
+    assert said(page, "GET", "", f"/{once.split('/')[-2]}/", **headers)[0] == 403
+    assert source.ordered == []
+
+
+def test_a_browser_that_does_not_say_who_asks_stops_nothing(served):
+    page, source = served
+    browser = {"User_Agent": "Mozilla/5.0"}
+    assert said(page, "POST", "stop", **browser)[0] == 403
+    assert source.ordered == []
+    assert said(page, "POST", "stop", Origin=f"http://127.0.0.1:{page.port}", **browser)[0] == 200
+    assert said(page, "POST", "stop", Sec_Fetch_Site="same-origin", **browser)[0] == 200
+    assert source.ordered == ["stop", "stop"]
+
+
+def test_links_of_other_websites_lead_to_the_page_alone(served):
+    page, source = served
+    link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    assert [said(page, "GET", what, **link)[0] for what in ("", "job/7/")] == [200, 200]
+    for method, what in (("GET", "secret"), ("POST", "stop"), ("POST", "")):
+        assert said(page, method, what, **link)[0] == 403
+    assert source.ordered == []
+
+
+def test_a_hub_passes_on_a_name_of_its_own(monkeypatch):
+    monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
+    source = Secrets()
+    with page_server(source.answer, 0, source.stop) as page:
+        own = {"Host": "hub.example", "Sec_Fetch_Site": "same-origin"}
+        assert said(page, "GET", "secret", **own)[0] == 200
+        assert said(page, "POST", "stop", Origin="https://hub.example", **own)[0] == 200
+        assert said(page, "POST", "stop", Origin="https://site.example", **own)[0] == 403
+    assert source.ordered == ["stop"]
+
+
+def sent(page, content, timeout_s=120):
+    """Send bytes over a connection of its own; return what the server says until it closes."""
+    with socket.create_connection(("127.0.0.1", page.port), timeout_s) as connection:
+        connection.sendall(content)
+        answer = b""
+        while received := connection.recv(65_536):
+            answer += received
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("token", "headers", "status"),
+    [
+        ("wrong", "Content-Length: 100000000", 404),
+        ("wrong", "Transfer-Encoding: chunked", 404),
+        ("", "Content-Length: 100000000\r\nExpect: 100-continue", 404),
+        (None, "Content-Length: 100000000", 413),
+        (None, f"Content-Length: {'9' * 5000}", 413),
+        (None, "Content-Length: 4097", 413),
+        (None, "Content-Length: -1", 400),
+        (None, "Content-Length: 1\r\nSec-Fetch-Site: cross-site", 403),
+    ],
+)
+def test_requests_are_refused_before_their_bodies_are_read(served, token, headers, status):
+    page, source = served
+    path = f"/{page.token if token is None else token}/stop"
+    answer = sent(page, f"POST {path} HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n\r\n".encode())
+    assert answer.startswith(f"HTTP/1.1 {status} ".encode())
+    assert source.ordered == []
+
+
+def test_a_refusal_can_be_read_by_who_sends_a_large_body(served):
+    page, _ = served
+    answer = sent(
+        page, b"POST /wrong/ HTTP/1.1\r\nContent-Length: 20000000\r\n\r\n" + bytes(2 << 20)
+    )
+    assert answer.startswith(b"HTTP/1.1 404 ")
+
+
+def test_a_body_in_pieces_is_small_as_well(served):
+    page, source = served
+    head = (
+        f"POST /{page.token}/stop HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    )
+    piece = b"400\r\n" + bytes(1024) + b"\r\n"
+    assert sent(page, head.encode() + 5 * piece).startswith(b"HTTP/1.1 400 ")
+    assert source.ordered == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "GET /",
+        "POST /{token}/stop HTTP/1.1\r\nHost: a\r\n",
+        "GET http://[/ HTTP/1.1\r\n\r\n",
+        "POST /{token}/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nab",
+        "POST /wrong/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nab",
+        "GET /{token}/page.css HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    ],
+)
+def test_a_connection_without_a_whole_request_is_closed(monkeypatch, content):
+    monkeypatch.setattr("lidarview.viewer.guarded_server.REQUEST_WITHIN_S", 0.2)
+    source = Secrets()
+    with page_server(source.answer, 0, source.stop) as page:
+        sent(page, content.format(token=page.token).encode())  # returns once it is closed
+    assert source.ordered == []
+
+
+def test_connections_that_wait_give_way_to_new_ones(served):
+    page, _ = served
+    with ExitStack() as stack:
+        address = ("127.0.0.1", page.port)
+        waiting = []
+        for number in range(200):
+            waiting.append(stack.enter_context(socket.create_connection(address, 120)))
+            waiting[-1].send(f"GET /{page.token}/secret HTTP/1.1\r\nHost: localhost\r\n".encode())
+            if number % 50 == 49:
+                assert said(page, "GET", "secret")[0] == 200
+        for connection in waiting[: 200 - MAX_CONNECTIONS]:
+            with suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
+        waiting[-1].send(b"\r\n")
+        assert waiting[-1].recv(12) == b"HTTP/1.1 200"
+
+
 # -- slow questions --------------------------------------------------------------------------------
 
 
@@ -197,7 +339,7 @@ def unread(page, count, question):
     with ExitStack() as stack:
         for _ in range(count):
             connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port)))
-            connection.sendall(f"GET /{page.token}/{question} HTTP/1.1\r\nHost: a\r\n\r\n".encode())
+            connection.sendall(f"GET /{page.token}/{question} HTTP/1.0\r\n\r\n".encode())
         yield
 
 

@@ -1,10 +1,12 @@
 """The page of partitions: served by the scheduler, without scripts, and safe with users' names."""
 
 import re
+import socket
 import urllib.error
 import urllib.request
 from html import unescape
 
+import dask
 import pytest
 from distributed import Client, get_worker
 from tests.clusters import cluster_of
@@ -15,10 +17,11 @@ from poolpart import Partition, Pipe, Pool, PoolError
 NASTY = "<script>alert('x')</script>&\"'"
 
 
-def get(url):
+def get(url, headers=None):
     """Status, headers and text of an answer."""
+    request = urllib.request.Request(url, headers=headers or {})
     try:
-        with urllib.request.urlopen(url, timeout=LONG_S) as answer:
+        with urllib.request.urlopen(request, timeout=LONG_S) as answer:
             return answer.status, answer.headers, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.headers, error.read().decode()
@@ -105,6 +108,39 @@ def test_it_goes_with_the_last_client_that_wanted_it(client, wait_until):
         assert get(url)[0] == 200
     wait_until(lambda: get(url)[0] == 404)
     assert set(client.cluster.scheduler.plugins) == plugins
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Sec-Fetch-Site": "same-site"}, 403),
+        ({"Sec-Fetch-Site": "same-origin"}, 200),
+        ({"Sec-Fetch-Site": "none"}, 200),
+        (
+            {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"},
+            200,
+        ),  # a link was followed
+        ({"Origin": "http://site.example"}, 403),
+        ({"Host": "site.example"}, 403),
+        ({"Host": "localhost:8787"}, 200),
+        ({"Host": socket.gethostname()}, 200),
+    ],
+)
+def test_other_websites_do_not_get_it(client, headers, status):
+    url = Pool.from_client(client).page()
+    assert get(url, headers)[0] == status
+
+
+@pytest.mark.parametrize("link", ["https://site.example/{port}/status", "/proxy/{port}/status"])
+def test_the_name_in_the_link_to_the_dashboard_is_its_name(client, link):
+    Pool.from_client(client).leave_page()
+    url = Pool.from_client(client).page()
+    assert get(url, {"Host": "site.example"})[0] == 403
+    with dask.config.set({"distributed.dashboard.link": link}):
+        assert Pool.from_client(client).page() != url
+    assert get(url, {"Host": "site.example"})[0] == 200
+    Pool.from_client(client).leave_page()
 
 
 def test_a_scheduler_without_a_port(client, monkeypatch):

@@ -21,6 +21,8 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.ports import port_number
+from lidarsim.base.words import shortened
 
 from ..export.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
@@ -83,11 +85,13 @@ class Network:
                 f"{', '.join(sorted(interfaces))}: give addresses of one network."
             )
         text = environment.get(DOMAIN_VARIABLE) or "0"
-        if not text.isascii() or not text.isdigit() or int(text) > _MAX_DOMAIN:
+        domain = port_number(text)
+        if domain is None or domain > _MAX_DOMAIN:
             raise LidarError(
-                f"{DOMAIN_VARIABLE} is {text!r}: set it to a number from 0 to {_MAX_DOMAIN}."
+                f"{DOMAIN_VARIABLE} is {shortened(text)!r}: set it to a number from 0 to "
+                f"{_MAX_DOMAIN}."
             )
-        return cls(interfaces.pop(), peers, int(text))
+        return cls(interfaces.pop(), peers, domain)
 
     @property
     def configuration(self) -> str:

@@ -184,6 +184,7 @@ class Transmitter:
                 redirect = partial(self._redirect, number)
                 service = stream.make_service(str(stream.address), stream.destination, redirect)
                 if service is not None:
+                    service.names |= {stream.address.name} - {""}
                     stack.enter_context(service)
                     self._services.append(service.description)
                 elif stream.api_given:

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import field_hint, fields_of, is_section, sections_in
-from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.words import did_you_mean, plural, shortened
 
 from .scenario import Scenario
 
@@ -88,11 +88,13 @@ def _match_name(names: Sequence[str], parts: Sequence[str], path: str) -> tuple[
 def _match_entry(entries: Sequence[Any], parts: Sequence[str], path: str) -> tuple[int, int]:
     """Return the index of the entry that leading parts of a path name, and the number of parts."""
     if parts[0].isdecimal():
-        if (index := int(parts[0])) < len(entries):
+        digits = parts[0].lstrip("0") or "0"  # Python refuses to convert thousands of them
+        index = int(digits) if len(digits) <= len(f"{len(entries)}") else len(entries)
+        if index < len(entries):
             return index, 1
         raise LidarError(
             f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, counted from 0, "
-            f"and no entry {index}."
+            f"and no entry {shortened(parts[0])}."
         )
     names = [getattr(entry, "name", None) for entry in entries]
     name, part_count = _match_name([name for name in names if isinstance(name, str)], parts, path)

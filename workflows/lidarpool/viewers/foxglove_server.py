@@ -16,7 +16,7 @@ from lidarsim.base.errors import LidarError
 
 from ..export.frames import WORLD
 from ..export.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform
-from .viewer import Address, Viewer
+from .viewer import LOOPBACK, Address, Viewer
 
 PORT = 8765  # Foxglove's own default
 # Messages that wait for a client; of more, the oldest are left out, so that a slow client takes a
@@ -50,7 +50,10 @@ _UNIT = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer(Viewer):
-    """A WebSocket server to which Foxglove connects.
+    """A WebSocket server to which Foxglove connects, on the loopback interface only.
+
+    The SDK's server has no token and checks no `Origin`: every program that can connect reads all
+    messages, also the scripts of any website that a browser of this machine has open.
 
     Topics are `/NAME/points` of each sensor, or `/points`, `/tf`, `/actors`, `/scene`,
     `/trajectories` and `/path`, in Foxglove's own schemas. Who subscribes late gets the last
@@ -68,13 +71,19 @@ class FoxgloveServer(Viewer):
     Raises
     ------
     LidarError
-        If the address cannot be used.
+        If the address cannot be used, or others than this machine can reach the address.
     """
 
     def __init__(
         self, to: str | None = None, title: str = "lidarpool", *, sends_time: bool = False
     ) -> None:
         address = Address.choose(to, PORT)
+        if not address.is_loopback:
+            raise LidarError(
+                f"Foxglove's server asks for no password, so it listens on this machine only, not "
+                f"at {address}: give 127.0.0.1, and forward the port: ssh -L "
+                f"{address.port}:{LOOPBACK}:{address.port} user@machine."
+            )
         # The server logs malformed requests of clients as warnings.
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._context = foxglove.Context()

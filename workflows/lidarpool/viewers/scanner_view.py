@@ -139,12 +139,14 @@ class Foxglove(_InViewer):
     scanner
         The scanner, or the first of several in one scene.
     to
-        ADDRESS:PORT to listen on; by default 127.0.0.1:8765, or another port if it is in use.
+        ADDRESS:PORT to listen on, of this machine alone; by default 127.0.0.1:8765, or another port
+        if it is in use.
 
     Raises
     ------
     LidarError
-        If foxglove-sdk is missing (`pip install "lidarpool[live]"`), or the address cannot be used.
+        If foxglove-sdk is missing (`pip install "lidarpool[live]"`), the address cannot be used, or
+        others than this machine can reach the address.
     """
 
     @checked

@@ -9,18 +9,22 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
+from ipaddress import ip_address
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
+from lidarsim.base.ports import port_number
+from lidarsim.base.words import shortened
 
 from ..export.shown_sweeps import ShownSweep, Surroundings
 from .table import VIEWERS
 
 LOOPBACK = "127.0.0.1"
 _PORTS_TRIED = 20
+_SHOWN_LETTERS = 60  # of an address that is refused
 
 
 class Viewer(ABC):
@@ -114,12 +118,20 @@ class Address(NamedTuple):
     @classmethod
     def _parse(cls, text: str, port: int) -> Address:
         has_port = ":" in text and not text.endswith("]")  # [::1] is an IPv6 address
-        host, _, number = text.rpartition(":") if has_port else (text, "", "")
-        if number and not (number.isascii() and number.isdigit() and int(number) < 1 << 16):
+        host, _, digits = text.rpartition(":") if has_port else (text, "", "")
+        number = port_number(digits) if digits else port
+        if number is None:
+            shown = shortened(text, _SHOWN_LETTERS)
             raise LidarError(
-                f"{text!r} is not an address: give ADDRESS:PORT, such as {LOOPBACK}:{port}."
+                f"{shown!r} is not an address: give ADDRESS:PORT, such as {LOOPBACK}:{port}."
             )
-        return cls(host.strip("[]") or LOOPBACK, int(number) if number else port)
+        return cls(host.strip("[]") or LOOPBACK, number)
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can connect."""
+        entries = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
+        return all(ip_address(entry[4][0]).is_loopback for entry in entries)
 
     def _check_free(self, count: int) -> None:
         """Raise LidarError unless servers can listen on `count` ports from `port` on."""

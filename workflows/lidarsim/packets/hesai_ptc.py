@@ -16,7 +16,7 @@ from ipaddress import IPv4Address
 from struct import Struct, pack
 from zlib import crc32
 
-from .service import Destination
+from .service import Destination, is_single_receiver
 from .tcp_service import TcpService
 
 PTC_PORT = 9347
@@ -136,7 +136,6 @@ class PtcService(TcpService):
         super().__init__(address, destination, send_to)
         self._device = device
         self._started_s = time.monotonic()
-        self._connections: dict[asyncio.Task[None], None] = {}  # the longest silent is first
 
     @property
     def description(self) -> str:
@@ -145,23 +144,15 @@ class PtcService(TcpService):
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the commands of a connection until it ends, or sends bytes that are none."""
-        task = asyncio.current_task()
-        assert task is not None
-        self._connections[task] = None
-        if len(self._connections) > self.max_connections:
-            silent = next(iter(self._connections))
-            del self._connections[silent]
-            silent.cancel()
         try:
-            with suppress(*_ENDS):
+            with suppress(*_ENDS), self.counted() as renew:
                 while True:
                     start = await reader.readexactly(1)
-                    self._connections[task] = self._connections.pop(task, None)
+                    renew()
                     async with asyncio.timeout(_WITHIN_S):
                         writer.write(await self._answered(start, reader, writer))
                         await writer.drain()
         finally:
-            self._connections.pop(task, None)
             writer.close()
 
     async def _answered(
@@ -203,7 +194,7 @@ class PtcService(TcpService):
             raise _RefusedError(_INVALID_PARAMETER)
         packed, port, _ = _DESTINATION.unpack(parameter)
         host = IPv4Address(packed)
-        if not port or host.is_multicast or host.is_unspecified:
+        if not port or not is_single_receiver(host):
             raise _RefusedError(_INVALID_PARAMETER)
         self.destination = Destination(str(host), {self._device.port: port})
         self.send_to(self.destination)

@@ -2,7 +2,7 @@
 
 Requests are small and come from few programs on a network without enemies, or from a program that
 is broken: sizes, times and the number of connections have limits, and each connection carries one
-request. A browser's page of another site is refused, as the protocols have no password.
+request. Requests of other websites are refused, as the protocols have no password.
 """
 
 from __future__ import annotations
@@ -10,23 +10,26 @@ from __future__ import annotations
 import asyncio
 import json
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from ipaddress import AddressValueError, IPv4Address
-from typing import Any
+from typing import Any, Self
 from urllib.parse import SplitResult, urlsplit
 
-from .service import Destination
+from ..base.other_sites import names_of_machine, refusal
+from .service import is_single_receiver
 from .tcp_service import TcpService
 
 HTTP_PORT = 80
-BROADCAST = "255.255.255.255"
 _MAX_HEAD_BYTES = 16 << 10  # of the request line and headers
 _MAX_BODY_BYTES = 64 << 10
 _WITHIN_S = 5.0  # from the connection to the answer
 _METHODS = ("GET", "POST", "PUT", "DELETE", "HEAD")
+_READING = ("GET", "HEAD")
+
+Headers = Mapping[str, str]  # {name in lower case: value}
 
 
 @dataclass(frozen=True)
@@ -81,15 +84,17 @@ class HttpService(TcpService):
     max_connections = 32
     buffer_bytes = _MAX_HEAD_BYTES
 
-    def __init__(
-        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
-    ) -> None:
-        super().__init__(address, destination, send_to)
-        self._connections = 0
-
     @abstractmethod
     def answer(self, request: Request) -> Answer:
         """Return the answer to a request; RefusedError for what is not understood."""
+
+    def changes_state(self, method: str, path: str) -> bool:
+        """Return True if a request may change what the sensor does."""
+        return method not in _READING
+
+    def __enter__(self) -> Self:
+        self.names |= names_of_machine(self.host)
+        return super().__enter__()
 
     @property
     def description(self) -> str:
@@ -100,21 +105,18 @@ class HttpService(TcpService):
         return words
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the request of a connection, and close it; drop a connection too many."""
-        self._connections += 1
+        """Answer the request of a connection, and close it."""
         try:
-            if self._connections <= self.max_connections:
-                with suppress(OSError, TimeoutError, asyncio.IncompleteReadError):
-                    async with asyncio.timeout(_WITHIN_S):
-                        writer.write((await self._answered(reader, writer)).encode())
-                        await writer.drain()
-                        writer.write_eof()
-                        # What the client still sends must not reset the connection before the
-                        # client has read the answer.
-                        while await reader.read(_MAX_HEAD_BYTES):
-                            pass
+            with suppress(OSError, TimeoutError, asyncio.IncompleteReadError), self.counted():
+                async with asyncio.timeout(_WITHIN_S):
+                    writer.write((await self._answered(reader, writer)).encode())
+                    await writer.drain()
+                    writer.write_eof()
+                    # What the client still sends must not reset the connection before the
+                    # client has read the answer.
+                    while await reader.read(_MAX_HEAD_BYTES):
+                        pass
         finally:
-            self._connections -= 1
             writer.close()
 
     async def _answered(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
@@ -127,20 +129,32 @@ class HttpService(TcpService):
                     "the headers are too long", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
                 ) from error
             method, url, headers = _parsed(head)
+            path = url.path or "/"
+            self._refuse_other_sites(method, url, headers)
             size = _body_size(headers)
             if headers.get("expect", "").lower() == "100-continue":
                 writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
             body = await reader.readexactly(size)
             peer = writer.get_extra_info("peername")[0]
-            path = url.path or "/"
             answer = self.answer(Request(method, path, url.query, body, peer))
             return Answer(status=answer.status) if method == "HEAD" else answer
         except RefusedError as error:
             return error.answer
 
+    def _refuse_other_sites(self, method: str, url: SplitResult, headers: Headers) -> None:
+        """Raise RefusedError for a request of another website."""
+        reason = refusal(
+            headers,
+            self.names,
+            url_authority=url.netloc,
+            changes_state=self.changes_state(method, url.path),
+        )
+        if reason:
+            raise RefusedError(reason, HTTPStatus.FORBIDDEN)
 
-def _parsed(head: bytes) -> tuple[str, SplitResult, Mapping[str, str]]:
-    """Return method, URL and headers {name: value} of a request; RefusedError for other bytes.
+
+def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
+    """Return method, URL and headers of a request; RefusedError for other bytes.
 
     The URL may be in absolute form, as for a proxy.
     """
@@ -150,21 +164,20 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Mapping[str, str]]:
         raise RefusedError("this is no request of HTTP/1.1")
     if words[0] not in _METHODS:
         raise RefusedError(f"use {', '.join(_METHODS)}", HTTPStatus.METHOD_NOT_ALLOWED)
-    headers = {}
+    headers: dict[str, str] = {}
     for entry in lines:
         name, separator, value = entry.partition(":")
-        if not separator or not name.strip():
+        name = name.strip().lower()
+        if not separator or not name:
             raise RefusedError("a header has no colon")
-        headers[name.strip().lower()] = value.strip()
-    if "origin" in headers:
-        raise RefusedError("pages of other sites are not answered", HTTPStatus.FORBIDDEN)
+        headers[name] = f"{headers[name]},{value.strip()}" if name in headers else value.strip()
     try:
         return words[0], urlsplit(words[1]), headers
     except ValueError as error:
         raise RefusedError("the URL is not understood") from error
 
 
-def _body_size(headers: Mapping[str, str]) -> int:
+def _body_size(headers: Headers) -> int:
     """Return the size of the body that headers announce; RefusedError for other encodings."""
     if "transfer-encoding" in headers:
         raise RefusedError("give a Content-Length", HTTPStatus.LENGTH_REQUIRED)
@@ -182,7 +195,7 @@ def receiver_of(name: str, value: Any) -> str:
         address = IPv4Address(str(value))
     except AddressValueError as error:
         raise RefusedError(f"{name} is no IPv4 address") from error
-    if address.is_multicast or address.is_unspecified or str(address) == BROADCAST:
+    if not is_single_receiver(address):
         raise RefusedError(f"{name} is not the address of one receiver")
     return str(address)
 

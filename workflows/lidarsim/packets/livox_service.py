@@ -35,7 +35,7 @@ from .livox_commands import (
     parse_values,
     push_frame,
 )
-from .service import Destination, Service
+from .service import Destination, Service, is_single_receiver
 
 SEARCH_PORT = 56_000
 _ANNOUNCE_S = 1.0  # as often as the SDK searches
@@ -329,5 +329,5 @@ def _check_host(key: int, value: bytes) -> None:
         address = IPv4Address(value[:4])
     except AddressValueError as error:
         raise RefusedError(Code.OUT_OF_RANGE, key) from error
-    if address.is_multicast or str(address) == "255.255.255.255":
+    if not is_single_receiver(address):
         raise RefusedError(Code.OUT_OF_RANGE, key)

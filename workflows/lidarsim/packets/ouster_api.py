@@ -75,6 +75,12 @@ class OusterApi(HttpService):
             raise RefusedError(f"{resource} cannot be changed", HTTPStatus.METHOD_NOT_ALLOWED)
         return Answer(self._document(resource))
 
+    def changes_state(self, method: str, path: str) -> bool:
+        """Return True if a request may change what the sensor does, as most commands by GET do."""
+        command = path.rstrip("/").removeprefix(f"{_ROOT}sensor/cmd/")
+        is_command = command != path.rstrip("/") and command != "get_config_param"
+        return is_command or super().changes_state(method, path)
+
     def _document(self, resource: str) -> Any:
         """Return a document that clients read."""
         whole = {**self._metadata, "config_params": self._active}

@@ -19,11 +19,14 @@ import numpy as np
 
 from ..base.arrays import Bytes, Ints
 from ..base.errors import LidarError
+from ..base.ports import port_number
+from ..base.words import shortened
 from .encoders import Datagrams
 from .sender_process import DATAGRAM, END, HEADER, ROUTE
-from .service import Destination
+from .service import Destination, is_single_receiver
 
 LOOPBACK = "127.0.0.1"
+_SHOWN_LETTERS = 60  # of an address that is refused
 _RECORD = np.dtype(
     [
         ("kind", "<u2"),
@@ -248,25 +251,30 @@ class Address:
 
     host: str  # as numbers
     port: int | None = None
+    name: str = field(default="", compare=False)  # the host as the user gives it, unless numbers
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Return the address of a text; LidarError for other text, IPv6 and multicast."""
+        """Return the address of one receiver of IPv4; LidarError for other text and addresses."""
         host, separator, number = text.rpartition(":")
         if not separator:
             host, number = text, ""
         if ":" in host or _is_ipv6(text):
             raise LidarError(f"{text} is of IPv6: give an IPv4 address, such as {LOOPBACK}:2368.")
-        if separator and not (number.isdecimal() and 0 < int(number) < 1 << 16):
-            raise LidarError(f"{text!r} is no address: give HOST or HOST:PORT, ports to 65535.")
+        port = port_number(number) if separator else None
+        if separator and not port:
+            shown = shortened(text, _SHOWN_LETTERS)
+            raise LidarError(f"{shown!r} is no address: give HOST or HOST:PORT, ports to 65535.")
+        name = ""
         try:
             address = IPv4Address(host)
         except AddressValueError:
             address = _resolved(host, text)
-        if address.is_multicast or address.is_unspecified:
+            name = host.lower()
+        if not is_single_receiver(address):
             kind = "a multicast address" if address.is_multicast else "no address of a receiver"
             raise LidarError(f"{text} is {kind}: give the address of one receiver.")
-        return cls(str(address), int(number) if separator else None)
+        return cls(str(address), port, name)
 
     @property
     def is_loopback(self) -> bool:
@@ -302,7 +310,6 @@ def _resolved(host: str, text: str) -> IPv4Address:
 def check_reachable(address: Address) -> None:
     """Raise LidarError if no datagrams can be sent to an address, such as without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         try:
             probe.connect((address.host, address.port or 9))
         except OSError as error:

@@ -83,7 +83,6 @@ class Route:
 def _open_socket(source: str, port: int) -> socket.socket:
     """Return a socket that sends from an address and port, or from any if they cannot be had."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
     for number in (port, 0) if source else (port,):
         with suppress(OSError):
             opened.bind((source, number))

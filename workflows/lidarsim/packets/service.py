@@ -5,7 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from ipaddress import IPv4Address
+from socket import AF_INET, SOCK_DGRAM, socket
 from typing import Self
+
+_BROADCAST = IPv4Address("255.255.255.255")
+_ANY_PORT = 9
 
 
 @dataclass(frozen=True)
@@ -15,6 +20,24 @@ class Destination:
     host: str  # IPv4 address
     # {port of `Datagrams`: port of the host}: other ports stay; datagrams to port 0 are not sent.
     ports: Mapping[int, int] = field(default_factory=dict)
+
+
+def is_single_receiver(address: IPv4Address) -> bool:
+    """Return True unless an address is unspecified, multicast or broadcast.
+
+    The system knows the broadcast addresses of this machine's networks: it connects no socket to
+    them that has not asked for broadcasts.
+    """
+    if address.is_unspecified or address.is_multicast or address == _BROADCAST:
+        return False
+    with socket(AF_INET, SOCK_DGRAM) as probe:
+        try:
+            probe.connect((str(address), _ANY_PORT))
+        except PermissionError:
+            return False
+        except OSError:  # such as no network, which may come
+            return True
+    return True
 
 
 class Service(ABC):
@@ -34,6 +57,8 @@ class Service(ABC):
     def __init__(self, destination: Destination, send_to: Callable[[Destination], None]) -> None:
         self.destination = destination
         self.send_to = send_to
+        # Names by which clients may ask, besides those of the machine; set before the start.
+        self.names: frozenset[str] = frozenset()
 
     @property
     @abstractmethod

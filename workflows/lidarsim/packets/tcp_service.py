@@ -8,15 +8,21 @@ import os
 import socket
 import threading
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import ClassVar, Self
 
 from ..base.errors import LidarError
 from .service import Destination, Service
 
+_BACKLOG = 128  # connections that wait to be accepted
+
 
 class TcpService(Service):
     """Serves connections on a thread; an end of the context drops all that are open.
+
+    Beyond `max_connections`, the oldest connection gives way to the newest: clients that open
+    connections and do not end their requests keep nobody else from being answered.
 
     Parameters
     ----------
@@ -42,10 +48,34 @@ class TcpService(Service):
         self._loop: asyncio.AbstractEventLoop
         self._thread: threading.Thread
         self._server: asyncio.Server
+        self._connections: dict[asyncio.Task[None], None] = {}  # tasks that serve, oldest first
 
     @abstractmethod
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of a connection, and close the connection."""
+
+    @contextmanager
+    def counted(self) -> Iterator[Callable[[], None]]:
+        """Count the connection of the current task, and close the oldest if there are too many.
+
+        Yields a function that makes the connection the newest.
+        """
+        task = asyncio.current_task()
+        assert task is not None
+
+        def renew() -> None:
+            self._connections.pop(task, None)
+            self._connections[task] = None
+
+        renew()
+        if len(self._connections) > self.max_connections:
+            oldest = next(iter(self._connections))
+            del self._connections[oldest]
+            oldest.cancel()
+        try:
+            yield renew
+        finally:
+            self._connections.pop(task, None)
 
     def __enter__(self) -> Self:
         listener = self._listening_socket()
@@ -53,7 +83,9 @@ class TcpService(Service):
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name=self.name, daemon=True)
         self._thread.start()
-        starting = asyncio.start_server(self.serve, sock=listener, limit=self.buffer_bytes)
+        starting = asyncio.start_server(
+            self.serve, sock=listener, limit=self.buffer_bytes, backlog=_BACKLOG
+        )
         self._server = asyncio.run_coroutine_threadsafe(starting, self._loop).result()
         return self
 
@@ -71,7 +103,7 @@ class TcpService(Service):
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 listener.bind((self.host, port))
-                listener.listen(self.max_connections)
+                listener.listen(_BACKLOG)
             except OSError as error:
                 listener.close()
                 is_taken = error.errno in (errno.EACCES, errno.EADDRINUSE)

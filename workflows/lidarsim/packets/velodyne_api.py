@@ -13,6 +13,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl
 
+from ..base.ports import port_number
 from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
 from .service import Destination
 
@@ -116,7 +117,7 @@ class VelodyneApi(HttpService):
             if name == "addr":
                 host = receiver_of(name, value)
             elif name in ports:
-                ports[name] = receiver_port(name, int(value) if value.isdecimal() else value)
+                ports[name] = receiver_port(name, port_number(value))
             else:
                 raise RefusedError(f"the host has no {name}")
         self._host = host

@@ -2,7 +2,8 @@
 
 The page asks with GET and gives orders with POST. Its address holds a random token; other addresses
 are answered with 404, so that no website, and no user of the machine who does not know the token,
-sees the page or gives orders. All addresses within the page are relative, so that the page also
+sees the page or gives orders. Requests of other websites are refused, whatever they know; only
+links to the page are followed. All addresses within the page are relative, so that the page also
 works behind a proxy.
 """
 
@@ -23,17 +24,20 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from hmac import compare_digest
 from html import escape
+from http import HTTPStatus
 from importlib.resources import files
 from typing import Any
 
 import click
-from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPHeaders, RequestStartLine
 from tornado.iostream import StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.notebook import cell_display
+from lidarsim.base.other_sites import names_of_machine, refusal
 
+from .guarded_server import Refusal, guarded_server
 from .point_selection import Abandoned
 
 HOST = "127.0.0.1"
@@ -137,7 +141,7 @@ class SlowQuestions:
 
 
 class _Guarded(RequestHandler):
-    """Answers requests with the page's token."""
+    """Answers requests that `_Guard` has let pass."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
@@ -147,16 +151,6 @@ class _Guarded(RequestHandler):
         # The cell of a notebook, whose address is unknown here, may frame any page.
         policy = POLICY if self.settings["in_notebook"] else POLICY + _FRAMES
         self.set_header("Content-Security-Policy", policy)
-
-    def prepare(self) -> None:
-        """Answer 404 without the token, and redirect an address of single use to the page."""
-        page: PageServer = self.settings["page"]
-        token = self.request.path.split("/")[1]
-        if token in page.good_once:
-            page.good_once.remove(token)
-            self.redirect(page.url)
-        elif not compare_digest(page.token.encode(), token.encode()):
-            raise HTTPError(404)
 
     def log_exception(self, *error: Any) -> None:
         """Log errors that are not the client's."""
@@ -256,6 +250,36 @@ class PageServer:
         return f"{self._root}{self.good_once[-1]}/"
 
 
+class _Guard:
+    """Checks a request by its address and headers, before its body is read."""
+
+    def __init__(self, page: PageServer) -> None:
+        self._page = page
+        # The name of a notebook's proxy is unknown here.
+        is_proxied = cell_display() is not None or _HUB in os.environ
+        self._names = None if is_proxied else names_of_machine(page.host) | {page.host.lower()}
+
+    def __call__(self, start_line: RequestStartLine, headers: HTTPHeaders) -> Refusal | None:
+        """Return the refusal of a request, or the page for an address of single use, or None."""
+        path = start_line.path.partition("?")[0]
+        token = "".join(path.split("/")[1:2])
+        is_good_once = token in self._page.good_once
+        if not is_good_once and not compare_digest(self._page.token.encode(), token.encode()):
+            return Refusal(HTTPStatus.NOT_FOUND, "there is no such page")
+        reason = refusal(
+            headers,
+            self._names,
+            changes_state=start_line.method not in ("GET", "HEAD"),
+            is_page=start_line.method == "GET" and path.endswith("/"),
+        )
+        if reason:
+            return Refusal(HTTPStatus.FORBIDDEN, reason)
+        if is_good_once:
+            self._page.good_once.remove(token)
+            return Refusal(HTTPStatus.FOUND, headers={"Location": self._page.url})
+        return None
+
+
 @contextmanager
 def page_server(
     source: Source,
@@ -288,10 +312,9 @@ def page_server(
         application.settings |= {
             "large": SlowQuestions(),
             "searches": SlowQuestions(),
-            "page": served_page,
             "in_notebook": cell_display() is not None,
         }
-        server = HTTPServer(application)
+        server = guarded_server(application, _Guard(served_page))
         server.add_socket(listener)
         loop = asyncio.get_running_loop()
         loop.set_default_executor(ThreadPoolExecutor(2, "lidarpool-page"))

@@ -1,0 +1,182 @@
+"""The HTTP server of pages: it checks requests by their headers, and holds few connections.
+
+A request is refused before its body is read, so that programs without the page's address cannot
+make the server keep what they send. Each request has to arrive within a time, and connections that
+wait for a request give way to new ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import cast
+
+from tornado.http1connection import HTTP1Connection, HTTP1ServerConnection
+from tornado.httpserver import HTTPServer
+from tornado.httputil import (
+    HTTPConnection,
+    HTTPHeaders,
+    HTTPMessageDelegate,
+    RequestStartLine,
+    ResponseStartLine,
+)
+from tornado.iostream import IOStream
+from tornado.web import Application
+
+MAX_BODY_BYTES = 4096  # our pages send no bodies
+MAX_CONNECTIONS = 64  # a browser opens six at a time
+REQUEST_WITHIN_S = 10.0  # from the connection, or from the last answer, to the end of the request
+_MAX_BUFFER_BYTES = 256 << 10  # of what a connection has received: 64 kB of headers, and a body
+_PIECE = 1 << 16  # bytes that are read at a time of a request that is refused
+_MAX_DIGITS = 9  # of a Content-Length
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An answer in place of the application's."""
+
+    status: HTTPStatus
+    reason: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+# Returns the refusal of a request, or None for a request that the application answers.
+Check = Callable[[RequestStartLine, HTTPHeaders], Refusal | None]
+
+
+def guarded_server(application: Application, check: Check) -> HTTPServer:
+    """Return a server that hands requests to an application which a check lets pass."""
+    server = _GuardedServer(
+        application, max_body_size=MAX_BODY_BYTES, max_buffer_size=_MAX_BUFFER_BYTES
+    )
+    server.check = check
+    return server
+
+
+class _GuardedServer(HTTPServer):
+    """Counts connections, and wraps the requests of each in `_GuardedRequest`."""
+
+    check: Check
+
+    def initialize(self, *arguments: object, **options: object) -> None:
+        super().initialize(*arguments, **options)  # type: ignore[arg-type]
+        self._open: set[object] = set()
+        # {connection whose request has not fully arrived: its end}, the oldest first
+        self._unfinished: dict[object, asyncio.TimerHandle] = {}
+
+    def start_request(
+        self, server_conn: object, request_conn: HTTPConnection
+    ) -> HTTPMessageDelegate:
+        """Return what a request is given to, which begins now."""
+        self._open.add(server_conn)
+        stream = cast(HTTP1ServerConnection, server_conn).stream
+        timer = asyncio.get_running_loop().call_later(REQUEST_WITHIN_S, stream.close)
+        self._unfinished[server_conn] = timer
+        if len(self._open) > MAX_CONNECTIONS:
+            oldest = next(iter(self._unfinished))
+            self._forget(oldest)
+            cast(HTTP1ServerConnection, oldest).stream.close()
+        application_request = super().start_request(server_conn, request_conn)
+        return _GuardedRequest(
+            application_request,
+            cast(HTTP1Connection, request_conn),
+            self.check,
+            lambda: self._finish(server_conn),
+        )
+
+    def on_close(self, server_conn: object) -> None:
+        """Forget a connection that has ended."""
+        self._forget(server_conn)
+        super().on_close(server_conn)
+
+    def _forget(self, server_conn: object) -> None:
+        self._finish(server_conn)
+        self._open.discard(server_conn)
+
+    def _finish(self, server_conn: object) -> None:
+        """Take note that a request has arrived, or that its connection has ended."""
+        timer = self._unfinished.pop(server_conn, None)
+        if timer is not None:
+            timer.cancel()
+
+
+class _GuardedRequest(HTTPMessageDelegate):
+    """Hands a request to the application if the check lets the headers pass."""
+
+    def __init__(
+        self,
+        request: HTTPMessageDelegate,
+        connection: HTTP1Connection,
+        check: Check,
+        finished: Callable[[], None],
+    ) -> None:
+        self._request = request
+        self._connection = connection
+        self._check = check
+        self._finished = finished
+        self._is_handed_over = False
+
+    def headers_received(
+        self, start_line: RequestStartLine | ResponseStartLine, headers: HTTPHeaders
+    ) -> Awaitable[None] | None:
+        """Check the headers, and refuse the request or hand it over."""
+        start_line = cast(RequestStartLine, start_line)
+        refusal = self._check(start_line, headers) or _too_large(headers)
+        if refusal is not None:
+            return _refuse(self._connection.detach(), refusal, start_line.method)
+        self._is_handed_over = True
+        return self._request.headers_received(start_line, headers)
+
+    def data_received(self, chunk: bytes) -> Awaitable[None] | None:
+        """Hand over a piece of the body."""
+        return self._request.data_received(chunk)
+
+    def finish(self) -> None:
+        """Let the application answer."""
+        self._finished()
+        self._request.finish()
+
+    def on_connection_close(self) -> None:
+        """Tell the application that the browser has left."""
+        if self._is_handed_over:
+            self._request.on_connection_close()
+
+
+async def _refuse(stream: IOStream, refusal: Refusal, method: str) -> None:
+    """Answer by a refusal, and end the connection.
+
+    What the client still sends is thrown away, until the client or the server closes the
+    connection: a connection that is closed before is reset, and the answer with it.
+    """
+    body = refusal.reason.encode()
+    headers = {
+        "Content-Type": "text/plain; charset=utf-8",
+        "Content-Length": f"{len(body)}",
+        "Connection": "close",
+        "Cache-Control": "no-store",
+        "Referrer-Policy": "no-referrer",  # the address may hold a token
+        "X-Content-Type-Options": "nosniff",
+        "Content-Security-Policy": "default-src 'none'",
+        **refusal.headers,
+    }
+    lines = [f"HTTP/1.1 {refusal.status} {refusal.status.phrase}"]
+    lines += [f"{name}: {value}" for name, value in headers.items()]
+    head = "\r\n".join([*lines, "", ""]).encode()
+    with suppress(OSError):  # the client has gone, or the time is over
+        await stream.write(head if method == "HEAD" else head + body)
+        stream.socket.shutdown(socket.SHUT_WR)
+        while True:
+            await stream.read_bytes(_PIECE, partial=True)
+
+
+def _too_large(headers: HTTPHeaders) -> Refusal | None:
+    """Return the refusal of a body that is larger than any of our pages sends."""
+    size = headers.get("Content-Length", "0")
+    is_number = size.isascii() and size.isdecimal()
+    if is_number and (len(size) > _MAX_DIGITS or int(size) > MAX_BODY_BYTES):
+        return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the body is too large")
+    return None
