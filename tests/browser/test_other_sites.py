@@ -33,7 +33,9 @@ const form = (url) => {
   form.submit();
   return sent;
 };
-const post = (url) => fetch(url, { method: "POST", mode: "no-cors", body: "addr=127.0.0.77" }).catch(() => {});
+const nothing = () => {};
+const post = (url) =>
+  fetch(url, { method: "POST", mode: "no-cors", body: "addr=127.0.0.77" }).catch(nothing);
 (async () => {
   for (const url of urls) {
     await image(url, "");
