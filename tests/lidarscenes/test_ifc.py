@@ -324,6 +324,159 @@ def test_equal_shapes_are_shared(forked, tmp_path, monkeypatch):
     assert [column.matrix[0, 3] for column in columns] == [0, 2, 4]
 
 
+def test_shapes_after_a_shared_shape_are_their_own(forked, tmp_path):
+    model = Model()
+    solid = model.solid(1, 1, 1)
+    for number in range(2):
+        model.element("IfcColumn", f"C{number}", at=(2 * number, 0, 0), solid=solid)
+    model.element("IfcWall", "W", (5, 6, 7))
+    meshes = named(model.write(tmp_path / "a.ifc"))
+    assert np.ptp(meshes["IfcWall W"].bounds, axis=0) == pytest.approx([5, 6, 7])
+    assert np.ptp(meshes["IfcColumn C1"].bounds, axis=0) == pytest.approx([1, 1, 1])
+
+
+def geometric_set(model, *outlines):
+    """Return a representation of a line and of plane surfaces inside outlines."""
+    create = model.file.create_entity
+    line, *rings = (
+        create("IfcPolyline", Points=[model.point(*point) for point in points])
+        for points in (((0, 0, 0), (1, 0, 0), (1, 1, 0)), *outlines)
+    )
+    surfaces = [
+        create(
+            "IfcCurveBoundedPlane",
+            BasisSurface=create("IfcPlane", Position=model.frame),
+            OuterBoundary=ring,
+            InnerBoundaries=[],
+        )
+        for ring in rings
+    ]
+    return create(
+        "IfcShapeRepresentation",
+        ContextOfItems=model.context,
+        RepresentationIdentifier="Body",
+        RepresentationType="GeometricSet",
+        Items=[create("IfcGeometricSet", Elements=[line, *surfaces])],
+    )
+
+
+def test_styles_of_edges_are_not_styles_of_triangles(forked, tmp_path):
+    model = Model()
+    shape = geometric_set(model, ((0, 0), (3, 0), (3, 4), (0, 0)))
+    model.paint(model.element("IfcBeam", "B", solid=shape), "Steel", (0.2, 0.4, 0.6))
+    (mesh,) = load_meshes(
+        model.write(tmp_path / "a.ifc"), colours=True, materials=True, tell=[].append
+    )
+    assert len(mesh.faces) == 1
+    assert mesh.bounds == pytest.approx(np.array([(0, 0, 0), (3, 4, 0)]))
+    assert mesh.materials.names == ("Steel",)
+    assert mesh.colours.images[0].tolist() == [[[51, 102, 153]]]
+
+
+def test_a_shape_of_edges_with_styles_is_noted(forked, tmp_path):
+    model = Model()
+    model.element("IfcWall", "W")
+    flat = geometric_set(model, ((0, 0), (1, 0), (2, 0), (0, 0)))
+    model.paint(model.element("IfcBeam", "Line", solid=flat), "Steel", (0.2, 0.4, 0.6))
+    notes = []
+    (mesh,) = load_meshes(model.write(tmp_path / "a.ifc"), materials=True, tell=notes.append)
+    assert mesh.name == "IfcWall W"
+    [note] = notes
+    assert "1 element of which ifcopenshell makes no triangles: 'IfcBeam Line'" in note
+
+
+def test_elements_that_openings_take_away_are_noted(forked, tmp_path):
+    model = Model()
+    model.element("IfcWall", "W")
+    beam = model.element("IfcBeam", "Gone")
+    model.paint(beam, "Steel", (0.2, 0.4, 0.6))
+    opening = model.element("IfcOpeningElement", "Hole")
+    model.rooted(
+        "IfcRelVoidsElement", None, RelatingBuildingElement=beam, RelatedOpeningElement=opening
+    )
+    notes = []
+    path = model.write(tmp_path / "a.ifc")
+    (mesh,) = load_meshes(path, materials=True, tell=notes.append)
+    assert mesh.name == "IfcWall W"
+    [note] = notes
+    assert "1 element of which ifcopenshell makes no triangles: 'IfcBeam Gone'" in note
+
+
+@pytest.mark.parametrize(
+    ("schema", "layout", "suffix"),
+    [
+        ("IFC4X3", "IFC4X3_ADD2", ".ifc"), ("IFC4X3_ADD1", "IFC4X3_ADD2", ".ifczip"),
+        ("IFC4X3_TC1", "IFC4X3_ADD2", ".ifc"), ("Ifc4x3 ", "IFC4X3_ADD2", ".ifczip"),
+        ("IFC4_ADD2_TC1", "IFC4", ".ifc"), (" IFC2X3", "IFC2X3", ".ifc"),
+    ],
+)  # fmt: skip
+def test_schemas_with_the_layout_of_another_are_read(forked, tmp_path, schema, layout, suffix):
+    model = Model(layout)
+    model.element("IfcWall", "W", (2, 1, 1))
+    path = tmp_path / f"a{suffix}"
+    write_text(path, in_schema(model.file.to_string(), layout, schema))
+    notes = []
+    (mesh,) = load_meshes(path, tell=notes.append)
+    assert np.ptp(mesh.bounds, axis=0) == pytest.approx([2, 1, 1])
+    assert not notes
+
+
+def test_triangulated_faces_of_ifc4x3_are_read(forked, tmp_path):
+    """Closed stands before Normals there, and map conversions have two scales more."""
+    model = Model("IFC4X3_ADD2")
+    create = model.file.create_entity
+    corners = [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
+    faces = create(
+        "IfcTriangulatedFaceSet",
+        Coordinates=create("IfcCartesianPointList3D", CoordList=corners),
+        Closed=False,
+        CoordIndex=[(1, 2, 3)],
+    )
+    shape = create(
+        "IfcShapeRepresentation",
+        ContextOfItems=model.context,
+        RepresentationIdentifier="Body",
+        RepresentationType="Tessellation",
+        Items=[faces],
+    )
+    model.element("IfcWall", "W", solid=shape)
+    text = in_schema(model.file.to_string(), "IFC4X3_ADD2", "IFC4X3")
+    assert ",$,.F.,((1,2,3))" in text
+    (tmp_path / "a.ifc").write_text(text.replace(",$,.F.,((1,2,3))", ",.F.,$,((1,2,3))"))
+    (mesh,) = load_meshes(tmp_path / "a.ifc", tell=[].append)
+    assert sorted(mesh.vertices[mesh.faces][0].tolist()) == sorted(map(list, corners))
+
+
+@pytest.mark.parametrize(
+    ("schema", "suffix"), [("IFC4X3_RC4", ".ifc"), ("IFC2X2_FINAL", ".ifczip"), ("", ".ifc")]
+)
+def test_errors_name_the_schemas_that_are_read(house, forked, tmp_path, schema, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_text(path, in_schema(house.read_text(), "IFC4", schema))
+    with pytest.raises(LidarError) as caught:
+        load_meshes(path)
+    assert str(caught.value) == (
+        f"{path} is of the schema {schema!r}, and IFC2X3, IFC2X3_FINAL, IFC2X3_TC1, IFC4, "
+        "IFC4X3, IFC4X3_ADD1, IFC4X3_ADD2, IFC4X3_TC1, IFC4_ADD1, IFC4_ADD2, IFC4_ADD2_TC1 are "
+        "read: export it in one of these."
+    )
+
+
+def in_schema(text, schema, wanted):
+    """Return a file that states another schema."""
+    assert f"FILE_SCHEMA(('{schema}'))" in text
+    return text.replace(f"FILE_SCHEMA(('{schema}'))", f"FILE_SCHEMA (( '{wanted}'))")
+
+
+def write_text(path, text):
+    """Write a building, packed if its suffix says so."""
+    if path.suffix == ".ifc":
+        path.write_text(text)
+        return
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("house.ifc", text)
+
+
 def test_elements_without_triangles_are_noted(forked, tmp_path):
     model = Model()
     model.element("IfcWall", "W")

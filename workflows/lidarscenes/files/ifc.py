@@ -99,6 +99,11 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     with closing(child.frames(path, request, lambda _, size: allowance.take(size))) as frames:
         for frame, arrays in frames:
             match frame["what"]:
+                case "schema":
+                    raise MeshFileError(
+                        f"is of the schema {frame['schema']!r}, and {', '.join(frame['read'])} are "
+                        "read: export it in one of these"
+                    )
                 case "building":
                     building = frame
                     _check_storeys(options.storeys, frame["storeys"])

@@ -27,6 +27,22 @@ from numpy.typing import NDArray
 MAX_WAIT_S = 300  # from one shape to the next; broken files may take for ever
 _MAX_PARENTS = 100  # of an element in the tree of a building; broken files have cycles
 
+_HEAD_BYTES = 2**16  # of a file, which contain its header
+_SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
+# Schemas whose entities have the attributes of a schema that the library reads, but for attributes
+# without a shape and for the order of Normals and Closed of triangulated face sets, which are not
+# used. The drafts of IFC4X3, _RC1 to _RC4, differ in more.
+_SAME_SCHEMAS = {
+    "IFC2X3_FINAL": "IFC2X3",
+    "IFC2X3_TC1": "IFC2X3",
+    "IFC4_ADD1": "IFC4",
+    "IFC4_ADD2": "IFC4",
+    "IFC4_ADD2_TC1": "IFC4",
+    "IFC4X3": "IFC4X3_ADD2",
+    "IFC4X3_ADD1": "IFC4X3_ADD2",
+    "IFC4X3_TC1": "IFC4X3_ADD2",
+}
+
 # Classes, with their subclasses, that have shapes and reflect no light.
 _UNREAD = {
     "IfcSpatialElement",
@@ -125,19 +141,22 @@ class Building:
         iterator = ifcopenshell.geom.iterator(
             settings, self._file, 1, include=list(elements.values())
         )
-        shapes: dict[str, int] = {}  # {id of a shape: number}
+        shapes: dict[str, int] = {}  # {id of a shape: number of its frame}
         matrices = []
         rows = []
         is_valid = iterator.initialize()
         while is_valid:
             placed = iterator.get()
             geometry = placed.geometry
-            number = shapes.setdefault(geometry.id, len(shapes))
             element = elements.get(placed.id)
-            if element is not None:
-                if number == len(shapes) - 1:
-                    self._write_shape(number, geometry)
-                rows.append([_name(element), element.is_a(), number, _material_of(element)])
+            # A wall that its opening takes away has a shape without triangles.
+            if element is not None and len(geometry.faces_buffer):
+                if geometry.id not in shapes:
+                    shapes[geometry.id] = len(shapes)
+                    self._write_shape(geometry)
+                rows.append(
+                    [_name(element), element.is_a(), shapes[geometry.id], _material_of(element)]
+                )
                 matrices.append(np.frombuffer(placed.transformation_buffer, np.float64))
                 elements.pop(placed.id)
             is_valid = iterator.next()
@@ -160,17 +179,19 @@ class Building:
             np.array(matrices).reshape(-1, 4, 4).transpose(0, 2, 1),
         )
 
-    def _write_shape(self, number: int, geometry: Any) -> None:
+    def _write_shape(self, geometry: Any) -> None:
         """Write the triangles and materials of a shape."""
+        faces = np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3)
+        # Styles of the triangles, then of the edges of curves in the shape.
+        styles = np.frombuffer(geometry.material_ids_buffer, np.int32)[: len(faces)]
         self._write(
             {
                 "what": "shape",
-                "number": number,
                 "materials": [self._material(style) for style in geometry.materials],
             },
             np.frombuffer(geometry.verts_buffer, np.float64).reshape(-1, 3),
-            np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3),
-            np.frombuffer(geometry.material_ids_buffer, np.int32),
+            faces,
+            styles,
         )
 
     def _material(self, style: Any) -> dict[str, Any]:
@@ -228,20 +249,57 @@ class Building:
 
 
 def _open(path: str, max_unpacked: int) -> Any:
-    """Open a file; an .ifczip is unpacked in memory."""
-    if not path.lower().endswith(".ifczip"):
-        return ifcopenshell.open(path, ".ifc")
+    """Open a file; an .ifczip is unpacked in memory.
+
+    UnreadSchemaError if the library does not read the schema of the file.
+    """
+    if path.lower().endswith(".ifczip"):
+        data = _unpacked(path, max_unpacked)
+    else:
+        with open(path, "rb") as stream:  # noqa: PTH123
+            head = stream.read(_HEAD_BYTES)
+            if _with_read_schema(head) == head:
+                return ifcopenshell.open(path, ".ifc")
+            data = head + stream.read()
+    head = _with_read_schema(data[:_HEAD_BYTES])
+    return ifcopenshell.file.from_string((head + data[_HEAD_BYTES:]).decode("latin-1"))
+
+
+def _unpacked(path: str, max_bytes: int) -> bytes:
+    """Return the bytes of the building in an .ifczip."""
     with zipfile.ZipFile(path) as archive:
         entries = [e for e in archive.infolist() if e.filename.lower().endswith(".ifc")]
         if len(entries) != 1:
             raise ValueError(f"it holds {len(entries)} files .ifc, not one")
-        if entries[0].file_size > max_unpacked:
-            raise ValueError(f"it unpacks to more than {max_unpacked:,} bytes")
+        if entries[0].file_size > max_bytes:
+            raise ValueError(f"it unpacks to more than {max_bytes:,} bytes")
         with archive.open(entries[0]) as stream:
-            data = stream.read(max_unpacked)
+            data = stream.read(max_bytes)
     if b"END-ISO-10303-21" not in data[-200:]:
         raise ValueError("the end of the file is missing")
-    return ifcopenshell.file.from_string(data.decode("latin-1"))
+    return data
+
+
+def _with_read_schema(head: bytes) -> bytes:
+    """Return the first bytes of a file with a schema that the library reads.
+
+    UnreadSchemaError if the library reads neither the schema nor a schema of the same layout.
+    """
+    stated = _SCHEMA.search(head)
+    if stated is None:  # which the library refuses
+        return head
+    name = stated[1].decode("latin-1")
+    names = [text for text in ifcopenshell.ifcopenshell_wrapper.schema_names() if "IFC" in text]
+    if name.upper() in names:
+        return head
+    same = _SAME_SCHEMAS.get(name.strip().upper(), name.strip().upper())
+    if same not in names:
+        raise UnreadSchemaError(name[:40], sorted({*names, *_SAME_SCHEMAS}))
+    return head[: stated.start(1)] + same.encode() + head[stated.end(1) :]
+
+
+class UnreadSchemaError(Exception):
+    """A schema that the library does not read, and the schemas that are read."""
 
 
 def _parent(element: Any) -> Any:
@@ -284,7 +342,14 @@ def main(path: str, request: dict[str, Any]) -> None:
 
     try:
         Building(path, request, write).read()
+    except UnreadSchemaError as error:
+        schema, names = error.args
+        write({"what": "schema", "schema": schema, "read": names})
+    except MemoryError:  # as if the library had ended the process
+        raise
     except Exception as error:  # of any type, as readers of broken files are
+        if "shared_library::load" in str(error):  # of a schema: memory is short, not the file wrong
+            raise
         reason = " ".join(str(error).replace(path, os.path.basename(path)).split())  # noqa: PTH119
         write({"what": "error", "reason": (reason or type(error).__name__)[:300]})
     output.flush()
