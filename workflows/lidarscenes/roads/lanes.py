@@ -1,30 +1,45 @@
-"""Lanes of roads as strips of triangles: sections, borders, heights and kerbs."""
+"""Lanes of roads as strips of triangles: sections, borders, heights and kerbs.
+
+`section_surfaces` measures the surface of each section at samples, and makes its triangles at
+stations that follow from the samples.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.scene.files.scene_graph import MeshFileError
 
 from .cubics import NOTHING, Cubics
 from .elements import MAX_SHOWN, UnreadElements, number
 from .road import Frames, Network, Road
+from .stations import (
+    GAP_M,
+    HEIGHT_SHARE,
+    SAMPLES,
+    Intervals,
+    PlacedStations,
+    SampledSurface,
+    Samples,
+    Stations,
+    has_extent,
+    placed_stations,
+)
 
-HEIGHT_SHARE = 0.1  # tolerance of heights, as a share of the tolerance in plan
-STRIP_M = 0.5  # width of strips of lanes whose cross section is curved
-_STEP_M = 0.01  # length of a ramp between widths or heights that jump
-_LEAST_M = 1e-6  # stations that are nearer to each other are one
+_ACROSS_SHARE = 0.3  # of the tolerance of heights, for cross sections that are curved
 _KERB_M = 1e-3  # least height of a kerb
 _MIN_COLUMNS = 2  # of points of a section with lanes
-_MAX_STEPS = 1e9  # between two breaks; no memory holds as many
 _BYTES_PER_POINT = 400  # peak memory of a point of a lane
+_HALVINGS = 30  # of an interval, by which a crossing of two borders is found
 _KNOWN = (
     "width", "border", "height", "roadMark", "material", "speed", "access", "rule", "visibility",
 )  # fmt: skip
@@ -64,13 +79,19 @@ class Lane:
         """Polynomials of the lane."""
         return self.widths, self.borders, self.inner_heights, self.outer_heights
 
-    def outer_t(self, distances: Floats, inner_t: Floats, middle_t: Floats) -> Floats:
-        """Return t (k,) of the outer border, by t of the inner border and of the middle, m."""
+    @property
+    def has_heights(self) -> bool:
+        """Whether the lane is above or below the road."""
+        return len(self.inner_heights) > 0
+
+    def width(self, stations: Stations, inner_t: Floats, middle_t: Floats) -> Floats:
+        """Return the width (k,), negative as the file has it, m.
+
+        `inner_t` and `middle_t` are t (k,) of the inner border and of the middle of the road, m.
+        """
         if len(self.borders):
-            widths = np.abs(self.borders.values(distances)) - np.abs(inner_t - middle_t)
-        else:
-            widths = self.widths.values(distances)
-        return inner_t + self.side * np.maximum(widths, 0)
+            return np.asarray(np.abs(self.borders.values(stations)) - np.abs(inner_t - middle_t))
+        return self.widths.values(stations)
 
 
 def _steps(elements: Sequence[Element], start: float, *names: str) -> Cubics:
@@ -94,8 +115,6 @@ class LaneSection:
         Lanes of each side, {1: left, -1: right}, from the reference line outwards.
     middle
         The lane in the middle, or None.
-    stations
-        (k,): distances on the road at which the section has cross sections, m.
     """
 
     def __init__(self, element: Element, start: float, stop: float, unread: UnreadElements) -> None:
@@ -112,7 +131,6 @@ class LaneSection:
         lanes.sort(key=lambda lane: abs(lane.number))
         self.lanes = {side: [lane for lane in lanes if lane.side == side] for side in (1, -1)}
         self.middle = next((lane for lane in lanes if not lane.number), None)
-        self.stations = np.zeros(0)
         for lane in lanes:
             unread.check(lane.element, _KNOWN)
 
@@ -121,77 +139,104 @@ class LaneSection:
         """Lanes of both sides."""
         return [*self.lanes[1], *self.lanes[-1]]
 
-    def borders(self, road: Road, distances: Floats) -> dict[int, Floats]:
+    def borders(self, road: Road, stations: Stations) -> dict[int, Floats]:
         """Return t (k,) of the outer borders of lanes, and of the middle, {number of lane: t}."""
-        middle = road.lane_offset.values(distances)
+        return self._borders_and_widths(road, stations)[0]
+
+    def intervals(self, road: Road, start: float, stop: float) -> Intervals:
+        """Return the intervals between two distances in which all polynomials are single.
+
+        Borders of lanes that cross each other, or a kink of the road's cross section, end intervals
+        as well.
+        """
+        cubics = [cubics for lane in self.all_lanes for cubics in lane.cubics]
+        breaks = np.concatenate([road.breaks, *(c.starts for c in cubics if len(c))])
+        intervals = Intervals.between(start, stop, breaks)
+        crossings = self._crossings(road, intervals)
+        if len(crossings):
+            intervals = Intervals.between(start, stop, np.concatenate([breaks, crossings]))
+        return intervals
+
+    def samples(self, network: Network, road: Road) -> Samples:
+        """Return the stations at which the surface of the section is measured."""
+        intervals = self.intervals(road, self.start, self.stop).with_lead(road.breaks)
+        are_planes = self.is_plain and road.is_plain and network.is_straight(road, intervals)
+        return intervals.sampled(are_planes=are_planes)
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether lanes are planes where the road is straight."""
+        return not any(
+            cubics.bent or (lane.has_heights and not cubics.is_constant)
+            for lane in self.all_lanes
+            for cubics in (lane.widths, lane.borders)
+        )
+
+    def _borders_and_widths(
+        self, road: Road, stations: Stations
+    ) -> tuple[dict[int, Floats], dict[int, Floats]]:
+        """Return t (k,) of borders, and widths as the file has them, both by numbers of lanes."""
+        # Where the section starts with a step of the road, lanes are those of the section.
+        stations = Stations(stations.s, np.maximum(stations.pieces, self.start))
+        middle = road.lane_offset.values(stations)
         borders = {0: middle}
+        widths = {}
         for lanes in self.lanes.values():
             t = middle
             for lane in lanes:
-                t = lane.outer_t(distances, t, middle)
+                width = lane.width(stations, t, middle)
+                t = t + lane.side * np.maximum(width, 0)
                 borders[lane.number] = t
-        return borders
+                widths[lane.number] = width
+        return borders, widths
 
-    def place_stations(
-        self, network: Network, road: Road, sag_m: float, allowance: Allowance
-    ) -> None:
-        """Place the stations so that triangles are within a tolerance of the surface.
+    def _crossings(self, road: Road, intervals: Intervals) -> Floats:
+        """Return the distances (x,) at which widths turn negative and borders cross kinks."""
+        kinks = road.kinks(self.start, self.stop) if road.curved_across else np.zeros(0)
+        if not len(kinks) and all(
+            lane.widths.is_constant and not len(lane.borders) for lane in self.all_lanes
+        ):
+            return kinks
 
-        The tolerance is `sag_m` in plan, and a tenth of this in height.
-        """
-        breaks = self._breaks(road)
-        starts = breaks[:-1]
-        stops = breaks[1:]
-        counts = self._step_counts(network, road, starts, stops, sag_m)
-        if not counts.max() < _MAX_STEPS:
-            counts = np.minimum(np.nan_to_num(counts, nan=_MAX_STEPS), _MAX_STEPS)
-        columns = 2 * len(self.all_lanes) + 2
-        allowance.take(int(counts.sum() + len(counts)) * columns * _BYTES_PER_POINT)
-        steps = np.maximum(1, np.ceil(counts)).astype(np.int64)
-        rows = np.repeat(np.arange(len(steps)), steps)
-        within = np.arange(len(rows)) - np.repeat(np.cumsum(steps) - steps, steps)
-        stations = starts[rows] + (stops - starts)[rows] * (within / steps[rows])
-        self.stations = np.append(stations, self.stop)
+        def values(stations: Stations) -> Floats:
+            """Return widths and borders (v, k)."""
+            borders, widths = self._borders_and_widths(road, stations)
+            return np.stack([*widths.values(), *borders.values()])
 
-    def _step_counts(
-        self, network: Network, road: Road, starts: Floats, stops: Floats, sag_m: float
-    ) -> Floats:
-        """Return the numbers of steps, not rounded, that intervals (k,) between breaks need."""
-        curvature = network.max_curvatures(road, starts, stops)
-        width_cubics = [
-            cubics
-            for lane in self.all_lanes
-            for cubics in (lane.borders if len(lane.borders) else lane.widths,)
-            if cubics.bent
-        ]
-        profiles = (road.elevation, road.superelevation, road.lane_offset)
-        is_plane = not (width_cubics or any(cubics.bent for cubics in profiles))
-        if is_plane and not len(road.superelevation) and not curvature.any():
-            return np.ones_like(starts)
-        borders = np.stack([*self.borders(road, (starts + stops) / 2).values()])
-        reach = np.abs(borders).max(axis=0)
-        width = np.abs(np.diff(borders, axis=0)).max(initial=1.0)
-        bend = curvature * (1 + curvature * reach) + road.lane_offset.max_bends(starts, stops)
-        for cubics in width_cubics:
-            bend += cubics.max_bends(starts, stops)
-        height_bend = road.elevation.max_bends(starts, stops)
-        height_bend = height_bend + reach * road.superelevation.max_bends(starts, stops)
-        twist = road.superelevation.max_slopes(starts, stops) * width / 4
-        spans = stops - starts
-        return np.maximum(
-            spans * np.sqrt(np.maximum(bend, height_bend / HEIGHT_SHARE) / (8 * sag_m)),
-            spans * twist / (HEIGHT_SHARE * sag_m),
+        # Pairs of a width or border and of a level that it may cross.
+        lanes = len(self.all_lanes)
+        levels = np.concatenate([np.zeros(lanes), np.tile(kinks, lanes + 1)])
+        crossing = np.concatenate(
+            [np.arange(lanes), np.repeat(lanes + np.arange(lanes + 1), len(kinks))]
         )
+        samples = intervals.samples(SAMPLES)
+        heights = values(samples)[crossing] - levels[:, None]
+        heights = heights.reshape(len(levels), len(intervals), SAMPLES)
+        is_above = heights > 0
+        has_both = (heights.min(axis=-1) < -GAP_M) & (heights.max(axis=-1) > GAP_M)
+        is_crossed = (is_above[..., 1:] != is_above[..., :-1]) & has_both[..., None]
+        pairs, *cells = np.nonzero(is_crossed)
+        if not len(pairs):
+            return np.zeros(0)
+        s = samples.s.reshape(-1, SAMPLES)
 
-    def _breaks(self, road: Road) -> Floats:
-        """Return distances (b,) between which all polynomials of the section are single, m."""
-        cubics = [cubics for lane in self.all_lanes for cubics in lane.cubics]
-        jumps = [c.jumps - _STEP_M for c in (*cubics, road.lane_offset) if len(c) > 1]
-        starts = [c.starts for c in cubics if len(c)]
-        breaks = np.concatenate([road.breaks, *starts, *jumps])
-        inside = (breaks > self.start + _LEAST_M) & (breaks < self.stop - _LEAST_M)
-        breaks = np.sort(np.concatenate([[self.start], breaks[inside], [self.stop]]))
-        return np.asarray(breaks[np.append(True, np.diff(breaks) > _LEAST_M)])
+        def is_above_at(distances: Floats) -> Bools:
+            """Return whether each width or border is above its level at a distance."""
+            rows = np.arange(len(pairs))
+            return values(Stations.at(distances))[crossing[pairs], rows] > levels[pairs]
+
+        return _changes(is_above_at, s[:, :-1][tuple(cells)], s[:, 1:][tuple(cells)])
+
+
+def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) -> Floats:
+    """Return where between distances (x,) a function is above its level on one side only."""
+    is_first = is_above(lower)
+    for _ in range(_HALVINGS):
+        middle = (lower + upper) / 2
+        is_lower = is_above(middle) == is_first
+        lower = np.where(is_lower, middle, lower)
+        upper = np.where(is_lower, upper, middle)
+    return np.asarray(upper)
 
 
 def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
@@ -203,8 +248,60 @@ def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
     return [
         LaneSection(elements[k], max(starts[k], 0.0), stop, unread)
         for k, stop in zip(order, stops, strict=True)
-        if stop - max(starts[k], 0.0) > 10 * _LEAST_M
+        if stop - max(starts[k], 0.0) > 10 * GAP_M
     ]
+
+
+def section_surfaces(
+    network: Network,
+    sections: Sequence[tuple[Road, LaneSection]],
+    sag_m: float,
+    allowance: Allowance,
+) -> list[SectionSurface]:
+    """Return the surfaces of lane sections, whose triangles are within a tolerance.
+
+    The tolerance is `sag_m` in plan, and a tenth of this in height.
+    """
+
+    def surfaces_at(rows: Sequence[int], placed: Sequence[PlacedStations]) -> list[SectionSurface]:
+        """Return the surfaces of selected sections at stations."""
+        pairs = [sections[k] for k in rows]
+        frames = network.frames([road for road, _ in pairs], [entry.stations for entry in placed])
+        stops = np.cumsum([len(entry.stations) for entry in placed]).tolist()
+        return [
+            SectionSurface(
+                *pair, entry, frames.take(slice(stop - len(entry.stations), stop)), sag_m, allowance
+            )
+            for pair, entry, stop in zip(pairs, placed, stops, strict=True)
+        ]
+
+    samples = [section.samples(network, road) for road, section in sections]
+    columns = [2 * len(section.all_lanes) + 2 for _, section in sections]
+    points = sum(len(s.stations) * c for s, c in zip(samples, columns, strict=True))
+    allowance.check(points * _BYTES_PER_POINT)
+    no_steps = np.zeros(0, np.int64)
+    surfaces = surfaces_at(
+        range(len(sections)), [PlacedStations(entry.stations, no_steps) for entry in samples]
+    )
+    placed = placed_stations(
+        [
+            surface.sampled(entry.intervals)
+            for surface, entry in zip(surfaces, samples, strict=True)
+        ],
+        sag_m,
+        allowance,
+        _BYTES_PER_POINT,
+    )
+    rows = []
+    for k, (surface, entry) in enumerate(zip(surfaces, placed, strict=True)):
+        part = surface.part_at(entry)
+        if part is None:
+            rows.append(k)
+        else:
+            surfaces[k] = part
+    for k, surface in zip(rows, surfaces_at(rows, [placed[k] for k in rows]), strict=True):
+        surfaces[k] = surface
+    return surfaces
 
 
 class Strip(NamedTuple):
@@ -213,12 +310,21 @@ class Strip(NamedTuple):
     lane: Lane
     t: Floats  # (c, k): of columns of points, m
     points: Floats  # (c, k, 3), m
+    steps: Ints  # (j,): stations that the next follows at the same distance
     is_kerb: bool = False
 
     @property
     def faces(self) -> Ints:
         """Triangles (f, 3) of the points in order, with normals up, or off the road of a kerb."""
         faces = grid_faces(*self.t.shape)
+        if len(self.steps):
+            # Where heights step there is a wall, and where only widths step there is none.
+            columns, stations = self.t.shape
+            is_step = np.zeros((columns - 1, stations - 1, 2), np.bool_)
+            is_step[:, self.steps] = True
+            rows = np.flatnonzero(is_step)
+            thin = rows[~has_extent(self.points.reshape(-1, 3), faces[rows])]
+            faces = np.delete(faces, thin, axis=0)
         return faces if self.lane.side > 0 else faces[:, ::-1]
 
 
@@ -235,36 +341,93 @@ def grid_faces(columns: int, stations: int) -> Ints:
 
 
 class SectionSurface:
-    """The surfaces of a lane section.
+    """The surfaces of a lane section at stations.
+
+    Parameters
+    ----------
+    placed
+        The stations.
+    frames
+        Frames of the road at the stations.
+    sag_m
+        Tolerance in plan, m. The tolerance in height is a tenth of this.
+    allowance
+        Memory that points across lanes take.
 
     Attributes
     ----------
     strips
         Surfaces of lanes, from right to left.
-    kerbs
-        Upright surfaces between lanes of different heights.
     """
 
-    def __init__(self, road: Road, section: LaneSection, frames: Frames) -> None:
+    def __init__(
+        self,
+        road: Road,
+        section: LaneSection,
+        placed: PlacedStations,
+        frames: Frames,
+        sag_m: float,
+        allowance: Allowance,
+    ) -> None:
         self.section = section
+        self.stations, self.steps = placed
         self.frames = frames
         self._road = road
-        self.borders = section.borders(road, section.stations)
-        sides = {side: [*self._strips(lanes)] for side, lanes in section.lanes.items()}
-        self.strips = [*sides[-1][::-1], *sides[1]]
-        self.kerbs = [*self._kerbs()]
-        ordered = [
-            (strip.t, strip.points) if strip.lane.side > 0 else (strip.t[::-1], strip.points[::-1])
+        self._sag_m = sag_m
+        self._allowance = allowance
+        self.borders = section.borders(road, self.stations)
+        self._lines = self._lines_across()
+        # Points (c, k, 3) of all borders, from right to left, where lanes are straight across.
+        self._border_points: Floats | None = None
+        if not road.curved_across:
+            right = [self.borders[lane.number] for lane in section.lanes[-1][::-1]]
+            left = [self.borders[lane.number] for lane in section.lanes[1]]
+            self._border_points = self._base(np.stack([*right, self.borders[0], *left]))
+        self.strips = [*[*self._strips(-1)][::-1], *self._strips(1)]
+
+    @cached_property
+    def kerbs(self) -> list[Strip]:
+        """Upright surfaces between lanes of different heights."""
+        return [*self._kerbs()]
+
+    def sampled(self, intervals: Intervals) -> SampledSurface:
+        """Return the surface for placing stations, if the stations here are samples."""
+        height_m = HEIGHT_SHARE * self._sag_m
+        if self._road.shapes is not None:
+            height_m *= 1 - _ACROSS_SHARE
+        points = self._border_points
+        if points is not None and not any(
+            lane.level or lane.has_heights for lane in self.section.all_lanes
+        ):
+            return SampledSurface(intervals, points, np.ones(len(points) - 1, np.bool_), height_m)
+        ends = np.cumsum([len(strip.t) for strip in self.strips], dtype=np.int64)
+        is_cell = np.ones(max(0, len(self._points) - 1), np.bool_)
+        is_cell[ends[:-1] - 1] = False
+        return SampledSurface(intervals, self._points, is_cell, height_m)
+
+    def part_at(self, placed: PlacedStations) -> SectionSurface | None:
+        """Return the surface at stations that are all among the stations here, else None."""
+        rows = np.searchsorted(self.stations.pieces, placed.stations.pieces)
+        rows = np.minimum(rows, len(self.stations) - 1)
+        if (self.stations.pieces[rows] != placed.stations.pieces).any():
+            return None
+        surface = copy(self)
+        surface.stations, surface.steps = placed
+        surface.frames = self.frames.take(rows)
+        surface.borders = {key: t[rows] for key, t in self.borders.items()}
+        surface.strips = [
+            Strip(strip.lane, strip.t[:, rows], strip.points[:, rows], placed.steps)
             for strip in self.strips
         ]
-        stations = len(section.stations)
-        self._t = np.concatenate([t for t, _ in ordered] or [np.zeros((0, stations))])
-        self._points = np.concatenate([p for _, p in ordered] or [np.zeros((0, stations, 3))])
+        surface._border_points = None
+        for name in ("_t", "_points"):  # of the stations here
+            vars(surface).pop(name, None)
+        return surface
 
     def points(self, stations: Ints, t: Floats) -> Floats:
         """Return points (q, 3) on the triangles' edges across the road, at stations and t (q,)."""
         frames = self.frames
-        count = len(self._t)
+        count = len(self._points)
         if count < _MIN_COLUMNS:
             return np.asarray(frames.origins[stations] + t[:, None] * frames.side[stations])
         columns = self._t[:, stations]
@@ -278,49 +441,97 @@ class SectionSurface:
         inside = first + share[:, None] * (self._points[right + 1, stations] - first)
         return np.asarray(inside + (t - within)[:, None] * frames.side[stations])
 
-    def _strips(self, lanes: Sequence[Lane]) -> Iterator[Strip]:
+    @cached_property
+    def _t(self) -> Floats:
+        """Positions (c, k) across the road of the points of all strips, from right to left, m."""
+        ordered = [strip.t if strip.lane.side > 0 else strip.t[::-1] for strip in self.strips]
+        return np.concatenate(ordered or [np.zeros((0, len(self.stations)))])
+
+    @cached_property
+    def _points(self) -> Floats:
+        """Points (c, k, 3) of all strips, from right to left, m."""
+        ordered = [
+            strip.points if strip.lane.side > 0 else strip.points[::-1] for strip in self.strips
+        ]
+        return np.concatenate(ordered or [np.zeros((0, len(self.stations), 3))])
+
+    def _lines_across(self) -> Floats:
+        """Return ascending t (j,) at which strips need points inside, m."""
+        if not self._road.curved_across:
+            return np.zeros(0)
+        borders = np.stack([*self.borders.values()])
+        lines = self._road.lines(
+            self.section.start,
+            self.section.stop,
+            np.array([borders.min(), borders.max()]),
+            _ACROSS_SHARE * HEIGHT_SHARE * self._sag_m,
+        )
+        self._allowance.check(len(lines) * len(self.stations) * _BYTES_PER_POINT)
+        return lines
+
+    def _strips(self, side: int) -> Iterator[Strip]:
         """Yield the strips of the lanes of a side, from the middle outwards."""
-        distances = self.section.stations
         frames = self.frames
         inner_t = self.borders[0]
+        middle = len(self.section.lanes[-1])
         level_points: Floats | None = None  # (k, 3): inner border of level lanes
-        for lane in lanes:
-            outer_t = self.borders[lane.number]
-            widest = float(np.abs(outer_t - inner_t).max(initial=0))
-            strips = max(1, int(widest / STRIP_M)) if self._road.curved_across else 1
-            share = np.linspace(0, 1, strips + 1)[:, None]
-            t = inner_t + share * (outer_t - inner_t)
+        for k, lane in enumerate(self.section.lanes[side]):
+            t = np.stack([inner_t, self.borders[lane.number]])
+            inner_t = t[1]
             if lane.level:
                 if level_points is None:
-                    level_points = self._base(inner_t[None])[0]
-                base = level_points + (t - inner_t)[..., None] * frames.level_side
+                    level_points = self._base(t[:1])[0]
+                base = level_points + (t - t[0])[..., None] * frames.level_side
                 level_points = base[-1]
+            elif self._border_points is not None:
+                first = middle + side * k
+                base = self._border_points[[first, first + side]]
             else:
+                t = self._t_across(*t)
                 base = self._base(t)
-            inner = lane.inner_heights.values(distances)
-            heights = inner + share * (lane.outer_heights.values(distances) - inner)
-            yield Strip(lane, t, base + heights[..., None] * frames.up)
-            inner_t = outer_t
+            if lane.has_heights:
+                inner = lane.inner_heights.values(self.stations)
+                outer = lane.outer_heights.values(self.stations)
+                width = t[-1] - t[0]
+                share = (t - t[0]) / np.where(width == 0, 1, width)
+                share[-1] = 1
+                base = base + (inner + share * (outer - inner))[..., None] * frames.up
+            yield Strip(lane, t, base, self.steps)
+
+    def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:
+        """Return t (c, k) of the columns of points of a lane, from the inside out, m."""
+        lower = np.minimum(inner_t, outer_t)
+        upper = np.maximum(inner_t, outer_t)
+        lines = self._lines
+        if len(lines):
+            lines = lines[(lines > lower.min() + GAP_M) & (lines < upper.max() - GAP_M)]
+            if (outer_t - inner_t).sum() < 0:
+                lines = lines[::-1]
+        return np.stack([inner_t, *(np.clip(line, lower, upper) for line in lines), outer_t])
 
     def _base(self, t: Floats) -> Floats:
-        """Return points (c, k, 3) of the road without heights of lanes, at t (c, k)."""
+        """Return points (c, k, 3) of a lane without its heights, at t (c, k) from edge to edge."""
         frames = self.frames
         base = frames.origins + t[..., None] * frames.side
         if self._road.curved_across:
-            base += self._road.heights(self.section.stations, t)[..., None] * frames.up
+            # Heights that step at a border belong to the lane on their side of the border.
+            lower = np.minimum(t[0], t[-1])
+            upper = np.maximum(t[0], t[-1])
+            inside = np.clip(t, np.minimum(lower + GAP_M / 2, upper), upper - GAP_M / 2)
+            base += self._road.heights(self.stations, t, inside)[..., None] * frames.up
         return np.asarray(base)
 
     def _kerbs(self) -> Iterator[Strip]:
         """Yield upright strips between lanes of different heights, as parts of the higher lanes."""
-        for right, left in zip(self.strips[:-1], self.strips[1:], strict=True):
+        for right, left in pairwise(self.strips):
             right_row = -1 if right.lane.side > 0 else 0
             left_row = 0 if left.lane.side > 0 else -1
             right_points = right.points[right_row]
             left_points = left.points[left_row]
-            steps = ((left_points - right_points) * self.frames.up).sum(axis=1)
-            if np.abs(steps).max() < _KERB_M:
+            heights = ((left_points - right_points) * self.frames.up).sum(axis=1)
+            if np.abs(heights).max() < _KERB_M:
                 continue
-            is_left_higher = steps.sum() > 0
+            is_left_higher = heights.sum() > 0
             lane = left.lane if is_left_higher else right.lane
             points = np.stack([right_points, left_points])
-            yield Strip(lane, np.zeros(points.shape[:2]), points, is_kerb=True)
+            yield Strip(lane, np.zeros(points.shape[:2]), points, self.steps, is_kerb=True)

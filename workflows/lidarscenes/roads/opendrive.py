@@ -29,7 +29,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from .elements import UnreadElements, number
-from .lanes import Lane, SectionSurface, lane_sections
+from .lanes import Lane, SectionSurface, lane_sections, section_surfaces
 from .materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
 from .road import Network, Road
 from .road_marks import painted_quads
@@ -94,16 +94,9 @@ class _RoadReader:
             for road, road_sections in zip(network.roads, sections_of_roads, strict=True)
             for section in road_sections
         ]
-        for road, section in sections:
-            section.place_stations(network, road, self._sag_m, self._allowance)
-        frames = network.frames(
-            [road for road, _ in sections], [section.stations for _, section in sections]
-        )
-        start = 0
-        for road, section in sections:
-            stop = start + len(section.stations)
-            self._add_section(road, SectionSurface(road, section, frames.take(slice(start, stop))))
-            start = stop
+        surfaces = section_surfaces(network, sections, self._sag_m, self._allowance)
+        for (road, _), surface in zip(sections, surfaces, strict=True):
+            self._add_section(road, surface)
         objects = ObjectBuilder(network, self._sag_m, self._allowance, self._unread)
         signals = SignalBuilder(network, self._unread)
         for road, road_sections in zip(network.roads, sections_of_roads, strict=True):

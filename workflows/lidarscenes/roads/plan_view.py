@@ -118,9 +118,9 @@ class PlanTable:
         rows = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
         return np.asarray(self._bend_table[np.maximum(rows, 0), 1])
 
-    def points(self, distances: Floats) -> PlanPoints:
-        """Return points at distances (k,) of the table."""
-        rows = np.maximum(np.searchsorted(self._starts, distances, "right") - 1, 0)
+    def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
+        """Return points at distances (k,) of the table, on the pieces at other distances (k,)."""
+        rows = np.maximum(np.searchsorted(self._starts, pieces, "right") - 1, 0)
         points = self._clothoid_points(distances, rows)
         kinds = self._kinds[rows]
         for kind in np.unique(kinds[kinds >= 0]).tolist():

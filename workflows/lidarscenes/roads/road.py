@@ -22,8 +22,11 @@ from lidarsim.scene.files.scene_graph import MeshFileError
 from .cubics import Cubics
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .plan_view import PlanTable
+from .stations import GAP_M, Intervals, Stations
 
+_STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
 MAX_ROAD_M = 1e7  # longest road
+MAX_LINES = 1e5  # across a road, between two kinks of its cross section
 _GAP_M = 1.0  # between roads in the table of reference lines
 _MAX_MISSING = 0.01  # of the length of a road, which its geometry may lack
 _CROSSFALL_SIDES = {"left": (1,), "right": (-1,), "both": (1, -1)}
@@ -42,7 +45,7 @@ class Frames(NamedTuple):
     up: Floats  # (k, 3): unit vectors, upright on both
     level_side: Floats  # (k, 3): horizontal unit vectors to the left
 
-    def take(self, rows: slice) -> Frames:
+    def take(self, rows: slice | Ints) -> Frames:
         """Return the frames of selected stations."""
         return Frames(*(array[rows] for array in self))
 
@@ -119,6 +122,13 @@ class Road:
         """Whether cross sections of lanes are curved or broken."""
         return self.shapes is not None or any(map(len, self.crossfalls.values()))
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the road is a plane where its reference line is straight."""
+        return not (
+            self.curved_across or self.lane_offset.bent or not self.superelevation.is_constant
+        )
+
     @cached_property
     def breaks(self) -> Floats:
         """Distances (b,) at which polynomials of the road change, m."""
@@ -130,16 +140,46 @@ class Road:
             starts.append(self.shapes.stations)
         return np.concatenate(starts)
 
-    def heights(self, distances: Floats, t: Floats) -> Floats:
-        """Return heights above the banked plane of crossfall and shapes, for t (..., k), m."""
+    def heights(self, stations: Stations, t: Floats, pieces: Floats | None = None) -> Floats:
+        """Return heights above the banked plane of crossfall and shapes, for t (..., k), m.
+
+        `pieces` are t (..., k) in whose cubics of shapes the heights are; `t` itself if None.
+        """
         heights = np.zeros_like(t)
         for side, crossfall in self.crossfalls.items():
             if len(crossfall):
-                sines, cosines = sin_cos(crossfall.values(distances))
+                sines, cosines = sin_cos(crossfall.values(stations))
                 heights -= np.maximum(side * t, 0) * (sines / cosines)
         if self.shapes is not None:
-            heights += self.shapes.heights(distances, t)
+            heights += self.shapes.heights(stations.s, t, t if pieces is None else pieces)
         return heights
+
+    def kinks(self, start: float, stop: float) -> Floats:
+        """Return t (j,) at which cross sections between distances change their slope, m."""
+        kinks = [np.zeros(1 if any(map(len, self.crossfalls.values())) else 0)]
+        if self.shapes is not None:
+            kinks.append(self.shapes.kinks(start, stop))
+        return np.unique(np.concatenate(kinks))
+
+    def lines(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
+        """Return ascending t (j,) at which cross sections between t (2,) need points, m.
+
+        Straight lines between the points are within `height_m` of the cross sections between the
+        distances `start` and `stop`.
+        """
+        kinks = self.kinks(start, stop)
+        if self.shapes is None:
+            return kinks
+        knots = np.concatenate([t[:1], kinks[(kinks > t[0]) & (kinks < t[1])], t[1:]])
+        bends = self.shapes.max_bends(start, stop, knots)
+        gaps = np.diff(knots)
+        counts = np.ceil(gaps * np.sqrt(bends / (8 * height_m)))
+        counts = np.clip(counts, 1, MAX_LINES).astype(np.int64)
+        rows = np.repeat(np.arange(len(gaps)), counts)
+        within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        lines = np.append(knots[rows] + gaps[rows] * (within / counts[rows]), t[1])
+        steps = self.shapes.steps(start, stop)
+        return np.unique(np.concatenate([lines, steps - GAP_M, steps + GAP_M]))
 
 
 class LateralShapes:
@@ -160,21 +200,56 @@ class LateralShapes:
         self._starts: Floats = table[..., 0]  # (m, r), m
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
-    def heights(self, distances: Floats, t: Floats) -> Floats:
-        """Return heights at distances (k,) and t (..., k), m."""
+    def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
+        """Return heights at distances (k,) and t (..., k), in the cubics at `pieces`, m."""
         last = len(self.stations) - 1
         rows = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
         following = np.minimum(rows + 1, last)
         gaps = np.maximum(self.stations[following] - self.stations[rows], 1e-9)
         share = np.clip((distances - self.stations[rows]) / gaps, 0, 1)
-        lower = self._profiles(rows, t)
-        return np.asarray(lower + share * (self._profiles(following, t) - lower))
+        lower = self._profiles(rows, t, pieces)
+        return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
 
-    def _profiles(self, rows: Ints, t: Floats) -> Floats:
+    def kinks(self, start: float, stop: float) -> Floats:
+        """Return t (j,) at which cubics start, of all stations that matter between distances."""
+        starts = self._starts[self._rows(start, stop)]
+        return np.unique(starts[np.isfinite(starts)])
+
+    def steps(self, start: float, stop: float) -> Floats:
+        """Return t (j,) at which heights step, of all stations that matter between distances."""
+        rows = self._rows(start, stop)
+        starts = self._starts[rows]
+        a, b, c, d = self._coefficients[:, rows]
+        with np.errstate(invalid="ignore"):  # infinite starts of cubics that lack
+            x = np.diff(starts, axis=1)
+            ends = ((d[:, :-1] * x + c[:, :-1]) * x + b[:, :-1]) * x + a[:, :-1]
+            is_step = np.abs(ends - a[:, 1:]) > _STEP_M
+        return np.unique(starts[:, 1:][is_step & np.isfinite(starts[:, 1:])])
+
+    def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
+        """Return the largest second derivatives between ascending t (j + 1,), 1/m."""
+        rows = self._rows(start, stop)
+        t = (knots[1:] + knots[:-1]) / 2
+        pieces = np.maximum((self._starts[rows, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
+        indices = np.arange(rows.start, rows.stop)[:, None]
+        _, _, c, d = self._coefficients[:, indices, pieces]
+        origins = self._starts[indices, pieces]
+        ends = [np.abs(2 * c + 6 * d * np.maximum(k - origins, 0)) for k in (knots[:-1], knots[1:])]
+        is_before = t < origins  # where heights are level
+        return np.where(is_before, 0.0, np.maximum(*ends)).max(axis=0)
+
+    def _rows(self, start: float, stop: float) -> slice:
+        """Return the stations between which the heights between two distances are."""
+        first = int(np.searchsorted(self.stations, start, "right")) - 1
+        last = int(np.searchsorted(self.stations, stop, "left")) + 1
+        count = len(self.stations)
+        return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
+
+    def _profiles(self, rows: Ints, t: Floats, pieces: Floats) -> Floats:
         """Return the heights of the stations `rows` (k,) at t (..., k), m."""
-        pieces = np.maximum((self._starts[rows] <= t[..., None]).sum(axis=-1) - 1, 0)
-        a, b, c, d = self._coefficients[:, rows, pieces]
-        x = np.maximum(t - self._starts[rows, pieces], 0)
+        cubics = np.maximum((self._starts[rows] <= pieces[..., None]).sum(axis=-1) - 1, 0)
+        a, b, c, d = self._coefficients[:, rows, cubics]
+        x = np.maximum(t - self._starts[rows, cubics], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
 
@@ -197,20 +272,25 @@ class Network:
             offset = road.place(self._table, offset)
         self._table.finish()
 
-    def max_curvatures(self, road: Road, starts: Floats, stops: Floats) -> Floats:
-        """Return the largest curvatures of a reference line in intervals (k,), 1/m."""
-        return self._table.max_curvatures(road.offset + starts, road.offset + stops)
+    def is_straight(self, road: Road, intervals: Intervals) -> bool:
+        """Return True if a reference line is straight in plan and in height in all intervals."""
+        if road.elevation.bent or not road.superelevation.is_constant:
+            return False
+        ends = road.offset + intervals.ends
+        return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
-    def frames(self, roads: Sequence[Road], distances: Sequence[Floats]) -> Frames:
-        """Return the frames of roads at distances (k,) of each, one after another."""
-        positions = np.concatenate(
-            [road.offset + s for road, s in zip(roads, distances, strict=True)]
+    def frames(self, roads: Sequence[Road], stations: Sequence[Stations]) -> Frames:
+        """Return the frames of roads at stations (k,) of each, one after another."""
+        pairs = [*zip(roads, stations, strict=True)]
+        if not pairs:
+            return Frames(*np.zeros((5, 0, 3)))
+        points = self._table.points(
+            np.concatenate([road.offset + at.s for road, at in pairs]),
+            np.concatenate([road.offset + at.pieces for road, at in pairs]),
         )
-        pairs = [*zip(roads, distances, strict=True)]
-        points = self._table.points(positions)
-        heights = np.concatenate([road.elevation.values(s) for road, s in pairs])
-        slopes = np.concatenate([road.elevation.slopes(s) for road, s in pairs])
-        roll = np.concatenate([road.superelevation.values(s) for road, s in pairs])
+        heights = np.concatenate([road.elevation.values(at) for road, at in pairs])
+        slopes = np.concatenate([road.elevation.slopes(at) for road, at in pairs])
+        roll = np.concatenate([road.superelevation.values(at) for road, at in pairs])
         zero = np.zeros_like(heights)
         origins = np.stack([points.x, points.y, heights], axis=1)
         along = np.stack([points.cosines, points.sines, slopes], axis=1)
@@ -223,8 +303,7 @@ class Network:
         side = level_side * cosines + upright * sines
         return Frames(origins, along, side, upright * cosines - level_side * sines, level_side)
 
-    def points(self, road: Road, distances: Floats, t: Floats, h: Floats | float = 0.0) -> Floats:
-        """Return points (k, 3) of a road at distances, t and heights (k,) above its plane."""
-        frames = self.frames([road], [distances])
-        lift = np.broadcast_to(h, distances.shape)[:, None]
-        return np.asarray(frames.origins + t[:, None] * frames.side + lift * frames.up)
+    def point(self, road: Road, s: float, t: float, h: float = 0.0) -> Floats:
+        """Return the point (3,) of a road at a distance, at t and a height above its plane."""
+        frames = self.frames([road], [Stations.at(np.array([s]))])
+        return np.asarray(frames.origins[0] + t * frames.side[0] + h * frames.up[0])

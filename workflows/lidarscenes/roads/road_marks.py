@@ -13,6 +13,7 @@ from lidarsim.base.arrays import Floats, Ints
 
 from .elements import UnreadElements, number, positive
 from .lanes import Lane, SectionSurface
+from .stations import GAP_M
 
 LIFT_M = 0.003  # of marks above the road: thickness of thermoplastic marks
 DASH_M = 3.0  # dashes of broken marks that state no lengths
@@ -59,7 +60,7 @@ def painted_quads(
     section = surface.section
     lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
     knots = [
-        _knots_of(line, section.stations, surface.borders[lane.number])
+        _knots_of(line, surface, surface.borders[lane.number])
         for lane in lanes
         for line in _lines_of(lane, section.start, section.stop, allowance, unread)
     ]
@@ -71,7 +72,7 @@ def painted_quads(
     offset = 0
     for entry in knots:
         rows_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
-        offset += len(entry.distances)
+        offset += len(entry.stations)
     return [
         PaintedQuads(colour, points, _quads(np.concatenate(rows), offset))
         for colour, rows in rows_of_colours.items()
@@ -95,8 +96,7 @@ def _quads(rows: Ints, count: int) -> Ints:
 class _Knots(NamedTuple):
     """Cross sections of a painted line."""
 
-    distances: Floats  # (q,): ascending, m
-    stations: Ints  # (q,): of the section, each the last before a cross section
+    stations: Ints  # (q,): ascending, of the section, each the last before a cross section
     shares: Floats  # (q,): of the way to the following station
     first_t: Floats  # (q,): of the middle of the line at `stations`, m
     second_t: Floats  # (q,): at the following stations, m
@@ -105,34 +105,52 @@ class _Knots(NamedTuple):
     colour: str
 
 
-def _knots_of(line: _Line, stations: Floats, border: Floats) -> _Knots:
-    """Return the cross sections of a line: ends of dashes, and stations within them."""
+def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
+    """Return the cross sections of a line: ends of dashes, and stations within them.
+
+    Where the road steps, lines end before the step and start again after it.
+    """
+    s = surface.stations.s
+    last = len(s) - 1
+    if len(line.starts) == 1 and line.starts[0] <= s[0] and line.stops[0] >= s[-1]:
+        stations = np.append(np.arange(last), last - 1)
+        shares = np.append(np.zeros(last), 1.0)
+        quads = np.delete(np.arange(last), surface.steps)
+    else:
+        stations, shares, quads = _dashed_knots(line, s, surface.steps)
     middle = border + line.shift
-    if len(line.starts) == 1 and line.starts[0] <= stations[0] and line.stops[0] >= stations[-1]:
-        rows = np.arange(len(stations) - 1)
-        knots = np.append(rows, rows[-1])
-        last = np.append(np.zeros(len(rows)), 1.0)
-        following = middle[knots + 1]
-        return _Knots(
-            stations, knots, last, middle[knots], following, line.width, rows, line.colour
-        )
-    distances = np.sort(np.concatenate([line.starts, line.stops, stations]))
-    distances = distances[np.append(True, np.diff(distances) > 0)]
-    middles = (distances[1:] + distances[:-1]) / 2
-    dash = np.searchsorted(line.starts, middles, "right") - 1
-    painted = (dash >= 0) & (middles < line.stops[np.maximum(dash, 0)])
-    rows = np.clip(np.searchsorted(stations, distances, "right") - 1, 0, len(stations) - 2)
-    shares = (distances - stations[rows]) / (stations[rows + 1] - stations[rows])
     return _Knots(
-        distances,
-        rows,
-        np.clip(shares, 0, 1),
-        middle[rows],
-        middle[rows + 1],
-        line.width,
-        np.flatnonzero(painted),
-        line.colour,
+        stations, shares, middle[stations], middle[stations + 1], line.width, quads, line.colour
     )
+
+
+def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, Ints]:
+    """Return the stations, shares and quadrangles of the cross sections of a line of dashes.
+
+    `s` are the distances of the section's stations (k,), m, and `steps` (j,) the stations that the
+    next follows at the same distance.
+    """
+    last = len(s) - 1
+    # At a step, a dash starts at the station after it, and stops at the station before it.
+    starts = _positions(line.starts, s, np.searchsorted(s, line.starts, "right") - 1)
+    stops = _positions(line.stops, s, np.searchsorted(s, line.stops, "left") - 1)
+    positions = np.sort(np.concatenate([starts, stops, np.arange(last + 1)]))
+    positions = positions[np.append(True, np.diff(positions) > 0)]
+    middles = (positions[1:] + positions[:-1]) / 2
+    dash = np.searchsorted(starts, middles, "right") - 1
+    is_painted = (dash >= 0) & (middles < stops[np.maximum(dash, 0)])
+    if len(steps):
+        is_painted &= ~np.isin(middles.astype(np.int64), steps)
+    stations = np.minimum(positions.astype(np.int64), last - 1)
+    return stations, positions - stations, np.flatnonzero(is_painted)
+
+
+def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
+    """Return distances (d,) in numbers of stations, with the share of the way to the following."""
+    stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
+    lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
+    shares = (distances - s[stations]) / lengths
+    return np.asarray(stations + np.minimum(np.maximum(shares, 0), 1))
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
@@ -141,7 +159,7 @@ def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
     shares = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
     second_t = np.concatenate([entry.second_t for entry in knots])
-    half = np.concatenate([np.full(len(entry.distances), entry.width / 2) for entry in knots])
+    half = np.concatenate([np.full(len(entry.stations), entry.width / 2) for entry in knots])
     count = len(rows)
     corners = surface.points(
         np.concatenate([rows, rows, rows + 1, rows + 1]),

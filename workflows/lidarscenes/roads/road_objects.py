@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import arctan2
 from lidarsim.base.vectors import length
 from lidarsim.scene.files.scene_graph import Piece
@@ -18,9 +18,28 @@ from lidarsim.scene.files.scene_graph import Piece
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .lanes import LaneSection
 from .materials import CONCRETE, PAINT, material_of_object
-from .road import Network, Road
+from .road import Frames, Network, Road
 from .road_marks import LIFT_M
-from .solids import box, cylinder, extruded, painted_strips, placed, prism, rotation, zebra
+from .solids import (
+    box,
+    cylinder,
+    extruded,
+    joined,
+    painted_strips,
+    placed,
+    prism,
+    rotation,
+    zebra,
+)
+from .stations import (
+    HEIGHT_SHARE,
+    Intervals,
+    SampledSurface,
+    Samples,
+    Stations,
+    has_extent,
+    placed_stations,
+)
 
 TUNNEL_HEIGHT_M = 5.0
 TUNNEL_MARGIN_M = 0.5  # from the outermost lanes to the walls
@@ -28,24 +47,31 @@ STRIPE_M = 0.5  # stripes and gaps of crosswalks that state no markings
 UNTYPED = "object"  # name of objects without a type, whose flat outlines may be lines or decals
 _FLAT = ("crosswalk", "roadMark", "parkingSpace")  # types that are paint if they have no height
 _BYTES_PER_COPY = 4000
+_BYTES_PER_POINT = 400  # peak memory of a point of a rail or tunnel
+_TOP = [3, 2]  # corners of a rail between which it is measured, from the right to the left
+_CEILING = [2, 1]  # of a tunnel, from the right to the left
 _KNOWN_OBJECTS = ("object", "objectReference", "tunnel")
 _KNOWN = ("repeat", "outline", "outlines", "material", "parkingSpace", "markings")
 
 
-class ObjectBuilder(NamedTuple):
+class ObjectBuilder:
     """Builder of the objects of a file."""
 
-    network: Network
-    sag_m: float
-    allowance: Allowance
-    unread: UnreadElements
+    def __init__(
+        self, network: Network, sag_m: float, allowance: Allowance, unread: UnreadElements
+    ) -> None:
+        self._network = network
+        self._sag_m = sag_m
+        self._allowance = allowance
+        self._unread = unread
+        self._rails = _rail_pieces(network, sag_m, allowance)
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
         """Yield the names and triangles of the objects of a road."""
         for group in road.element.iterfind("objects"):
-            self.unread.check(group, _KNOWN_OBJECTS)
+            self._unread.check(group, _KNOWN_OBJECTS)
             for element in group.iterfind("object"):
-                self.unread.check(element, _KNOWN)
+                self._unread.check(element, _KNOWN)
                 yield from self._object(road, element)
             for k, element in enumerate(group.iterfind("tunnel")):
                 name = f"tunnel {road.name}/{element.get('id') or k}"
@@ -54,9 +80,7 @@ class ObjectBuilder(NamedTuple):
 
     def _object(self, road: Road, element: Element) -> Iterator[tuple[str, Piece]]:
         """Yield the names and triangles of an object and of its copies."""
-        kind = element.get("type")
-        if kind in (None, "", "none", "-1"):
-            kind = UNTYPED
+        kind = _kind(element)
         name = f"{kind[:MAX_SHOWN]} {road.name}/{(element.get('id') or '')[:MAX_SHOWN]}"
         repeats = element.findall("repeat")
         if not repeats:
@@ -65,10 +89,11 @@ class ObjectBuilder(NamedTuple):
                 yield name, piece
         count = 0
         for repeat in repeats:
-            if positive(repeat, "distance", 0.0) == 0 and not _outlines(element):
-                strip = self._continuous(road, element, repeat, kind)
-                if strip is not None:
-                    yield name, strip
+            if _is_rail(element, repeat):
+                if repeat in self._rails:
+                    yield name, self._rails[repeat]
+                else:
+                    self._unread.add("object without a size")
                 continue
             for placement in self._copies(element, repeat):
                 count += 1
@@ -80,9 +105,9 @@ class ObjectBuilder(NamedTuple):
     ) -> Iterator[Piece]:
         """Yield the triangles of an object at a placement."""
         material = material_of_object(kind)
-        frame = _ObjectFrame.of(self.network, road, element, placement)
+        frame = _ObjectFrame.of(self._network, road, element, placement)
         outlines = [
-            _Outline.of(self.network, road, outline, frame) for outline in _outlines(element)
+            _Outline.of(self._network, road, outline, frame) for outline in _outlines(element)
         ]
         painted = [*self._markings(element, frame, placement, outlines)]
         yield from painted
@@ -97,12 +122,12 @@ class ObjectBuilder(NamedTuple):
             yield _roof(outlines, material)
         elif placement.radius > 0 and placement.height > 0:
             yield cylinder(
-                placement.radius, placement.height, frame.origin, frame.turn, material, self.sag_m
+                placement.radius, placement.height, frame.origin, frame.turn, material, self._sag_m
             )
         elif not outlines and max(size[:2]) > 0 and placement.height > 0:
             yield box(size, frame.origin, frame.turn, material)
         else:
-            self.unread.add("object without a size")
+            self._unread.add("object without a size")
 
     def _copies(self, element: Element, repeat: Element) -> Iterator[_Placement]:
         """Yield the placements of the copies of an object along a road."""
@@ -110,61 +135,10 @@ class ObjectBuilder(NamedTuple):
         span = positive(repeat, "length", 0.0)
         distance = positive(repeat, "distance", 0.0)
         count = span / distance + 1e-6 if distance > 0 else 0
-        self.allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
+        self._allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
         for k in range(int(count) + 1):
             share = min(1.0, k * distance / span) if span > 0 else 0.0
             yield base.repeated(repeat, share, number(repeat, "s") + k * distance)
-
-    def _continuous(self, road: Road, element: Element, repeat: Element, kind: str) -> Piece | None:
-        """Return an object that is drawn along a road, such as a guard rail; None without size."""
-        start = number(repeat, "s")
-        stop = min(start + positive(repeat, "length", 0.0), road.length)
-        base = _Placement.of(element)
-        first = base.repeated(repeat, 0.0, start)
-        last = base.repeated(repeat, 1.0, stop)
-        if stop <= start or max(first.height, last.height) <= 0:
-            self.unread.add("object without a size")
-            return None
-        stations = self._stations(road, start, stop)
-        share = (stations - start) / (stop - start)
-
-        def along(a: float, b: float) -> Floats:
-            return np.asarray(a + share * (b - a))
-
-        width = np.maximum(along(first.wide, last.wide), 1e-3)
-        t = along(first.t, last.t)
-        lower = along(first.z, last.z)
-        upper = lower + along(first.height, last.height)
-        ring = [(-0.5, lower), (0.5, lower), (0.5, upper), (-0.5, upper)]
-        frames = self.network.frames([road], [stations])
-        sections = np.stack(
-            [
-                frames.origins
-                + (t + side * width)[:, None] * frames.side
-                + height[:, None] * frames.up
-                for side, height in ring
-            ],
-            axis=1,
-        )
-        return extruded(sections, material_of_object(kind))
-
-    def _stations(self, road: Road, start: float, stop: float) -> Floats:
-        """Return distances (k,) at which a line along a road is cut, within the tolerance."""
-        breaks = road.breaks
-        inside = breaks[(breaks > start) & (breaks < stop)]
-        breaks = np.unique(np.concatenate([[start], inside, [stop]]))
-        starts = breaks[:-1]
-        stops = breaks[1:]
-        bend = self.network.max_curvatures(road, starts, stops)
-        bend = bend * 2 + road.elevation.max_bends(starts, stops)
-        counts = np.ceil((stops - starts) * np.sqrt(bend / (8 * self.sag_m)))
-        counts = np.maximum(1, np.minimum(counts, 1e9)).astype(np.int64)
-        self.allowance.take(int(counts.sum()) * _BYTES_PER_COPY)
-        pieces = [
-            a + (b - a) * np.arange(n) / n
-            for a, b, n in zip(starts.tolist(), stops.tolist(), counts.tolist(), strict=True)
-        ]
-        return np.concatenate([*pieces, [stop]])
 
     def _markings(
         self,
@@ -190,7 +164,7 @@ class ObjectBuilder(NamedTuple):
                 line = [*sides.get(marking.get("side", ""), ())]
             width = positive(marking, "width", 0.0)
             if len(line) < 2 or not width:
-                self.unread.add("marking without a line")
+                self._unread.add("marking without a line")
                 continue
             starts, stops = self._dashed(np.array(line), marking)
             if len(starts):
@@ -211,7 +185,7 @@ class ObjectBuilder(NamedTuple):
             if last <= first or size <= 0:
                 continue
             count = (last - first) / (dash + space) if dash > 0 and space > 0 else 0.0
-            self.allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
+            self._allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
             offsets = first + (dash + space) * np.arange(int(count) + 1)
             offsets = offsets[offsets < last]
             ends = np.minimum(offsets + dash, last) if count else np.array([last])
@@ -233,18 +207,133 @@ class ObjectBuilder(NamedTuple):
             last = min(stop, section.stop)
             if last - first < TUNNEL_MARGIN_M:
                 continue
-            stations = self._stations(road, first, last)
-            borders = np.stack([*section.borders(road, stations).values()])
-            left = borders.max(axis=0) + TUNNEL_MARGIN_M
-            right = borders.min(axis=0) - TUNNEL_MARGIN_M
-            frames = self.network.frames([road], [stations])
-            corners = ((left, 0.0), (left, TUNNEL_HEIGHT_M), (right, TUNNEL_HEIGHT_M), (right, 0.0))
-            rings = np.stack(
-                [frames.origins + t[:, None] * frames.side + h * frames.up for t, h in corners],
-                axis=1,
-            )
-            for a, b in ((0, 1), (1, 2), (2, 3)):  # open below
-                yield _sheet(rings[:, a], rings[:, b])
+            yield from self._tunnel_part(road, section, first, last)
+
+    def _tunnel_part(
+        self, road: Road, section: LaneSection, start: float, stop: float
+    ) -> Iterator[Piece]:
+        """Yield the walls and the ceiling of a tunnel between two distances of a lane section."""
+        intervals = section.intervals(road, start, stop)
+        is_plain = section.is_plain and road.is_plain
+        samples = intervals.sampled(
+            are_planes=is_plain and self._network.is_straight(road, intervals)
+        )
+        rings = self._tunnel_rings(road, section, samples.stations)
+        surface = _sampled(samples, rings[:, _CEILING], self._sag_m)
+        [placed] = placed_stations([surface], self._sag_m, self._allowance, _BYTES_PER_POINT)
+        rings = self._tunnel_rings(road, section, placed.stations)
+        for a, b in pairwise(range(4)):  # open below
+            yield _sheet(rings[:, a], rings[:, b], placed.steps)
+
+    def _tunnel_rings(self, road: Road, section: LaneSection, stations: Stations) -> Floats:
+        """Return corners (k, 4, 3) of a tunnel, from lower left to lower right over the ceiling."""
+        borders = np.stack([*section.borders(road, stations).values()])
+        left = borders.max(axis=0) + TUNNEL_MARGIN_M
+        right = borders.min(axis=0) - TUNNEL_MARGIN_M
+        frames = self._network.frames([road], [stations])
+        corners = ((left, 0.0), (left, TUNNEL_HEIGHT_M), (right, TUNNEL_HEIGHT_M), (right, 0.0))
+        return np.stack(
+            [frames.origins + t[:, None] * frames.side + h * frames.up for t, h in corners],
+            axis=1,
+        )
+
+
+class _Rail(NamedTuple):
+    """An object that is drawn along a road, such as a guard rail."""
+
+    road: Road
+    start: float  # m
+    stop: float  # m
+    first: _Placement
+    last: _Placement
+    intervals: Intervals
+    material: str
+
+    @classmethod
+    def of(cls, road: Road, element: Element, repeat: Element) -> _Rail | None:
+        """Return the rail of a <repeat>; None without a size."""
+        start = number(repeat, "s")
+        stop = min(start + positive(repeat, "length", 0.0), road.length)
+        base = _Placement.of(element)
+        first = base.repeated(repeat, 0.0, start)
+        last = base.repeated(repeat, 1.0, stop)
+        if stop <= start or max(first.height, last.height) <= 0:
+            return None
+        intervals = Intervals.between(start, stop, road.breaks)
+        material = material_of_object(_kind(element))
+        return cls(road, start, stop, first, last, intervals, material)
+
+    def rings(self, stations: Stations, frames: Frames) -> Floats:
+        """Return cross sections (k, 4, 3), from the lower right corner to the upper left."""
+        share = (stations.s - self.start) / (self.stop - self.start)
+        first = self.first
+        last = self.last
+        width = np.maximum(first.wide + share * (last.wide - first.wide), 1e-3)
+        t = first.t + share * (last.t - first.t)
+        lower = first.z + share * (last.z - first.z)
+        upper = lower + (first.height + share * (last.height - first.height))
+        right_side = (t - width / 2)[:, None] * frames.side
+        left_side = (t + width / 2)[:, None] * frames.side
+        lower_up = lower[:, None] * frames.up
+        upper_up = upper[:, None] * frames.up
+        corners = (
+            right_side + lower_up,
+            left_side + lower_up,
+            left_side + upper_up,
+            right_side + upper_up,
+        )
+        return np.stack([frames.origins + corner for corner in corners], axis=1)
+
+
+def _rail_pieces(network: Network, sag_m: float, allowance: Allowance) -> dict[Element, Piece]:
+    """Return the rails of a file by their <repeat>."""
+    rails: dict[Element, _Rail] = {}
+    for road in network.roads:
+        for element in road.element.iterfind("objects/object"):
+            for repeat in element.iterfind("repeat"):
+                rail = _Rail.of(road, element, repeat) if _is_rail(element, repeat) else None
+                if rail is not None:
+                    rails[repeat] = rail
+    samples = [
+        rail.intervals.sampled(
+            are_planes=rail.road.is_plain and network.is_straight(rail.road, rail.intervals)
+        )
+        for rail in rails.values()
+    ]
+    allowance.check(4 * sum(len(entry.stations) for entry in samples) * _BYTES_PER_POINT)
+    rings = _rings(network, rails.values(), [entry.stations for entry in samples])
+    surfaces = [
+        _sampled(entry, sections[:, _TOP], sag_m)
+        for entry, sections in zip(samples, rings, strict=True)
+    ]
+    placed = placed_stations(surfaces, sag_m, allowance, _BYTES_PER_POINT)
+    rings = _rings(network, rails.values(), [entry.stations for entry in placed])
+    # Where the road steps, one solid ends and another starts.
+    return {
+        repeat: joined(
+            [extruded(part, rail.material) for part in np.split(sections, entry.steps + 1)]
+        )
+        for (repeat, rail), sections, entry in zip(rails.items(), rings, placed, strict=True)
+    }
+
+
+def _sampled(samples: Samples, points: Floats, sag_m: float) -> SampledSurface:
+    """Return the surface between two lines of points (k, 2, 3) at samples."""
+    columns = np.moveaxis(points, 1, 0)
+    is_cell = np.ones(1, np.bool_)
+    return SampledSurface(samples.intervals, columns, is_cell, HEIGHT_SHARE * sag_m)
+
+
+def _rings(
+    network: Network, rails: Collection[_Rail], stations: Sequence[Stations]
+) -> Iterator[Floats]:
+    """Yield the cross sections (k, 4, 3) of each rail at stations."""
+    frames = network.frames([rail.road for rail in rails], stations)
+    stop = 0
+    for rail, at in zip(rails, stations, strict=True):
+        start = stop
+        stop += len(at)
+        yield rail.rings(at, frames.take(slice(start, stop)))
 
 
 class _Placement(NamedTuple):
@@ -306,7 +395,7 @@ class _ObjectFrame(NamedTuple):
         cls, network: Network, road: Road, element: Element, placement: _Placement
     ) -> _ObjectFrame:
         """Return the frame of an object, which is upright whatever the slope of the road."""
-        frames = network.frames([road], [np.array([placement.s])])
+        frames = network.frames([road], [Stations.at(np.array([placement.s]))])
         origin = frames.origins + placement.t * frames.side + placement.z * frames.up
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
         turn = rotation(
@@ -334,9 +423,8 @@ class _Outline(NamedTuple):
         ids = {}
         for corner in element:
             if corner.tag == "cornerRoad":
-                s = np.array([number(corner, "s") + frame.shift])
-                t = np.array([number(corner, "t")])
-                point = network.points(road, s, t, number(corner, "dz", 0.0))[0]
+                s = number(corner, "s") + frame.shift
+                point = network.point(road, s, number(corner, "t"), number(corner, "dz", 0.0))
             elif corner.tag == "cornerLocal":
                 uvz = [number(corner, name, 0.0) for name in "uvz"]
                 point = placed(np.array([uvz]), frame.origin, frame.turn)[0]
@@ -352,6 +440,17 @@ class _Outline(NamedTuple):
             element.get("closed") != "false",
             element.get("outer") != "false",
         )
+
+
+def _kind(element: Element) -> str:
+    """Return the type of an object."""
+    kind = element.get("type")
+    return UNTYPED if kind in (None, "", "none", "-1") else kind
+
+
+def _is_rail(element: Element, repeat: Element) -> bool:
+    """Return True if a <repeat> draws an object along a road, in place of copies."""
+    return positive(repeat, "distance", 0.0) == 0 and not _outlines(element)
 
 
 def _outlines(element: Element) -> list[Element]:
@@ -379,14 +478,7 @@ def _roof(outlines: Sequence[_Outline], material: str) -> Piece:
                 material,
             )
         )
-    counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    return Piece(
-        np.concatenate([piece.vertices for piece in pieces]),
-        np.concatenate(
-            [piece.faces + start for piece, start in zip(pieces, counts.tolist(), strict=False)]
-        ),
-        material=material,
-    )
+    return joined(pieces)
 
 
 def _flat_pieces(
@@ -421,9 +513,10 @@ def _rectangle(size: Sequence[float]) -> Floats:
     )
 
 
-def _sheet(first: Floats, second: Floats) -> Piece:
-    """Return the surface between two lines of points (k, 3)."""
+def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
+    """Return the surface between two lines of points (k, 3), with walls at steps (j,)."""
     count = len(first)
+    points = np.concatenate([first, second])
     a = np.arange(count - 1)
     faces = np.concatenate(
         [
@@ -431,7 +524,9 @@ def _sheet(first: Floats, second: Floats) -> Piece:
             np.stack([a, a + 1 + count, a + count], axis=1),
         ]
     )
-    return Piece(np.concatenate([first, second]), faces, material=CONCRETE)
+    rows = np.concatenate([steps, steps + count - 1])
+    thin = rows[~has_extent(points, faces[rows])]
+    return Piece(points, np.delete(faces, thin, axis=0), material=CONCRETE)
 
 
 def _paint_of(element: Element) -> str:

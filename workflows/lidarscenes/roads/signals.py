@@ -17,6 +17,7 @@ from .lanes import LaneSection
 from .materials import CARRIAGEWAY, LAMP, METAL, SIGN
 from .road import Network, Road
 from .solids import FRONT_FACES, box, cylinder, rotation
+from .stations import Stations
 
 SIZE_M = 0.6  # width and height of signs that state no size
 LIGHT_M = (0.3, 0.9)  # width and height of traffic lights that state no size
@@ -97,12 +98,12 @@ class SignalBuilder(NamedTuple):
         if placement is None:
             placement = element.find("physicalPosition/positionRoad")
         source = element if placement is None else placement
-        s = np.array([number(source, "s")])
-        frames = self.network.frames([road], [s])
+        at = Stations.at(np.array([number(source, "s")]))
+        frames = self.network.frames([road], [at])
         foot = frames.origins[0] + number(source, "t") * frames.side[0]
         if road.curved_across:
             t = np.array([number(source, "t")])
-            foot = foot + road.heights(s, t)[0] * frames.up[0]
+            foot = foot + road.heights(at, t)[0] * frames.up[0]
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
         if element.get("orientation", "+") != "-":  # traffic along the road sees the front
             heading += np.pi
@@ -135,7 +136,8 @@ def _hangs(road: Road, sections: Sequence[LaneSection], element: Element) -> boo
     section = next((x for x in sections if x.start <= s <= x.stop), None)
     if section is None:
         return False
-    borders = {key: float(v[0]) for key, v in section.borders(road, np.array([s])).items()}
+    at = Stations.at(np.array([s]))
+    borders = {key: float(t[0]) for key, t in section.borders(road, at).items()}
     for lane in section.all_lanes:
         inner = max(
             (k for k in borders if abs(k) < abs(lane.number) and k * lane.number >= 0),

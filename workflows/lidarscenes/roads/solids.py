@@ -120,6 +120,16 @@ def extruded(sections: Floats, material: str, *, capped: bool = True) -> Piece:
     return Piece(sections.reshape(-1, 3), faces, material=material)
 
 
+def joined(pieces: Sequence[Piece]) -> Piece:
+    """Return pieces of a material as one."""
+    counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
+    return Piece(
+        np.concatenate([piece.vertices for piece in pieces]),
+        np.concatenate([piece.faces + k for piece, k in zip(pieces, counts, strict=False)]),
+        material=pieces[0].material,
+    )
+
+
 def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -> Piece:
     """Return level strips of a width between points (n, 3), with their lines in the middle."""
     along = stops - starts

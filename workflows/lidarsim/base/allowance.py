@@ -65,11 +65,16 @@ class Allowance:
 
     def take(self, count: int) -> None:
         """Take a number of bytes, before they are allocated; LidarError above the limit."""
+        self.check(count)
         self.used_bytes += count
-        if self.used_bytes > self.limit:
+
+    def check(self, count: int) -> None:
+        """Check that a number of bytes fits that is freed again; LidarError above the limit."""
+        if not self.fits(count):
             raise LidarError(
-                f"it has {bytes_of(self._size)} and would unpack to {bytes_of(self.used_bytes)} or "
-                f"more, of at most {bytes_of(self.limit)}: {self._advice}."
+                f"it has {bytes_of(self._size)} and would unpack to "
+                f"{bytes_of(self.used_bytes + count)} or more, of at most {bytes_of(self.limit)}: "
+                f"{self._advice}."
             )
 
 
