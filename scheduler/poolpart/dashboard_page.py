@@ -42,17 +42,20 @@ _PAGE = Template("""<!doctype html>
 <title>Partitions</title>
 <style>
 :root { color-scheme: light dark; }
-body { max-width: 70rem; margin: 1.5rem auto; font: 14px/1.5 system-ui, sans-serif; }
-table { border-collapse: collapse; margin-bottom: 2rem; font-variant-numeric: tabular-nums; }
+body { max-width: 70rem; margin: 1.5rem auto; padding: 0 1rem; font: 14px/1.5 system-ui, sans-serif;
+  color: #1c1e21; background: #fff; }
+@media (prefers-color-scheme: dark) { body { color: #e3e5e8; background: #16181c; } }
+div { overflow-x: auto; margin-bottom: 2rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; white-space: nowrap; }
 caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
 th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
 th:first-child, td:first-child { text-align: left; }
 </style>
-{% for title, head, rows in tables %}{% if rows %}<table>
+{% for title, head, rows in tables %}{% if rows %}<div tabindex="0"><table>
 <caption>{{ title }}</caption>
 <tr>{% for cell in ["", *head] %}<th>{{ cell }}</th>{% end %}</tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ str(cell)[:200] }}</td>{% end %}</tr>
-{% end %}</table>
+{% end %}</table></div>
 {% end %}{% end %}""")
 _COUNTS = ("waiting", "queued", "running", "done", "failed", "seconds")
 _OF_A_WORKER = ("partition", "slots", "busy", "tasks given", "status", "address")
@@ -75,12 +78,12 @@ def page_of(scheduler: Any) -> bytes:
         state = (
             "open" if end is None else "closed" if isinstance(end, PipeClosed) else f"failed: {end}"
         )
-        pipes.append([name, pipe.queue.qsize(), state])
+        pipes.append([name, pipe.queue.qsize(), pipe.queue.capacity, state])
     tables = [
         ("Partitions", ["workers", "slots", "busy", *_COUNTS], partitions),
         ("Stages", ["partition", *_COUNTS], stages),
         ("Workers", _OF_A_WORKER, [_worker(worker) for worker in workers]),
-        ("Pipes", ["depth", "state"], pipes),
+        ("Pipes", ["depth", "capacity", "state"], pipes),
     ]
     return _PAGE.generate(tables=tables)
 
@@ -102,7 +105,7 @@ def _worker(worker: Any) -> list[object]:
         running_on(worker, partition)[1],
         len(worker.processing),
         worker.status.name,
-        worker.address,
+        "" if worker.name == worker.address else worker.address,
     ]
 
 
@@ -163,17 +166,33 @@ class PageOwners(SchedulerPlugin):
 def partitions_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
     check_client(client)
-    try:
-        link = client.dashboard_link
-    except KeyError:  # no such service
-        link = None
-    on_scheduler(client, _open, owner=client.id, link=link)
-    if not link:
+    on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
+    link = page_link(client)
+    if link is None:
         raise PoolError(
             f"The scheduler at {client.scheduler.address} has no HTTP server for a page: start "
             "it with a dashboard address, such as 127.0.0.1:8787."
         )
-    return f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
+    return link
+
+
+def page_link(client: Client) -> str | None:
+    """Return the URL that the page has while it is open; None without an HTTP server."""
+    link = _dashboard_link(client)
+    return link and f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
+
+
+def _dashboard_link(client: Client) -> str | None:
+    """Return the URL of Dask's dashboard, or None if the scheduler has no such service."""
+    try:
+        return client.dashboard_link or None
+    except KeyError:
+        return None
+
+
+def is_open(scheduler: Any) -> bool:
+    """Return whether the scheduler serves the page."""
+    return NAME in scheduler.plugins
 
 
 async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> None:

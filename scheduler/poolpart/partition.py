@@ -19,6 +19,7 @@ from .for_each import ItemTasks
 from .internals.names import MAP, require
 from .mapping import Results, Stage
 from .membership import addresses_of, check_slots, forget_memberships
+from .notebook import table_of_partitions
 from .pipe import Pipe
 from .rules import check_count
 from .stats import PartitionStats, stats_of
@@ -91,6 +92,10 @@ class Partition:
 
     def __repr__(self) -> str:
         return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table that notebooks show."""
+        return table_of_partitions(self.client, repr(self), [self.name])
 
     def stats(self) -> PartitionStats:
         """Return the load and the finished tasks of the partition, of all clients.

@@ -15,6 +15,7 @@ from .dashboard_page import leave_page, partitions_page
 from .division import ask, declare, dissolve
 from .errors import PoolError
 from .membership import forget_memberships
+from .notebook import table_of_partitions
 from .partition import Partition
 from .pipe_states import names_of_pipes
 from .probe import worker_gpus
@@ -103,6 +104,10 @@ class Pool:
         parts = ", ".join(f"{name} {count}" for name, count in sorted(declared.items()))
         parts = f"; partitions: {parts}" if parts else ""
         return f"<Pool: workers {len(self)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table of all partitions of the cluster that notebooks show."""
+        return table_of_partitions(self.client, repr(self))
 
     def __getitem__(self, name: str) -> Partition:
         if (part := (parts := self.partitions()).get(name)) is None:

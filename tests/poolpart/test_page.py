@@ -85,9 +85,9 @@ def test_what_it_tells(client, wait_until):
         client.gather(results)
         wait_until(failing.done)
         rows = rows_of(url)
-        assert rows["frames-12345678"] == ["3", "open"]
+        assert rows["frames-12345678"] == ["3", "5", "open"]
         pipe.fail("the reason")
-        assert rows_of(url)["frames-12345678"] == ["3", "failed: the reason"]
+        assert rows_of(url)["frames-12345678"] == ["3", "5", "failed: the reason"]
     assert rows["A"][:3] == ["1", "2", "0"]
     assert rows["work"][:5] == ["A", "0", "0", "0", "6"]
     assert (rows["broken"][0], rows["broken"][5]) == ("A", "1")
