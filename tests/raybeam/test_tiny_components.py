@@ -83,6 +83,7 @@ def test_rays_at_a_mesh(backend, shapes, origin):
     check(backend, [Instance(Mesh(*shapes["sphere"]()))], origin, packets(60))
 
 
+@pytest.mark.extended(keep=("embree*",))
 def test_rays_that_start_at_many_points(backend, shapes):
     directions = packets(60)
     rng = np.random.default_rng(1)
@@ -91,6 +92,7 @@ def test_rays_that_start_at_many_points(backend, shapes):
     check(backend, [Instance(Mesh(*shapes["sphere"]()))], origins, directions)
 
 
+@pytest.mark.extended(keep=("embree*",))
 def test_rays_that_start_outside(backend, shapes):
     directions = packets(60) * 0.05
     directions[:, 0] = -1
@@ -104,6 +106,7 @@ def test_rays_at_an_instance(backend, shapes, name):
     check(backend, [instance(Mesh(*shapes["sphere"]()), name)], ORIGIN, packets(60))
 
 
+@pytest.mark.extended(keep=("embree*",))
 def test_rays_at_many_instances(backend, shapes):
     """Also among instances that are turned by any angles, and after these have moved."""
     rng = np.random.default_rng(2)
@@ -121,6 +124,7 @@ def test_rays_at_many_instances(backend, shapes):
     assert hits[0].hit.all() and np.array_equal(hits[1].distance, hits[0].distance)
 
 
+@pytest.mark.extended(keep=("embree*",))
 @pytest.mark.parametrize("nested", [False, True])
 def test_rays_at_a_mask(backend, shapes, nested):
     vertices, faces = shapes["sphere"]()
@@ -135,6 +139,7 @@ def test_rays_at_a_mask(backend, shapes, nested):
     )
 
 
+@pytest.mark.extended(keep=("embree*",))
 def test_rays_at_moving_bodies(backend, shapes):
     """Poses turn by right angles, so directions in the axes of the bodies are tiny, too."""
     directions = packets(60)
@@ -168,6 +173,7 @@ def test_few_rays(backend, shapes, count):
     check(backend, [Instance(Mesh(*shapes["sphere"]()))], ORIGIN, directions)
 
 
+@pytest.mark.extended(keep=("embree*",))
 def test_sub_rays(backend, shapes):
     """Six sub-rays around beams on a regular grid, of which a ring is level."""
     azimuth, elevation = np.meshgrid(

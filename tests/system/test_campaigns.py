@@ -144,6 +144,7 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
     assert again.done == 2, "all files are known as the data set's own"
 
 
+@pytest.mark.extended
 def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
     def make_named(number: int, rng: np.random.Generator) -> Job:
         sensor = Sensor.grid(360, 20, step_deg=4)
@@ -204,6 +205,7 @@ pool: {backend: numpy, gpu: 1}
 
 
 @pytest.mark.usefixtures("pictures")
+@pytest.mark.extended
 @pytest.mark.slow(keep=("folder",))
 @pytest.mark.parametrize("kept", DATA_SETS)
 def test_a_campaign_has_the_same_bytes_twice(slots, tmp_path, monkeypatch, kept):

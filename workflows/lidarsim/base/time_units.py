@@ -82,4 +82,5 @@ def _probable_unit(times: Floats, stated: TimeUnit) -> TimeUnit:
             return unit
     if not step:
         return stated
-    return min(units, key=lambda unit: abs(np.log(step / SECONDS[unit] / _USUAL_STEP_S)))
+    ratios = {unit: step / SECONDS[unit] / _USUAL_STEP_S for unit in units}
+    return min(units, key=lambda unit: max(ratios[unit], 1 / ratios[unit]))
