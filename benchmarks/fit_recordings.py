@@ -20,7 +20,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lidarpool import LidarError, Noise, fit
-from lidarpool.compare.fit import SweepStack, find_surfaces, select_smooth_rays
+from lidarpool.compare.fit.motion import read_static
+from lidarpool.compare.fit.stack import SweepStack
+from lidarpool.compare.fit.surfaces import find_surfaces, select_smooth_rays
 from lidarpool.recordings.recordings import Recording, open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.angle_noise import angle_errors
@@ -70,9 +72,9 @@ def compare_halves(recording: Recording, model: str | None, white: float | None)
 
     LidarError if a half cannot be fitted.
     """
-    SweepStack.read(recording)  # refuses a sensor that moves, which halves may not show
+    read_static(recording)  # refuses a sensor that moves, which halves may not show
     fit_result = fit(every_second_sweep(recording, 0), model=model, white=white)
-    test_stack = SweepStack.read(every_second_sweep(recording, 1))
+    test_stack = read_static(every_second_sweep(recording, 1))
     rays = select_smooth_rays(test_stack, test_stack.rough_sigma, 0.002)
     recorded = flattened_ranges(test_stack, rays)
     energy = np.maximum(rays.intensity / (white or recording.white or 100), 1 / 400)

@@ -11,7 +11,8 @@ import yaml
 from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
 
 from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
-from lidarpool.compare.fit import Estimate, _with_performance
+from lidarpool.compare.fit.estimates import Estimate
+from lidarpool.compare.fit.fitting import _with_performance
 from lidarpool.export.formats import Format
 from lidarpool.recordings.recordings import Recording, open_recording
 from lidarscenes.procedural.city import city

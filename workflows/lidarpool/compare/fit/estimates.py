@@ -1,0 +1,81 @@
+"""Figures with their confidence intervals of 95 %."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats, Ints
+
+MIN_RAYS = 30  # rays that a figure or a point of a curve needs
+_CONFIDENCE = 0.95  # probability of intervals
+_CONFIDENCE_SIGMAS = 1.959964  # half of the interval of a normal distribution
+
+
+class Estimate(NamedTuple):
+    """A figure with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def from_variance(cls, value: Any, variance: Any) -> Estimate:
+        """Build the estimate of a normally distributed value with a variance."""
+        half = _CONFIDENCE_SIGMAS
+        return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -half, half)))
+
+    @classmethod
+    def from_values(cls, values: Floats) -> Estimate:
+        """Estimate the mean of values (n,)."""
+        return cls.from_variance(values.mean(), values.var() / len(values))
+
+    @classmethod
+    def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
+        """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
+
+        The interval is that of Clopper and Pearson for the number of independent pulses whose
+        binomial variance is the variance of the share by the n parts, at most the sum of totals.
+        The interval is not empty if the share is 0.
+        """
+        from scipy.stats import beta
+
+        total = float(totals.sum())
+        share = float(parts.sum()) / total
+        share_variance = float(((parts - share * totals) ** 2).sum()) / total**2
+        binomial_variance = share * (1 - share) / total
+        pulses = (
+            total * binomial_variance / share_variance
+            if share_variance > binomial_variance > 0
+            else total
+        )
+        tail = (1 - _CONFIDENCE) / 2
+        lower = beta.ppf(tail, share * pulses, (1 - share) * pulses + 1) if share > 0 else 0.0
+        upper = beta.isf(tail, share * pulses + 1, (1 - share) * pulses) if share < 1 else 1.0
+        return cls(share, float(lower), float(upper))
+
+    def is_within(self, share: float) -> bool:
+        """Return True if half of the interval is at most a share of the value."""
+        return self.high - self.low <= 2 * share * abs(self.value)
+
+    def power(self, exponent: float, scale: float = 1.0) -> Estimate:
+        """Return the estimate of `scale` times a power; negative numbers count as 0."""
+        value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
+        return Estimate(value, min(limits), max(limits))
+
+
+def sandwich(design: Floats, residuals: Floats, patch: Ints | None = None) -> Floats:
+    """Estimate the covariance of a least-squares fit whose residuals (k,) are of unequal size.
+
+    Residuals of one patch (k,), such as of a surface, may be alike.
+    """
+    inverse = np.linalg.pinv(design.T @ design, hermitian=True)
+    score = design * residuals[:, None]
+    if patch is not None:
+        _, patch = np.unique(patch, return_inverse=True)
+        sums = np.zeros((patch.max() + 1, score.shape[1]))
+        np.add.at(sums, patch, score)
+        score = sums * np.sqrt(len(sums) / max(len(sums) - 1, 1))
+    covariance: Floats = inverse @ (score.T @ score) @ inverse
+    return covariance

@@ -1,0 +1,322 @@
+"""Fits noise, lost pulses and false alarms to the statistics of rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
+
+from .estimates import MIN_RAYS, Estimate, sandwich
+from .stack import SweepStack
+from .surfaces import MIN_RETURN_SHARE, SmoothRays
+
+# chances of a variance above which a ray is left out: outliers only, and the upper tail
+_OUTLIER_CHANCE = 1e-4
+_TAIL_CHANCE = 0.1
+# rings of a patch of rays; patches of a revolution
+_PATCH_ROWS = 4
+_PATCHES = 36
+_FRONTAL_TANGENT = 1.0  # tangent of incidence: below, noise is hardly that of directions
+_MIN_FRONTAL_RAYS = 100
+_MIN_FRONTAL_SHARE = 0.05
+_MAX_HALF_INTERVAL = 0.75  # half of the interval of a figure of noise, over its value
+_VARIANCE_ERROR = 0.03  # relative error of the variances of steep or distant rays
+_MAX_VARIANCE_RATIO = 3.0  # quotient of a variance and the expected variance that counts at most
+# quotient of ranges, and tangent of incidence, that determine noise by range and by direction
+_MIN_RANGE_RATIO = 2.0
+_MIN_TILT_TANGENT = 0.3
+
+# Lost pulses and false alarms
+_MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
+_LOG_STEP = 1e-3  # of logarithms, for derivatives
+# Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
+# gaps between leaves, leaves return once.
+_SKY_RINGS = 7
+_SKY_DEG = 36.0
+_MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
+
+
+def has_frontal_rays(rays: SmoothRays) -> bool:
+    """Return True if enough frontal rays separate noise of ranges from noise of directions."""
+    frontal = (rays.slope < _FRONTAL_TANGENT * rays.distance).sum()
+    return bool(frontal >= max(_MIN_FRONTAL_RAYS, _MIN_FRONTAL_SHARE * len(rays.row)))
+
+
+def fit_performance(
+    stack: SweepStack, rays: SmoothRays, energy: Floats | None
+) -> tuple[dict[str, Estimate], Floats]:
+    """Estimate the performance of a sensor from repeated sweeps.
+
+    `energy` (k,) is that of the returns of rays, if known. Returns estimates by the field names of
+    `Noise`; and the standard deviations of rays (k,), metres, by range or by energy, whichever is
+    likelier.
+    """
+    threshold, dropout = _fit_detection(rays, energy)
+    scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
+    if energy is not None and threshold is not None:
+        by_energy = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
+        if "range_at_threshold_m" in by_energy.estimates and by_energy.deviance < scatter.deviance:
+            scatter = by_energy
+    figures = {}
+    if has_frontal_rays(rays):
+        figures = {
+            name: estimate
+            for name, estimate in scatter.estimates.items()
+            if estimate.is_within(_MAX_HALF_INTERVAL)
+        }
+    if threshold is not None:
+        figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
+    if alarms := alarm_share(stack):
+        figures["false_alarms"] = alarms
+    if dropout is not None:
+        figures["dropout"] = dropout
+    return figures, scatter.sigma
+
+
+def _fit_detection(
+    rays: SmoothRays, energy: Floats | None
+) -> tuple[Estimate | None, Estimate | None]:
+    """Estimate the energy of which half of the pulses return, and the share lost at any energy.
+
+    Either is None if undetermined; `energy` (k,) is None if unknown.
+    """
+    light = np.nan_to_num(rays.intensity) if energy is None else energy
+    strong = light >= np.median(light)
+    threshold = None
+    dropout = lost_share(rays, strong)
+    for _ in range(3):
+        if energy is None:
+            break
+        lost = dropout.value if dropout else 0.0
+        threshold = fit_threshold(energy, rays.returns, rays.trials, lost)
+        if threshold is None:
+            break
+        strong = energy > 2 * threshold.value  # no pulse of these is lost for want of energy
+        dropout = lost_share(rays, strong) or dropout
+    return threshold, dropout
+
+
+def lost_share(rays: SmoothRays, chosen: Bools) -> Estimate | None:
+    """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
+
+    A ray without any return is unknown, so the rays that are known lose fewer pulses than others.
+    For each return of a ray, the share is that of the other `trials - 1` pulses: the mean of
+    (trials - returns) / (trials - 1) over all returns is unbiased.
+    """
+    chosen = chosen & (rays.trials > 1)
+    if chosen.sum() < MIN_RAYS:
+        return None
+    returns = rays.returns[chosen]
+    trials = rays.trials[chosen]
+    return Estimate.from_shares((trials - returns) * returns / (trials - 1), returns)
+
+
+class ScatterFit(NamedTuple):
+    """Noise of ranges and directions that was fitted to the variances of rays."""
+
+    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
+    sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
+    deviance: float  # of the fit to all rays; a smaller deviance is likelier
+
+
+class _VarianceSamples(NamedTuple):
+    """Variances of the ranges of rays that lose few pulses, (k,) each."""
+
+    variance: Floats  # square metres
+    freedom: Ints  # degrees of freedom of the variance
+    growth: Floats  # the quantity with which noise of ranges grows, such as the range
+    slope: Floats  # metres in a radian
+    distance: Floats  # metres
+    patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
+
+
+@dataclass(frozen=True, eq=False)
+class _VarianceModel:
+    """Variance of ranges: noise that grows with a quantity, plus noise of directions.
+
+    The three parameters are relative to the usual variance v: for noise of ranges σ at growth 0,
+    (σ / √v) to the power `power`; the increase of that power at `growth_scale`; and the variance
+    by noise of directions at `slope_scale` over v. Methods take the parameters (p,) that `fitted`
+    marks; the others are 0.
+    """
+
+    power: int  # of σ and the growth: 1 if noise adds, 2 if variances add
+    fitted: Bools  # (3,): which parameters are fitted
+    variance_scale: float  # usual variance v, square metres
+    growth_scale: float  # usual growth, in its unit
+    slope_scale: float  # usual slope, metres in a radian
+
+    def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
+        """Return the variances (k,) of the ranges of rays, square metres."""
+        theta = np.zeros(3)
+        theta[self.fitted] = parameters
+        range_term = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
+        direction_term = theta[2] * (slope / self.slope_scale) ** 2
+        return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
+
+    def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
+        """Return the variances (k,) that the model gives samples, square metres."""
+        return self.variance(parameters, samples.growth, samples.slope)
+
+
+def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int) -> ScatterFit:
+    """Fit noise of ranges and directions to the variances of rays, by their likelihood.
+
+    The noise of ranges is a + b g for power 1 and √(a² + b² g²) for power 2, with the `growth` g
+    (k,); a is the figure `range_m`, and b the figure `increase_name`. Figures that the rays do not
+    determine, for want of different growths or inclined surfaces, are left out. Intervals are of
+    sandwich estimators, for patches of rays that may be alike, and of errors of the model: edges,
+    slopes, and growth.
+    """
+    lower, middle, upper = np.quantile(growth, (0.05, 0.5, 0.95))
+    samples = _variance_samples(rays, growth)
+    is_tilted = np.quantile(rays.slope / rays.distance, 0.9) > _MIN_TILT_TANGENT
+    model = _VarianceModel(
+        power=power,
+        # Growth is fitted even if undetermined: it widens the interval of range_m rightly.
+        fitted=np.array([True, True, is_tilted]),
+        variance_scale=max(float(np.median(samples.variance)), 1e-12),
+        growth_scale=middle,
+        slope_scale=np.median(rays.slope),
+    )
+    exponents = (1 / power, 1 / power, 0.5)
+    scales = np.sqrt(model.variance_scale) / np.array([1, middle, np.radians(model.slope_scale)])
+    theta, theta_variance = _fit_variances(model, samples)
+    names = ("range_m", increase_name, "angle_deg")
+    estimates = {
+        names[k]: Estimate.from_variance(value, variance).power(exponents[k], scales[k])
+        for k, value, variance in zip(
+            np.flatnonzero(model.fitted), theta, theta_variance, strict=True
+        )
+        if k != 1 or upper > _MIN_RANGE_RATIO * lower
+    }
+    expected = model.expected(theta, samples)
+    ratios = np.minimum(samples.variance / expected, _MAX_VARIANCE_RATIO)
+    deviance = float(samples.freedom @ (np.log(expected) + ratios))
+    return ScatterFit(estimates, np.sqrt(model.variance(theta, growth, rays.slope)), deviance)
+
+
+def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
+    """Choose the rays whose variances are fitted; `growth` (k,) is of all rays.
+
+    Rays that lose many pulses are left out: only their nearer or brighter pulses return.
+    """
+    repeated = (rays.freedom > 0) & (rays.returns >= MIN_RETURN_SHARE * rays.trials)
+    patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
+    patch = rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // patch_columns
+    return _VarianceSamples(
+        variance=rays.variance[repeated],
+        freedom=rays.freedom[repeated],
+        growth=growth[repeated],
+        slope=rays.slope[repeated],
+        distance=rays.distance[repeated],
+        patch=patch[repeated],
+    )
+
+
+def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Floats, Floats]:
+    """Fit the parameters of a model (p,) to samples, and estimate the variances (p,) of the fit."""
+    start = np.array([1.0, 0.1, 0.1])[model.fitted]
+    theta, covariance = _fit_trimmed(model, start, samples, _TAIL_CHANCE)
+    # Edges that are finer than the rays make the variances of some rays larger: the change of the
+    # figures if fewer rays are left out is an error of the model.
+    untrimmed, _ = _fit_trimmed(model, theta, samples, _OUTLIER_CHANCE)
+    variances = np.diag(covariance) + (theta - untrimmed) ** 2
+    # Slopes are not exact: variances of steep or distant rays may be wrong against the others.
+    for quantity in (samples.slope / samples.distance, samples.growth):
+        error = _VARIANCE_ERROR * np.where(quantity > np.median(quantity), 1.0, -1.0)
+        changed = samples._replace(variance=samples.variance * (1 + error))
+        biased, _ = _fit_trimmed(model, theta, changed, _TAIL_CHANCE)
+        variances += (biased - theta) ** 2
+    return theta, variances
+
+
+def _fit_trimmed(
+    model: _VarianceModel, start: Floats, samples: _VarianceSamples, chance: float
+) -> tuple[Floats, Floats]:
+    """Fit a model to variances, and estimate the covariance (p, p) of its parameters (p,).
+
+    Samples whose variance is above a quantile, which a share `chance` of the expected distribution
+    exceeds, are left out; the expected mean of the others is that of the truncated distribution.
+    `start` (p,) has initial parameters.
+    """
+    from scipy.optimize import least_squares
+    from scipy.stats import chi2
+
+    freedom = samples.freedom
+    limit = chi2.isf(chance, freedom)
+    inliers = np.ones(len(samples.variance), bool)
+    truncated_mean = chi2.cdf(limit, freedom + 2) / (1 - chance)
+    theta = start
+    for step in range(12):
+        expected = model.expected(theta, samples)
+        if step:
+            inliers = freedom * samples.variance / expected < limit
+        scale = truncated_mean if step else 1.0
+        weight = np.sqrt(freedom / 2) / expected
+
+        def residuals(
+            parameters: Floats, rows: Bools = inliers, weight: Floats = weight, scale: Any = scale
+        ) -> Any:
+            variance = scale * model.expected(parameters, samples)
+            return ((samples.variance - variance) * weight)[rows]
+
+        x_scale = np.maximum(theta, 0.01)
+        solved = least_squares(residuals, theta, bounds=(0, np.inf), x_scale=x_scale)
+        theta = solved.x
+    return theta, sandwich(solved.jac, solved.fun, samples.patch[inliers])
+
+
+def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> Estimate | None:
+    """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
+
+    `energy` (n,) is that of rays, which return `count` (n,) of `trials` (n,) pulses; `dropout` is
+    the share that is lost at any energy. A ray is recorded only if a pulse returns: the likelihood
+    is that of a truncated binomial distribution. None if too few rays lose some of their pulses.
+    """
+    from scipy.optimize import brute
+    from scipy.special import ndtr
+    from scipy.stats import binom
+
+    def detection(log_threshold: Any) -> Floats:
+        share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
+        return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
+
+    def deviance(log_threshold: Any) -> Floats:
+        p: Floats = detection(log_threshold)
+        return np.log1p(-((1 - p) ** trials)) - binom.logpmf(count, trials, p)
+
+    lower, upper = np.log(np.quantile(energy, (0.001, 0.999)))
+    (fitted,) = brute(lambda guess: deviance(guess).sum(), [(lower - 2, upper)], Ns=60)
+    if (detection(fitted) < 0.9 * (1 - dropout)).sum() < _MIN_WEAK_RAYS:
+        return None
+    below, centre, above = (deviance(fitted + step) for step in (-_LOG_STEP, 0, _LOG_STEP))
+    information = (above - 2 * centre + below).sum() / _LOG_STEP**2
+    score = (((above - below) / (2 * _LOG_STEP)) ** 2).sum()
+    return Estimate(*np.exp(Estimate.from_variance(fitted, score / information**2)).tolist())
+
+
+def alarm_share(stack: SweepStack) -> Estimate | None:
+    """Estimate the share of pulses into the sky that return.
+
+    A pulse counts as a pulse into the sky if no other pulse of its ray returns, and no ray in its
+    neighbourhood returns twice; rays of fewer than three pulses do not count. None with little sky,
+    or with two sweeps.
+    """
+    from scipy.ndimage import maximum_filter
+    from scipy.stats import binomtest
+
+    count = np.isfinite(stack.ranges).sum(axis=0)
+    # Weak surfaces, which return seldom, are beside surfaces that return more often.
+    size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
+    repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
+    sky = ~repeated & (stack.trials > 2)
+    alarms = int((count[sky] == 1).sum())
+    trials = int(stack.trials[sky & (count == 0)].sum()) + alarms
+    if trials < _MIN_SKY_PULSES:
+        return None
+    return Estimate(alarms / trials, *map(float, binomtest(alarms, trials).proportion_ci()))

@@ -1,0 +1,138 @@
+"""Bias of rings against large planes that several rings cross."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+from lidarsim.base.sampling import even_indices
+
+from ...base.open3d_module import load_open3d
+from .estimates import Estimate, sandwich
+from .surfaces import SmoothRays
+
+_MAX_PLANES = 8
+_PLANE_TOLERANCE_M = 0.05
+_MIN_PLANE_RAYS = 300
+_MAX_PLANE_POINTS = 20_000
+_MIN_RING_RAYS = 20  # rays of a ring on a plane that its bias needs
+_MAX_MEDIAN_OFFSET = 0.4  # of points from their plane, over the tolerance
+_MAX_DIRECTION_GAP = 0.1  # distance of neighbouring directions of one piece of a plane
+_OUTLIER_SIGMAS = 4.0  # beyond, points are not of their planes
+_STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error of the planes
+
+
+class _PlaneRays(NamedTuple):
+    """Rays on large planes that several rings cross, (n,) each; a plane is a flat surface."""
+
+    rays: Indices  # indices into the rays
+    plane: Ints  # numbers of the planes
+
+
+def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
+    """Estimate by how much the ranges of rows differ from the mean of all: {row: metres}.
+
+    Large planes u · x = 1 and offsets b of the rows are fitted at once to the ranges r of rays with
+    `directions` d (k, 3): 1 / r = u · d − b / r², times r². Ranges have standard deviations
+    `error_m` (k,), metres. A row that meets a single plane has no offset. Surfaces are not quite
+    plane: intervals hold noise, and the changes of the offsets if points far from their planes, or
+    any of the planes, are left out (jackknife; Efron, 1982).
+    """
+    if not len(rays.row):
+        return {}
+    chosen = _plane_rays(rays, directions)
+    rows, row_index = np.unique(rays.row[chosen.rays], return_inverse=True)
+    if len(rows) < 3:
+        return {}
+    _, plane = np.unique(chosen.plane, return_inverse=True)
+    plane_count = plane.max() + 1
+    error_m = error_m[chosen.rays]
+    distance = rays.distance[chosen.rays]
+    normals = np.eye(plane_count)[plane][:, :, None] * directions[chosen.rays][:, None]
+    normals = normals.reshape(len(distance), -1) * distance[:, None] ** 2
+    design = np.hstack([normals, -np.eye(len(rows))[row_index]]) / error_m[:, None]
+    offsets, variances = _solve_offsets(design, distance / error_m, plane)
+    estimates = zip(rows.tolist(), offsets, variances, strict=True)
+    return {row: Estimate.from_variance(offset, variance) for row, offset, variance in estimates}
+
+
+def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
+    """Choose rays, with directions (k, 3), of rings that cross at least two large planes."""
+    indices = even_indices(len(rays.row), _MAX_PLANE_POINTS)
+    plane = _segment_planes(rays.distance[indices, None] * directions[indices])
+    count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)
+    np.add.at(count, (rays.row[indices], plane), 1)  # the last column is of points in no plane
+    crosses_planes = (count[:, :-1] >= _MIN_RING_RAYS).sum(axis=1) > 1
+    chosen = (plane >= 0) & crosses_planes[rays.row[indices]]
+    return _PlaneRays(indices[chosen], plane[chosen])
+
+
+def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats, Floats]:
+    """Return the offsets of rows (r,), whose mean is 0, and the variances (r,) of the offsets.
+
+    The unknowns of `design` (n, 3 p + r) are the vectors u of p planes, then the offsets, see
+    `ring_bias`; `plane` (n,) is the plane of each equation, and `values` (n,) the right sides.
+    """
+    plane_count = plane.max() + 1
+    first = 3 * plane_count
+    row_count = design.shape[1] - first
+    # One offset of all rows is nearly the same as other planes: the mean of the rows is 0.
+    centred = np.eye(row_count) - 1 / row_count
+    solution, inliers = _solve_without_outliers(design, values, _OUTLIER_SIGMAS)
+    offsets = centred @ solution[first:]
+    strict_solution, _ = _solve_without_outliers(design, values, _STRICT_SIGMAS)
+    used = design[inliers]
+    covariance = sandwich(used, values[inliers] - used @ solution)[first:, first:]
+    shift = centred @ strict_solution[first:] - offsets
+    replicates = [
+        centred @ np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0][first:]
+        for chosen in (inliers & (plane != number) for number in range(plane_count))
+    ]
+    variances = np.diag(centred @ covariance @ centred) + shift**2
+    variances += (plane_count - 1) * np.var(replicates, axis=0)
+    return offsets, variances
+
+
+def _solve_without_outliers(
+    design: Floats, values: Floats, max_sigmas: float
+) -> tuple[Floats, Bools]:
+    """Solve least squares without residuals beyond a number of standard deviations.
+
+    Returns the solution, and a mask of the equations (k,) that are used.
+    """
+    residuals = np.zeros(len(values))
+    for _ in range(4):
+        sizes = np.abs(residuals)
+        inliers = sizes <= max_sigmas * 1.4826 * np.median(sizes)
+        solution = np.linalg.lstsq(design[inliers], values[inliers], rcond=None)[0]
+        residuals = values - design @ solution
+    return solution, inliers
+
+
+def _segment_planes(points: Floats) -> Ints:
+    """Return the number of the large plane that each point (n, 3) lies in; -1 for no plane."""
+    o3d = load_open3d()
+    o3d.utility.random.seed(0)
+    plane = np.full(len(points), -1)
+    remaining = np.arange(len(points))
+    for _ in range(_MAX_PLANES):
+        if len(remaining) < _MIN_PLANE_RAYS:
+            break
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[remaining]))
+        (*normal, constant), _ = cloud.segment_plane(_PLANE_TOLERANCE_M, 3, 400)
+        offset = np.abs(points[remaining] @ normal + constant)  # from the plane of all inliers
+        inliers = np.flatnonzero(offset < _PLANE_TOLERANCE_M)
+        inlier_points = points[remaining[inliers]]
+        directions = inlier_points / np.linalg.norm(inlier_points, axis=1)[:, None]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(directions))
+        # Walls in a line are not quite one plane: the largest piece is.
+        piece = np.asarray(cloud.cluster_dbscan(_MAX_DIRECTION_GAP, 3))
+        inliers = inliers[piece == np.bincount(piece + 1)[1:].argmax()]
+        # What fills the slab evenly is cut out of other surfaces.
+        is_large = len(inliers) >= _MIN_PLANE_RAYS
+        if is_large and np.median(offset[inliers]) < _MAX_MEDIAN_OFFSET * _PLANE_TOLERANCE_M:
+            plane[remaining[inliers]] = plane.max() + 1
+        remaining = np.delete(remaining, inliers)
+    return plane

@@ -1,0 +1,259 @@
+"""Sweeps of a recording in the same cells.
+
+A cell is a ring and a column, which is a step of azimuth of a revolution. All pulses that the
+sweeps send into a cell are pulses of the same ray. Arrays have s sweeps, r rings (rows), c columns
+and k rays; positions and directions are in the sensor frame.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.base.sampling import even_indices
+
+from ...recordings.recordings import RecordedPoints, Recording
+from ..range_image import RangeImages, range_images
+
+MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly
+_MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
+_NEIGHBOUR_RAYS = 5  # rays on either side whose scatter counts
+_MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
+_MAX_LOG_CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
+MAX_KINK_M = 0.01  # by how much a surface may leave its plane within four columns
+
+
+@dataclass(frozen=True, eq=False)
+class SweepStack:
+    """Returns of all sweeps in the same cells, the highest ring first; NaN without a return."""
+
+    numbers: Ints  # (n,): numbers of the sweeps that are read, those without points among them
+    rings: Ints  # (r,): numbers of the rings
+    elevation_deg: Floats  # (r,): of the rings
+    directions: Floats  # (r, c, 3): mean unit directions of the cells
+    ranges: Floats32  # (s, r, c): metres
+    intensities: Floats32  # (s, r, c)
+    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less those of `directions`, radians
+    rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, metres
+    trials: Ints  # (r, c): number of sweeps that cover the cell, with a return or a lost pulse
+    notes: tuple[str, ...]
+
+    @property
+    def sweep_count(self) -> int:
+        """Number of sweeps."""
+        return len(self.ranges)
+
+    @classmethod
+    def read(cls, recording: Recording) -> SweepStack:
+        """Read the sweeps of a recording into the same cells.
+
+        LidarError if the recording has no sweeps with points and rings, or is of several sensors.
+        """
+        name = recording.name
+        notes = list(recording.notes)
+        if recording.thinned:
+            raise LidarError(f"{notes[0]}.")
+        if recording.is_cloud or not recording.count:
+            raise LidarError(f"{name} has no sweeps: give a recording of sweeps.")
+        cells = _CommonCells.read(recording)
+        if len(cells.numbers) < recording.count:
+            notes.append(
+                f"{len(cells.numbers):,} of {recording.count:,} sweeps are used, evenly chosen"
+            )
+        for index in range(len(cells.numbers)):
+            cells.read_sweep(recording, index)
+        elevation_deg, values = cells.sorted_by_elevation()
+        covered = covered_cells(np.isfinite(values[0]))
+        has_return = np.isfinite(values[0]).any(axis=0)
+        if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
+            notes.append(
+                f"{100 * gaps:.2g} % of the sweeps are gaps, of lost packets or sweeps cut short, "
+                "and count as no lost pulses"
+            )
+        directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
+        return cls(
+            numbers=cells.numbers,
+            rings=cells.sorted_rings(),
+            elevation_deg=elevation_deg,
+            directions=directions,
+            ranges=values[0],
+            intensities=values[1],
+            azimuth_offsets=azimuth_offsets,
+            rough_sigma=rough_scatter(values[0]),
+            trials=covered.sum(axis=0),
+            notes=tuple(notes),
+        )
+
+
+@dataclass(eq=False)
+class _CommonCells:
+    """Cells of a sensor that are filled sweep by sweep; a ring is added with its first return."""
+
+    numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
+    reference: RecordedPoints  # the sweep whose rings and steps of azimuth define the cells
+    images: RangeImages  # of the reference
+    rings: Ints  # (r,)
+    elevation_deg: Floats  # (r,)
+    values: Floats32  # (4, s, r, c): range, metres; intensity; azimuth and elevation, degrees
+
+    @classmethod
+    def read(cls, recording: Recording) -> _CommonCells:
+        """Define empty cells by the largest of the first three sweeps."""
+        sweeps = (recording.read_points(k) for k in range(min(3, recording.count)))
+        reference = max(sweeps, key=len)
+        if not len(reference):
+            raise LidarError(f"{recording.name} has no points: there is nothing to fit.")
+        with prefixed(recording.name):
+            images = range_images(reference, reference, ("a sweep", "a sweep"))
+        shape = len(images.rings), round(360 / images.step_deg)
+        max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)
+        numbers = even_indices(recording.count, max_sweeps)
+        values = np.full((4, len(numbers), *shape), np.nan, np.float32)
+        return cls(numbers, reference, images, images.rings, images.elevation_deg, values)
+
+    @property
+    def step_deg(self) -> float:
+        """Width of a column, degrees."""
+        return self.images.step_deg
+
+    def read_sweep(self, recording: Recording, index: int) -> None:
+        """Read the sweep `numbers[index]` into the cells; LidarError if of another sensor."""
+        number = int(self.numbers[index])
+        points = recording.read_points(number)
+        if not len(points):
+            return
+        with prefixed(recording.name):
+            names = (f"sweep {number}", "another")
+            sweep = range_images(points, self.reference, names, self.step_deg)
+            returned = np.isfinite(sweep.images[0, 0])
+            # Rings of false alarms alone may have no return in the first sweeps.
+            foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
+            is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
+            # With other steps of azimuth, more points lie behind others of their cell.
+            if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
+                raise LidarError(f"sweep {number} is of another sensor, or another mode.")
+        self._add_rings(sweep)
+        _, sweep_rows, rows = np.intersect1d(sweep.rings, self.rings, return_indices=True)
+        first_column = round(sweep.start_deg / sweep.step_deg)
+        columns = first_column + np.arange(sweep.images.shape[-1])
+        columns %= self.values.shape[-1]
+        self.values[:, index, rows[:, None], columns] = sweep.images[0][:, sweep_rows]
+
+    def _add_rings(self, sweep: RangeImages) -> None:
+        """Append rows for the rings of a sweep that no earlier sweep had."""
+        is_new = ~np.isin(sweep.rings, self.rings)
+        if not is_new.any():
+            return
+        _, sweep_count, _, column_count = self.values.shape
+        self.rings = np.append(self.rings, sweep.rings[is_new])
+        self.elevation_deg = np.append(self.elevation_deg, sweep.elevation_deg[is_new])
+        blank = np.full((4, sweep_count, is_new.sum(), column_count), np.nan, np.float32)
+        self.values = np.concatenate([self.values, blank], axis=2)
+
+    def _order(self) -> Ints:
+        """Order of the rows by elevation, the highest first."""
+        return np.argsort(-self.elevation_deg, kind="stable")
+
+    def sorted_rings(self) -> Ints:
+        """Return the rings, the highest first."""
+        return np.asarray(self.rings[self._order()])
+
+    def sorted_by_elevation(self) -> tuple[Floats, Floats32]:
+        """Return elevations (r,) and values (4, s, r, c), the highest ring first.
+
+        Sweeps without points are left out.
+        """
+        order = self._order()
+        has_points = np.isfinite(self.values[0]).any(axis=(1, 2))
+        return self.elevation_deg[order], self.values[:, has_points][:, :, order]
+
+
+def _mean_directions(
+    values: Floats32, elevation_deg: Floats, step_deg: float
+) -> tuple[Floats, Floats32]:
+    """Return the mean directions of cells (r, c, 3), and offsets of azimuths (s, r, c), radians.
+
+    `values` (4, s, r, c) are those of `_CommonCells`, `elevation_deg` (r,) the elevations of rings.
+    """
+    grid_azimuth = np.radians(step_deg * np.arange(values.shape[-1]))
+    grid_elevation = elevation_deg[:, None]
+    azimuth_offset = (np.radians(values[2]) - grid_azimuth + np.pi) % (2 * np.pi) - np.pi
+    elevation_offset = np.radians(values[3] - grid_elevation)
+    mean_azimuth_offset, mean_elevation_offset = (
+        np.nansum(offset, axis=0) / np.maximum(np.isfinite(offset).sum(axis=0), 1)
+        for offset in (azimuth_offset, elevation_offset)
+    )
+    azimuth = grid_azimuth + mean_azimuth_offset
+    elevation = np.radians(grid_elevation) + mean_elevation_offset
+    directions = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
+    return np.stack(directions, axis=-1), azimuth_offset - mean_azimuth_offset
+
+
+def finite_median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
+    """Return medians of the finite values along axes, float64; NaN without finite values."""
+    with warnings.catch_warnings(action="ignore"):
+        return np.nanmedian(values, axis=axis).astype(np.float64)
+
+
+def rough_scatter(ranges: Floats32) -> Floats:
+    """Estimate the standard deviation (r, c) over the sweeps of ranges (s, r, c), metres.
+
+    The estimate is a median over neighbouring rays, and at least the median of the ring. Ranges of
+    weak or steep surfaces scatter more than ranges of other surfaces of the ring.
+    """
+    changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
+    ring_scatter = finite_median(changes, (0, 2))[:, None]
+    ray_scatter = finite_median(changes, 0)
+    shifts = range(-_NEIGHBOUR_RAYS, _NEIGHBOUR_RAYS + 1)
+    neighbourhood = finite_median(
+        np.stack([np.roll(ray_scatter, shift, axis=1) for shift in shifts]), 0
+    )
+    ring_scatter = np.where(np.isnan(ring_scatter), MAX_KINK_M, np.maximum(ring_scatter, 1e-4))
+    return np.fmax(neighbourhood, ring_scatter)
+
+
+def covered_cells(returned: Bools) -> Bools:
+    """Return a mask of the cells (s, r, c) into which a sweep sent a pulse: no gaps.
+
+    Lost packets and sweeps cut short make gaps. `returned` (s, r, c) marks the cells with a return.
+    A run of cells without a return, in all rings or in one ring, is a gap if pulses that are lost
+    independently would hardly ever make such a run.
+    """
+    share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
+    log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)
+    # Columns without a return in any ring are gaps also where few sweeps return at all.
+    sparse_log_chance = np.log1p(-returned.sum(axis=0) / (len(returned) + 1)).sum(axis=0)
+    columns = _improbable_runs(np.asarray(~returned.any(axis=1)), sparse_log_chance)
+    rings = _improbable_runs(~returned, log_chance)
+    return ~(columns[:, None] | rings)
+
+
+def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
+    """Mark runs of empty cells along the last axis, a revolution, that are too long for chance.
+
+    `log_chance` are the logarithms of the chances that cells are empty; the last axis is columns.
+    """
+    count = empty.shape[-1]
+    edge = np.zeros((*empty.shape[:-1], 1), bool)
+    twice = np.concatenate([edge, empty, empty, edge], axis=-1)
+    changes = np.diff(twice.ravel().astype(np.int8))
+    starts = np.flatnonzero(changes == 1)
+    stops = np.flatnonzero(changes == -1)
+    weights = np.zeros(twice.shape)
+    weights[..., 1:-1] = np.concatenate([log_chance, log_chance], axis=-1)
+    total = np.cumsum(weights.ravel())
+    gaps = total[stops] - total[starts] < _MAX_LOG_CHANCE
+    marks = np.zeros(twice.size, np.int64)
+    marks[starts[gaps] + 1] += 1
+    marks[stops[gaps] + 1] -= 1
+    inside = np.cumsum(marks).reshape(twice.shape) > 0
+    return np.asarray(inside[..., 1 : count + 1] | inside[..., count + 1 : -1])

@@ -1,0 +1,202 @@
+"""Smooth surfaces of range images, and the rays that meet them in all sweeps."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+
+from .stack import MAX_KINK_M, SweepStack, finite_median
+
+_MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
+_MAX_BEAM_ORIGIN_M = 0.1  # how far from zero the beams of a head may meet
+_MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
+FLAT_TANGENT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
+MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each metre of range
+SCENE_TOLERANCE_M = 0.3  # how far surfaces may be from the scene's
+_MAX_SIGMAS = 6.0  # a return beyond is of something that moves
+MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
+
+
+class Surfaces(NamedTuple):
+    """Surfaces of a range image, (r, c) each."""
+
+    azimuth_slope: Floats  # growth of the range with the azimuth, metres in a radian
+    slope: Floats  # growth of the range with the direction of steepest growth, metres in a radian
+    smooth: Bools  # whether the neighbours lie in one plane with the cell
+    scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
+
+
+class _Neighbours(NamedTuple):
+    """Points (r, c, 3) of the cells beside each cell of a range image, metres."""
+
+    next_1: Floats
+    previous_1: Floats
+    next_2: Floats  # two columns away
+    previous_2: Floats
+    above: Floats
+    below: Floats
+
+    @classmethod
+    def from_points(cls, points: Floats) -> _Neighbours:
+        """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
+        rows = np.arange(len(points))
+        columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
+        rings = (points[np.clip(rows + shift, 0, rows[-1])] for shift in (-1, 1))
+        return cls(*columns, *rings)
+
+    def normals(self) -> Floats:
+        """Return the normals (r, c, 3) of surfaces, of any length."""
+        rise = self.above - self.below if len(self.above) > 2 else np.array([0, 0, 1.0])
+        run = 2 * (self.next_2 - self.previous_2) + self.next_1 - self.previous_1
+        return np.cross(run, rise)
+
+    def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
+        """Mark points (r, c, 3) whose neighbours lie in the plane of the point and its normal.
+
+        Tolerances (r, c) are for neighbours in the next column; for others they are doubled.
+        """
+        means_1 = (self.next_1 + self.previous_1) / 2
+        means_2 = (self.next_2 + self.previous_2) / 2
+        coplanar = np.ones(points.shape[:2], bool)
+        pairs = ((means_1, 1), (means_2, 2), (self.above, 2), (self.below, 2))
+        for neighbours, tolerance_factor in pairs:
+            offset = np.abs(((neighbours - points) * normal).sum(axis=-1))
+            coplanar &= offset < tolerance_factor * tolerance_m
+        return coplanar
+
+
+def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
+    """Find slopes and edges of a range image `distance` (r, c) with errors (r, c), metres."""
+    points = distance[..., None] * stack.directions
+    with np.errstate(invalid="ignore", divide="ignore"):
+        beams = points - _beam_origins(points)
+        length = np.linalg.norm(beams, axis=-1, keepdims=True)
+        directions = beams / length
+        neighbours = _Neighbours.from_points(points)
+        normal = neighbours.normals()
+        # The range of a plane n · x = c in the direction d is c / (n · d).
+        normal /= (normal * directions).sum(axis=-1, keepdims=True)
+        gradient = length * (directions - normal)
+        slope = np.linalg.norm(gradient, axis=-1)
+        tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance + 5 * error_m
+        smooth = (slope < _MAX_TANGENT * distance) & (distance > _MIN_RANGE_M)
+        smooth &= neighbours.are_coplanar(points, normal, tolerance_m)
+    azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
+    return Surfaces(azimuth_slope, slope, smooth, normal)
+
+
+def _beam_origins(points: Floats) -> Floats:
+    """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), metres.
+
+    Beams of a row meet on the z axis, near zero: heights grow linearly with the distance from the
+    axis, and the height at distance 0 is the origin.
+    """
+    with warnings.catch_warnings(action="ignore"):
+        distance = np.hypot(points[..., 0], points[..., 1])
+        height = points[..., 2]
+        mean_distance = np.nanmean(distance, axis=1)
+        offset = distance - np.nanmean(distance, axis=1, keepdims=True)
+        tangent = np.nansum(offset * height, axis=1) / np.nansum(offset**2, axis=1)
+        origin = np.nanmean(height, axis=1) - tangent * mean_distance
+    plausible = np.abs(origin) < _MAX_BEAM_ORIGIN_M  # also false of NaN
+    return np.where(plausible, origin, 0)[:, None, None] * np.array([0, 0, 1.0])
+
+
+class SmoothRays(NamedTuple):
+    """Rays that meet smooth surfaces, (k,) each."""
+
+    row: Ints
+    column: Ints
+    distance: Floats  # mean of the ranges, metres
+    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, metres in a radian
+    intensity: Floats  # mean; NaN if unknown
+    returns: Ints  # number of sweeps with a return
+    trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
+    variance: Floats  # of the range over the sweeps, square metres
+    freedom: Ints  # degrees of freedom of the variance: its returns, less 1
+
+    def select(self, chosen: Bools | Indices) -> SmoothRays:
+        """Select rays by mask or index."""
+        return SmoothRays._make(values[chosen] for values in self)
+
+
+class _RayStatistics(NamedTuple):
+    """Statistics of the returns of rays, without returns that are outliers, (k,) each."""
+
+    mean_range: Floats  # metres
+    mean_intensity: Floats
+    variance: Floats  # of the range, square metres
+    return_count: Ints
+
+
+def select_smooth_rays(
+    stack: SweepStack, sigma: Floats, direction_noise_rad: float, expected: Floats | None = None
+) -> SmoothRays:
+    """Choose rays away from edges, and compute the statistics of their returns.
+
+    A return is an outlier if the range is more than `_MAX_SIGMAS` standard deviations from the
+    median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
+    are left out, and rays with many outliers. Slopes are those of a scene's ranges `expected`
+    (r, c), metres, if known.
+    """
+    median = finite_median(stack.ranges, 0)
+    return_count = np.isfinite(stack.ranges).sum(axis=0)
+    error_m = stack.rough_sigma / np.sqrt(np.maximum(return_count, 1))
+    surfaces = find_surfaces(stack, median, error_m)
+    slopes = surfaces.slope
+    smooth = surfaces.smooth
+    if expected is not None:
+        slopes = find_surfaces(stack, expected, 0 * error_m).slope
+        smooth &= np.abs(median - expected) < SCENE_TOLERANCE_M
+    # A cell that is smooth by chance, as in leaves, has no smooth cells beside it.
+    neighbours = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
+    cell = np.nonzero(smooth & (neighbours >= 3))
+    slope = slopes[cell]
+    returns = return_count[cell]
+    limit_m = _MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
+    limit_m = np.where(returns > 1, limit_m, np.inf)
+    statistics = _ray_statistics(stack, cell, surfaces.azimuth_slope[cell], median[cell], limit_m)
+    rays = SmoothRays(
+        row=cell[0],
+        column=cell[1],
+        distance=statistics.mean_range,
+        slope=slope,
+        intensity=statistics.mean_intensity,
+        returns=returns,
+        trials=stack.trials[cell],
+        variance=statistics.variance,
+        freedom=statistics.return_count - 1,
+    )
+    count = statistics.return_count
+    return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * returns)))
+
+
+def _ray_statistics(
+    stack: SweepStack,
+    cell: tuple[Indices, ...],
+    azimuth_slope: Floats,
+    median: Floats,
+    limit_m: Floats,
+) -> _RayStatistics:
+    """Compute the statistics of returns within a distance (k,) from the median range (k,).
+
+    `cell` has the rows and columns (k,) of the rays. Ranges are corrected for the azimuths of
+    their pulses by `azimuth_slope` (k,), as of `Surfaces`; all distances are in metres.
+    """
+    row, column = cell
+    ranges = stack.ranges[:, row, column].astype(np.float64)
+    ranges -= azimuth_slope * stack.azimuth_offsets[:, row, column].astype(np.float64)
+    intensities = stack.intensities[:, row, column].astype(np.float64)
+    inliers = np.abs(ranges - median) <= limit_m
+    inlier_count = inliers.sum(axis=0)
+    divisor = np.maximum(inlier_count, 1)
+    mean_range = np.where(inliers, ranges, 0).sum(axis=0) / divisor
+    mean_intensity = np.where(inliers, intensities, 0).sum(axis=0) / divisor
+    squares = np.where(inliers, (ranges - mean_range) ** 2, 0).sum(axis=0)
+    return _RayStatistics(
+        mean_range, mean_intensity, squares / np.maximum(inlier_count - 1, 1), inlier_count
+    )
