@@ -8,9 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from benchmarks.fit_coverage import PLACES, place, recorded, street, trial
+from benchmarks.fit_coverage import PLACES, box, place, recorded, street, trial
 
-from lidarpool import LidarError, Noise, Pose, Scanner, Sensor, fit, load_sensor
+from lidarpool import (
+    LidarError,
+    Noise,
+    Pose,
+    Scanner,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    fit,
+    load_sensor,
+    simulate,
+)
 from lidarpool.compare.fit.estimates import Estimate
 from lidarpool.compare.fit.fitting import _with_performance
 from lidarpool.export.formats import Format
@@ -177,6 +189,90 @@ def test_a_sensor_that_moves_is_refused_with_its_speed(block):
         assert len(told.splitlines()) == 1
     with pytest.raises(LidarError, match=r"moves, by .*2(.[01])?° from sweep to sweep"):
         fit(drive(block, 1.8, 0.0, 2.0))
+
+
+def parked_street():
+    """Parked cars and posts before high walls along x: nearly all ranges are those of walls."""
+    rng = np.random.default_rng(0)
+    boxes = [
+        box("ground", (-300, -20, -2), (300, 20, -1.8)),
+        box("left", (-300, 8, -1.8), (300, 9, 8)),
+        box("right", (-300, -9, -1.8), (300, -8, 8)),
+    ]
+    for number, x in enumerate(np.cumsum(rng.uniform(5.5, 14, 20)) - 100):
+        y = rng.choice([-5, 5])
+        boxes.append(box(f"car{number}", (x, y - 0.9, -1.8), (x + 4.4, y + 0.9, -0.35)))
+    for number, x in enumerate(np.arange(-100, 100, 6.25)):
+        y = 6.8 * (-1) ** number
+        boxes.append(box(f"post{number}", (x, y, -1.8), (x + 0.12, y + 0.12, 4)))
+    return Scene.from_meshes(boxes)
+
+
+def test_a_drive_along_walls_is_found_by_parked_cars_and_posts():
+    """26 m/s, of which most rays know nothing: such a drive looks like standing."""
+    scene = parked_street()
+    with pytest.raises(LidarError, match="is of a sensor that moves") as raised:
+        fit(drive(scene, 0.0, 1.3))
+    told = str(raised.value)
+    assert float(told.partition("(")[2].partition(" m/s")[0]) == pytest.approx(26, rel=0.05), told
+    assert "give a --pose for each sweep in its --scene, sweeps of a sensor that stands" in told
+
+
+def survey_along(speed_m_s, noise, sweeps=6):
+    """Survey of a VLP-16 at 20 Hz along x in a `parked_street`, with the times of points."""
+    sensor = load_sensor("velodyne/vlp16", rate_hz=20)
+    stop_m = -20 + speed_m_s * 0.4
+    return Survey(
+        sensor, trajectory=Track([0, 0.4], [[-20, 0.2, 0], [stop_m, 0.2, 0]]), noise=noise,
+        steps=sensor.steps_of_revolution(sweeps - 1).stop, columns=["intensity", "time"],
+        precision_m=1e-4,
+    )  # fmt: skip
+
+
+def test_poses_of_a_result_are_used(cluster_client):
+    """The result of a drive at 26 m/s is fitted in its scene, and refused without a scene."""
+    scene = parked_street()
+    cloud = simulate(scene, survey_along(26, Noise(range_m=0.01)), client=cluster_client).cloud
+    with pytest.raises(LidarError, match=r"by 1.3 m \(26 m/s\) .* give the --scene of its poses"):
+        fit(cloud)
+    fitted = fit(cloud, scene=scene)
+    dropout = fitted.figures["figures"]["dropout"]
+    assert dropout["value"] == 0 and dropout["high"] < 0.001
+    assert fitted.figures["figures"]["range_m"]["value"] == pytest.approx(0.01, rel=0.1)
+    assert "pulses on smooth surfaces of the scene" in repr(fitted)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("dropout", [0.0, 0.02])
+def test_poses_of_sweeps_are_used(cluster_client, dropout):
+    """Points without the motion of the sensor: steps of azimuth differ, and no pulse is lost."""
+    scene = parked_street()
+    survey = survey_along(26, Noise(range_m=0.01, dropout=dropout, seed=2))
+    result = open_recording(simulate(scene, survey, client=cluster_client).cloud)
+    located = replace(result, fired=None)
+    unlocated = replace(located, frame_poses=None, read=lambda k: (*result.read(k)[:2], None))
+    for recording, pose in ((located, None), (unlocated, result.frame_poses())):
+        figures = fit(recording, scene=scene, pose=pose).figures["figures"]
+        assert figures["dropout"]["value"] == pytest.approx(dropout, rel=0.15, abs=0.001)
+        assert figures["range_m"]["value"] == pytest.approx(0.01, rel=0.1)
+
+
+def test_poses_that_are_given_are_one_or_one_for_each_sweep_of_a_scene():
+    scene = parked_street()
+    made = drive(scene, 0.0, 1.3)
+    poses = [(-20 + 1.3 * number, 0.2, 0) for number in range(6)]
+    assert fit(made, scene=scene, pose=poses).figures["figures"]["dropout"]["high"] < 0.001
+    for pose, where, says in (
+        (poses[:2], scene, r"pose has 2 poses, and drive.pcap has 6 sweeps: give one pose"),
+        (poses, None, "by 1.3 m .* give the --scene of its poses"),
+        (poses[0], None, "pose is the sensor's in a scene: give scene"),
+        ([(x, y + 1, z + 1) for x, y, z in poses], scene, "less than half of .* is within 0.3 m"),
+        (np.full((6, 4, 4), np.nan), scene, "Matrix 0 of a pose deforms"),
+        (poses[0], scene, "by 1.3 m .* give a --pose for each sweep in its --scene"),
+    ):
+        with pytest.raises(LidarError, match=says) as raised:
+            fit(made, scene=where, pose=pose)
+        assert len(str(raised.value).splitlines()) == 1
 
 
 def test_a_slow_sensor_is_refused_with_its_speed(block):

@@ -73,6 +73,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
         ([".", "--model", "no-such"], "There is no sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),
+        ([".", "--pose", "0,0,0", "--pose", "1,0,0"], "pose has 2 poses, and . has 4 sweeps: give"),
         ([".", "--white", "0"], "white is 0.0; it must be above 0"),
     ],
 )

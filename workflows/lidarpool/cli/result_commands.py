@@ -357,15 +357,18 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 @options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
 @click.option("--model", metavar="MODEL|FILE", help="The sensor, for what the recording hides.")
 @options.path("--scene", help="The place, a mesh.")
-@options.pose
+@options.poses
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
 @click.option("--white", type=float, help="Intensity of white, if it is the same at all ranges.")
 @options.as_json
-def fit(recording: Path, out: Path, as_json: bool, **settings: Any) -> None:
+def fit(
+    recording: Path, out: Path, pose: Sequence[Sequence[float]], as_json: bool, **settings: Any
+) -> None:
     """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.
 
-    RECORDING is one that `lidarpool compare` reads, with sweeps and rings.
+    RECORDING is one that `lidarpool compare` reads, with sweeps and rings. With --scene the unit
+    may move, if its poses are known.
 
     \b
     Examples:
@@ -377,6 +380,6 @@ def fit(recording: Path, out: Path, as_json: bool, **settings: Any) -> None:
     from ..compare.fit import fit as fitted
 
     keep_freed_memory()
-    fitted_sensor = fitted(recording, **settings)
+    fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)
     lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
     options.show(fitted_sensor.figures, lines, as_json)

@@ -101,8 +101,9 @@ def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Comm
 
 
 _mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
-pose = click.option("--pose", metavar="X,Y,Z", type=_position, default="0,0,0",
-                    help="Place of the sensor in the scene, metres.")  # fmt: skip
+poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
+                     help="Place of the sensor in the scene, metres; or one for each sweep. By "
+                     "default that of the recording, or 0,0,0.")  # fmt: skip
 _mesh_options = combine(
     _mesh_option("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
     _mesh_option("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from lidarsim.scene.files.pcd import read_pcd
 from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 from lidarsim.scene.files.ptx import read_ptx
 from lidarsim.scene.files.stated_system import Metres, StatedSystem, stated_metres
+from lidarsim.sweeps.sweep_motion import FiringPoses
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.fingerprint import fingerprint
@@ -166,6 +167,14 @@ class NoiseFilter:
         return LeftOut(*totals).note()
 
 
+class FiredPoints(NamedTuple):
+    """Points of a sweep as they were fired."""
+
+    points: Floats  # (n, 3): in the sensor frame at the firing of each, metres
+    columns: Columns  # (n,) each
+    poses: FiringPoses  # of the sensor in the world
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A recording of sweeps; or a cloud without sweeps (`is_cloud`), in parts instead."""
@@ -189,12 +198,32 @@ class Recording:
     frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
     noise_filter: NoiseFilter | None = None  # that `read` applies; None if it leaves out nothing
+    # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
+    fired: Callable[[int], FiredPoints] | None = None
 
     @property
     def left_out_notes(self) -> list[str]:
         """Notes on points that were left out of what has been read."""
         note = "" if self.noise_filter is None else self.noise_filter.note()
         return [f"{self.name}: {note}"] if note else []
+
+    def poses(self, numbers: Iterable[int]) -> Floats | None:
+        """Return the poses (n, 4, 4) of sweeps in the world; None if one of these is unknown.
+
+        LidarError if the recording cannot be read.
+        """
+        with reading(self.name):
+            if self.frame_poses is not None and (frame_poses := self.frame_poses()) is not None:
+                return np.asarray(frame_poses[list(numbers)])
+            poses = []
+            for number in numbers:
+                _, _, pose = self.read(number)
+                if pose is None:
+                    return None
+                poses.append(pose)
+        matrices = np.array(poses, np.float64).reshape(-1, 4, 4)
+        matrices[:, :3, 3] *= self.metres
+        return matrices
 
     def without_noise(self, noise_filter: NoiseFilter) -> Recording:
         """Return the recording without points that it withholds or classifies as noise."""
@@ -232,7 +261,7 @@ class Recording:
                 )
             positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.metres
         names = _INTENSITY_COLUMNS if self.intensity_column is None else (self.intensity_column,)
-        rings = _first_column(columns, _RING_COLUMNS)
+        rings = rings_of(columns)
         intensities = _first_column(columns, names)
         return RecordedPoints(
             positions,
@@ -272,6 +301,11 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
         for name, recording in recordings.items()
         if recording.sequence == sequences[0]
     }
+
+
+def rings_of(columns: Columns) -> AnyArray | None:
+    """Return the rings (n,) of points, or None without a column of rings."""
+    return _first_column(columns, _RING_COLUMNS)
 
 
 def _first_column(columns: Columns, names: Iterable[str]) -> AnyArray | None:
@@ -468,6 +502,15 @@ def _open_cloud(
         points = next(saved.points(cloud, index, index + 1))
         return saved.in_sensor(index, points.positions), points.columns, saved.pose.matrix(index)
 
+    def read_fired(number: int) -> FiredPoints:
+        index = indices[number]
+        points = next(saved.points(cloud, index, index + 1))
+        positions = saved.as_fired(index, points)
+        return FiredPoints(positions, points.columns, saved.firing_poses(index, points))
+
+    def frame_poses() -> Floats:
+        return np.array([saved.pose.matrix(index) for index in indices])
+
     times = saved.begins_ns[indices] + (saved.start_ns or 0)
     fields["energies"] = intensity in (None, "intensity")
     columns = {column.name for column in cloud.table}
@@ -477,7 +520,8 @@ def _open_cloud(
         fields["firing_key"] = fingerprint(
             key, saved.scans[indices], saved.begins_ns[indices], poses
         )
-    return Recording(name, len(indices), read_sweep, intensity, times=lambda: times, **fields)
+    fields |= {"times": lambda: times, "frame_poses": frame_poses, "fired": read_fired}
+    return Recording(name, len(indices), read_sweep, intensity, **fields)
 
 
 def _ray_keys(columns: Columns) -> Ints:

@@ -47,15 +47,15 @@ def has_frontal_rays(rays: SmoothRays) -> bool:
 
 
 def fit_performance(
-    stack: SweepStack, rays: SmoothRays, energy: Floats | None
+    rays: SmoothRays, energy: Floats | None, *, all_known: bool = False
 ) -> tuple[dict[str, Estimate], Floats]:
-    """Estimate the performance of a sensor from repeated sweeps.
+    """Estimate noise and lost pulses of a sensor from rays.
 
-    `energy` (k,) is that of the returns of rays, if known. Returns estimates by the field names of
-    `Noise`; and the standard deviations of rays (k,), metres, by range or by energy, whichever is
-    likelier.
+    `energy` (k,) is that of the returns of rays, if known; `all_known` says that rays without any
+    return are known, too, by a scene. Returns estimates by the field names of `Noise`; and the
+    standard deviations of rays (k,), metres, by range or by energy, whichever is likelier.
     """
-    threshold, dropout = _fit_detection(rays, energy)
+    threshold, dropout = _fit_detection(rays, energy, all_known)
     scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
     if energy is not None and threshold is not None:
         by_energy = fit_scatter(rays, "range_at_threshold_m", threshold.value / energy, 2)
@@ -70,15 +70,13 @@ def fit_performance(
         }
     if threshold is not None:
         figures["detection_range_m"] = threshold.power(-0.5, 10 * np.sqrt(TARGET_REFLECTANCE))
-    if alarms := alarm_share(stack):
-        figures["false_alarms"] = alarms
     if dropout is not None:
         figures["dropout"] = dropout
     return figures, scatter.sigma
 
 
 def _fit_detection(
-    rays: SmoothRays, energy: Floats | None
+    rays: SmoothRays, energy: Floats | None, all_known: bool
 ) -> tuple[Estimate | None, Estimate | None]:
     """Estimate the energy of which half of the pulses return, and the share lost at any energy.
 
@@ -87,31 +85,34 @@ def _fit_detection(
     light = np.nan_to_num(rays.intensity) if energy is None else energy
     strong = light >= np.median(light)
     threshold = None
-    dropout = lost_share(rays, strong)
+    dropout = lost_share(rays, strong, all_known=all_known)
     for _ in range(3):
         if energy is None:
             break
         lost = dropout.value if dropout else 0.0
-        threshold = fit_threshold(energy, rays.returns, rays.trials, lost)
+        threshold = fit_threshold(energy, rays, lost, all_known=all_known)
         if threshold is None:
             break
         strong = energy > 2 * threshold.value  # no pulse of these is lost for want of energy
-        dropout = lost_share(rays, strong) or dropout
+        dropout = lost_share(rays, strong, all_known=all_known) or dropout
     return threshold, dropout
 
 
-def lost_share(rays: SmoothRays, chosen: Bools) -> Estimate | None:
+def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> Estimate | None:
     """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
 
-    A ray without any return is unknown, so the rays that are known lose fewer pulses than others.
-    For each return of a ray, the share is that of the other `trials - 1` pulses: the mean of
-    (trials - returns) / (trials - 1) over all returns is unbiased.
+    Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
+    pulses than others. For each return of a ray, the share is that of the other `trials - 1`
+    pulses: the mean of (trials - returns) / (trials - 1) over all returns is unbiased.
     """
-    chosen = chosen & (rays.trials > 1)
+    min_trials = 1 if all_known else 2
+    chosen = chosen & (rays.trials >= min_trials)
     if chosen.sum() < MIN_RAYS:
         return None
     returns = rays.returns[chosen]
     trials = rays.trials[chosen]
+    if all_known:
+        return Estimate.from_shares((trials - returns).astype(np.float64), trials)
     return Estimate.from_shares((trials - returns) * returns / (trials - 1), returns)
 
 
@@ -271,12 +272,14 @@ def _fit_trimmed(
     return theta, sandwich(solved.jac, solved.fun, samples.patch[inliers])
 
 
-def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> Estimate | None:
+def fit_threshold(
+    energy: Floats, rays: SmoothRays, dropout: float, *, all_known: bool = False
+) -> Estimate | None:
     """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
 
-    `energy` (n,) is that of rays, which return `count` (n,) of `trials` (n,) pulses; `dropout` is
-    the share that is lost at any energy. A ray is recorded only if a pulse returns: the likelihood
-    is that of a truncated binomial distribution. None if too few rays lose some of their pulses.
+    `energy` (k,) is that of rays; `dropout` is the share that is lost at any energy. Without
+    `all_known`, a ray is known only if a pulse returns: the likelihood is that of a truncated
+    binomial distribution. None if too few rays lose some of their pulses.
     """
     from scipy.optimize import brute
     from scipy.special import ndtr
@@ -288,7 +291,8 @@ def fit_threshold(energy: Floats, count: Ints, trials: Ints, dropout: float) -> 
 
     def deviance(log_threshold: Any) -> Floats:
         p: Floats = detection(log_threshold)
-        return np.log1p(-((1 - p) ** trials)) - binom.logpmf(count, trials, p)
+        likelihood = binom.logpmf(rays.returns, rays.trials, p)
+        return (0 if all_known else np.log1p(-((1 - p) ** rays.trials))) - likelihood
 
     lower, upper = np.log(np.quantile(energy, (0.001, 0.999)))
     (fitted,) = brute(lambda guess: deviance(guess).sum(), [(lower - 2, upper)], Ns=60)
@@ -314,7 +318,7 @@ def alarm_share(stack: SweepStack) -> Estimate | None:
     # Weak surfaces, which return seldom, are beside surfaces that return more often.
     size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
     repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
-    sky = ~repeated & (stack.trials > 2)
+    sky = ~repeated & (stack.trials > 2) & stack.steady
     alarms = int((count[sky] == 1).sum())
     trials = int(stack.trials[sky & (count == 0)].sum()) + alarms
     if trials < _MIN_SKY_PULSES:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are ch
 _MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
 _NEIGHBOUR_RAYS = 5  # rays on either side whose scatter counts
 _MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
-_MAX_LOG_CHANCE = -16.0  # logarithm of the chance of a run of lost pulses that is a gap instead
+_MAX_LOG_CHANCE = -16.0  # logarithm of the chance of lost pulses that are no losses instead
+_STEADY_PATCH = (3, 9)  # rows and columns of cells whose returns are counted together
 MAX_KINK_M = 0.01  # by how much a surface may leave its plane within four columns
 
 
@@ -32,7 +34,7 @@ MAX_KINK_M = 0.01  # by how much a surface may leave its plane within four colum
 class SweepStack:
     """Returns of all sweeps in the same cells, the highest ring first; NaN without a return."""
 
-    numbers: Ints  # (n,): numbers of the sweeps that are read, those without points among them
+    numbers: Ints  # (s,): numbers of the sweeps in the recording
     rings: Ints  # (r,): numbers of the rings
     elevation_deg: Floats  # (r,): of the rings
     directions: Floats  # (r, c, 3): mean unit directions of the cells
@@ -40,7 +42,7 @@ class SweepStack:
     intensities: Floats32  # (s, r, c)
     azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less those of `directions`, radians
     rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, metres
-    trials: Ints  # (r, c): number of sweeps that cover the cell, with a return or a lost pulse
+    covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, returned or lost
     notes: tuple[str, ...]
 
     @property
@@ -48,18 +50,24 @@ class SweepStack:
         """Number of sweeps."""
         return len(self.ranges)
 
+    @cached_property
+    def trials(self) -> Ints:
+        """Number of sweeps that cover each cell, with a return or a lost pulse: (r, c)."""
+        return np.asarray(self.covered.sum(axis=0))
+
+    @cached_property
+    def steady(self) -> Bools:
+        """Cells (r, c) around which no thing comes or goes between the sweeps."""
+        return steady_cells(np.isfinite(self.ranges), self.covered)
+
     @classmethod
     def read(cls, recording: Recording) -> SweepStack:
         """Read the sweeps of a recording into the same cells.
 
         LidarError if the recording has no sweeps with points and rings, or is of several sensors.
         """
-        name = recording.name
+        check_sweeps(recording)
         notes = list(recording.notes)
-        if recording.thinned:
-            raise LidarError(f"{notes[0]}.")
-        if recording.is_cloud or not recording.count:
-            raise LidarError(f"{name} has no sweeps: give a recording of sweeps.")
         cells = _CommonCells.read(recording)
         if len(cells.numbers) < recording.count:
             notes.append(
@@ -77,7 +85,7 @@ class SweepStack:
             )
         directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
         return cls(
-            numbers=cells.numbers,
+            numbers=cells.numbers[cells.have_points],
             rings=cells.sorted_rings(),
             elevation_deg=elevation_deg,
             directions=directions,
@@ -85,9 +93,17 @@ class SweepStack:
             intensities=values[1],
             azimuth_offsets=azimuth_offsets,
             rough_sigma=rough_scatter(values[0]),
-            trials=covered.sum(axis=0),
+            covered=covered,
             notes=tuple(notes),
         )
+
+
+def check_sweeps(recording: Recording) -> None:
+    """Raise LidarError unless a recording has sweeps, with all returns."""
+    if recording.thinned:
+        raise LidarError(f"{recording.notes[0]}.")
+    if recording.is_cloud or not recording.count:
+        raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
 
 
 @dataclass(eq=False)
@@ -155,6 +171,11 @@ class _CommonCells:
         blank = np.full((4, sweep_count, is_new.sum(), column_count), np.nan, np.float32)
         self.values = np.concatenate([self.values, blank], axis=2)
 
+    @property
+    def have_points(self) -> Bools:
+        """Mask of the sweeps that have points: (s,)."""
+        return np.asarray(np.isfinite(self.values[0]).any(axis=(1, 2)))
+
     def _order(self) -> Ints:
         """Order of the rows by elevation, the highest first."""
         return np.argsort(-self.elevation_deg, kind="stable")
@@ -169,8 +190,7 @@ class _CommonCells:
         Sweeps without points are left out.
         """
         order = self._order()
-        has_points = np.isfinite(self.values[0]).any(axis=(1, 2))
-        return self.elevation_deg[order], self.values[:, has_points][:, :, order]
+        return self.elevation_deg[order], self.values[:, self.have_points][:, :, order]
 
 
 def _mean_directions(
@@ -257,3 +277,32 @@ def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
     marks[stops[gaps] + 1] -= 1
     inside = np.cumsum(marks).reshape(twice.shape) > 0
     return np.asarray(inside[..., 1 : count + 1] | inside[..., count + 1 : -1])
+
+
+def steady_cells(returned: Bools, covered: Bools) -> Bools:
+    """Mark the cells (r, c) around which no thing comes or goes.
+
+    Where a car drives past in front of the sky, pulses of many cells return in some sweeps and in
+    none of the others. Pulses that are lost independently would hardly ever do so: the number of
+    returns of a patch of cells would be near the mean, by the bound of Chernoff (1952). `returned`
+    and `covered` (s, r, c) mark cells with a return, and cells into which a sweep sent a pulse.
+    """
+    from scipy.ndimage import maximum_filter, uniform_filter
+    from scipy.special import rel_entr
+
+    modes = ("constant", "wrap")
+
+    def patch_sums(values: Bools) -> Floats:
+        means = uniform_filter(values.astype(np.float64), _STEADY_PATCH, mode=modes)
+        return np.asarray(np.rint(means * np.prod(_STEADY_PATCH)))
+
+    pulses = sum(patch_sums(mask) for mask in covered)
+    returns = sum(patch_sums(mask) for mask in returned & covered)
+    mean_share = returns / np.maximum(pulses, 1)
+    unsteady = np.zeros(mean_share.shape, bool)
+    for sweep_returned, sweep_covered in zip(returned, covered, strict=True):
+        trials = patch_sums(sweep_covered)
+        share = patch_sums(sweep_returned & sweep_covered) / np.maximum(trials, 1)
+        divergence = rel_entr(share, mean_share) + rel_entr(1 - share, 1 - mean_share)
+        unsteady |= np.where(trials > 0, divergence, 0) * trials > -_MAX_LOG_CHANCE
+    return ~maximum_filter(unsteady, _STEADY_PATCH, mode=modes)

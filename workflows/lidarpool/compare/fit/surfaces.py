@@ -11,13 +11,15 @@ from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 
 from .stack import MAX_KINK_M, SweepStack, finite_median
 
-_MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
+MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
 _MAX_BEAM_ORIGIN_M = 0.1  # how far from zero the beams of a head may meet
-_MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
+MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
 FLAT_TANGENT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
 MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each metre of range
 SCENE_TOLERANCE_M = 0.3  # how far surfaces may be from the scene's
-_MAX_SIGMAS = 6.0  # a return beyond is of something that moves
+# Noise of directions before the noise is estimated, for the choice of outliers.
+ASSUMED_DIRECTION_NOISE_RAD = 0.002
+MAX_SIGMAS = 6.0  # a return beyond is of something that moves
 MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
 
 
@@ -30,7 +32,7 @@ class Surfaces(NamedTuple):
     scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
-class _Neighbours(NamedTuple):
+class Neighbours(NamedTuple):
     """Points (r, c, 3) of the cells beside each cell of a range image, metres."""
 
     next_1: Floats
@@ -41,7 +43,7 @@ class _Neighbours(NamedTuple):
     below: Floats
 
     @classmethod
-    def from_points(cls, points: Floats) -> _Neighbours:
+    def from_points(cls, points: Floats) -> Neighbours:
         """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
         rows = np.arange(len(points))
         columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
@@ -76,14 +78,14 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfa
         beams = points - _beam_origins(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
         directions = beams / length
-        neighbours = _Neighbours.from_points(points)
+        neighbours = Neighbours.from_points(points)
         normal = neighbours.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * directions).sum(axis=-1, keepdims=True)
         gradient = length * (directions - normal)
         slope = np.linalg.norm(gradient, axis=-1)
         tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance + 5 * error_m
-        smooth = (slope < _MAX_TANGENT * distance) & (distance > _MIN_RANGE_M)
+        smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
         smooth &= neighbours.are_coplanar(points, normal, tolerance_m)
     azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
     return Surfaces(azimuth_slope, slope, smooth, normal)
@@ -138,7 +140,7 @@ def select_smooth_rays(
 ) -> SmoothRays:
     """Choose rays away from edges, and compute the statistics of their returns.
 
-    A return is an outlier if the range is more than `_MAX_SIGMAS` standard deviations from the
+    A return is an outlier if the range is more than `MAX_SIGMAS` standard deviations from the
     median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
     are left out, and rays with many outliers. Slopes are those of a scene's ranges `expected`
     (r, c), metres, if known.
@@ -148,16 +150,14 @@ def select_smooth_rays(
     error_m = stack.rough_sigma / np.sqrt(np.maximum(return_count, 1))
     surfaces = find_surfaces(stack, median, error_m)
     slopes = surfaces.slope
-    smooth = surfaces.smooth
+    smooth = surfaces.smooth & stack.steady
     if expected is not None:
         slopes = find_surfaces(stack, expected, 0 * error_m).slope
         smooth &= np.abs(median - expected) < SCENE_TOLERANCE_M
-    # A cell that is smooth by chance, as in leaves, has no smooth cells beside it.
-    neighbours = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
-    cell = np.nonzero(smooth & (neighbours >= 3))
+    cell = np.nonzero(among_smooth(smooth))
     slope = slopes[cell]
     returns = return_count[cell]
-    limit_m = _MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
+    limit_m = MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
     limit_m = np.where(returns > 1, limit_m, np.inf)
     statistics = _ray_statistics(stack, cell, surfaces.azimuth_slope[cell], median[cell], limit_m)
     rays = SmoothRays(
@@ -173,6 +173,15 @@ def select_smooth_rays(
     )
     count = statistics.return_count
     return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * returns)))
+
+
+def among_smooth(smooth: Bools) -> Bools:
+    """Mark smooth cells (r, c) that have smooth cells beside them.
+
+    A cell that is smooth by chance, as in leaves, has none.
+    """
+    neighbours = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
+    return np.asarray(smooth & (neighbours >= 3))
 
 
 def _ray_statistics(

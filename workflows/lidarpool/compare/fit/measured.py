@@ -1,0 +1,250 @@
+"""Measures a sensor by the rays of a recording: noise, losses, bias, and curves of these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Spin
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.simulator import Scanner
+
+from ...recordings.recordings import Recording
+from .estimates import MIN_RAYS, Estimate
+from .known_poses import KnownPoses
+from .motion import read_static
+from .performance import alarm_share, fit_performance
+from .pulses import Pulses, measure_pulses
+from .ring_bias import ring_bias
+from .stack import SweepStack, finite_median
+from .surfaces import (
+    ASSUMED_DIRECTION_NOISE_RAD,
+    FLAT_TANGENT,
+    SCENE_TOLERANCE_M,
+    SmoothRays,
+    find_surfaces,
+    select_smooth_rays,
+)
+
+_CURVE_POINTS = 14  # points of a curve at most
+_MIN_SCENE_SHARE = 0.5  # share of rays that must be within `SCENE_TOLERANCE_M` of the scene
+_MIN_REFLECTANCE = 1 / 400  # reflectance of surfaces that are reported as 0
+_MIN_RANGE_ERROR_M = 0.001  # error of a ray's mean range, however often the range is measured
+
+Curve = list[dict[str, float]]  # points, each with x, value, low and high
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Rays on smooth surfaces, and the performance that was fitted to their returns."""
+
+    stack: SweepStack
+    rays: SmoothRays
+    energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
+    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
+    bias: dict[int, Estimate]  # {row: metres}
+    lost_by_range: Curve | None = None  # by the range of the scene; None without a scene
+    moves: bool = False  # whether the sensor moves
+
+    def curves(self) -> dict[str, Curve]:
+        """Compute the curves of noise, returns and intensity: {name in `charts`: points}."""
+        rays = self.rays
+        light = rays.intensity if self.energy is None else self.energy
+        variance = np.where(rays.freedom > 0, rays.variance, np.nan)
+        range_variance = self._range_variances()
+        incidence_deg = np.degrees(np.arctan(rays.slope / rays.distance))
+        curves = {
+            "noise_by_range": _curve(rays.distance, range_variance, 0.5),
+            "noise_by_light": _curve(light, range_variance, 0.5),
+            "noise_by_tilt": _curve(incidence_deg, variance, 0.5),
+            "light_by_range": _curve(rays.distance, rays.intensity),
+        }
+        if self.stack.sweep_count > 1:
+            curves["returned_by_light"] = _curve(light, rays.returns / rays.trials)
+        if self.lost_by_range is not None:
+            curves["lost_by_range"] = self.lost_by_range
+        return curves
+
+    def _range_variances(self) -> Floats:
+        """Return variances (k,) of ranges, m², less those by directions; NaN of single returns."""
+        rays = self.rays
+        estimate = self.estimates.get("angle_deg")
+        direction_noise_rad = 0.0 if estimate is None else np.radians(estimate.value)
+        variance = np.where(rays.freedom > 0, rays.variance, np.nan)
+        return np.asarray(variance - (direction_noise_rad * rays.slope) ** 2)
+
+    def channels(self) -> list[dict[str, Any]]:
+        """Return the noise, bias and spread of azimuths of each ring, as dictionaries."""
+        stack = self.stack
+        row_of_ray = self.rays.row
+        range_variance = self._range_variances()
+        azimuth_variance = np.degrees(np.diff(stack.azimuth_offsets, axis=2)) ** 2 / 2
+        has_spread = len(azimuth_variance) > 1 and not self.moves
+        return [
+            {
+                "ring": int(ring),
+                "elevation_deg": float(stack.elevation_deg[row]),
+                "rays": int(np.isfinite(range_variance[row_of_ray == row]).sum()),
+                "noise_m": _root_mean(range_variance[row_of_ray == row]),
+                "bias_m": self.bias[row]._asdict() if row in self.bias else None,
+                "uneven_deg": _root_mean(azimuth_variance[:, row]) if has_spread else None,
+            }
+            for row, ring in enumerate(stack.rings)
+        ]
+
+
+def measure_standing(
+    recording: Recording, white: float | None, scene: Scene | None, poses: KnownPoses | None
+) -> Measured:
+    """Choose rays on smooth surfaces and fit the performance of the sensor to their returns.
+
+    `white` is the intensity of a white surface. LidarError if the sensor moves, or is not at its
+    pose in the scene, or if too few rays meet smooth surfaces.
+    """
+    stack = read_static(recording, stands=poses is not None and poses.are_of_firings(recording))
+    lost_by_range = None
+    expected = None
+    if scene is not None:
+        expected = _scene_ranges(stack, scene, poses)
+        difference = np.abs(finite_median(stack.ranges, 0) - expected)
+        near_count = (difference < SCENE_TOLERANCE_M).sum()
+        _check_pose(near_count / max(np.isfinite(difference).sum(), 1), recording.name)
+        lost_by_range = _lost_by_range(stack, expected)
+    sigma = stack.rough_sigma.copy()
+    estimates: dict[str, Estimate] = {}
+    for _ in range(2):  # the second pass leaves returns out by the noise that the first pass fits
+        direction_noise_rad = 0.0 if estimates else ASSUMED_DIRECTION_NOISE_RAD
+        rays = select_smooth_rays(stack, sigma, direction_noise_rad, expected)
+        _check_rays(len(rays.row), recording.name)
+        energy = _pulse_energies(rays, white or recording.white, recording.energies)
+        if stack.sweep_count > 1:
+            estimates, sigma[rays.row, rays.column] = fit_performance(rays, energy)
+    if estimates and (alarms := alarm_share(stack)):
+        estimates["false_alarms"] = alarms
+    bias = _bias(stack, rays, sigma, expected)
+    return Measured(stack, rays, energy, estimates, bias, lost_by_range)
+
+
+def measure_moving(
+    recording: Recording, white: float | None, scene: Scene, poses: KnownPoses
+) -> Measured:
+    """Fit the performance of a sensor that moves to its pulses on the surfaces of a scene.
+
+    `white` is the intensity of a white surface. LidarError if the sensor is not at its poses in the
+    scene, or if too few pulses meet smooth surfaces.
+    """
+    stack, sweeps = measure_pulses(recording, scene, poses.fired(recording))
+    _check_pose(sweeps.near / max(sweeps.compared, 1), recording.name)
+    pulses = sweeps.pulses
+    if np.isfinite(stack.intensities).any():
+        pulses = pulses.select(np.isfinite(pulses.intensity))
+    _check_rays(np.isfinite(pulses.difference).sum(), recording.name)
+    pulses = pulses.select(pulses.near_scene(pulses.rough_sigma()))
+    sigma = pulses.rough_sigma()
+    for _ in range(2):  # the second pass leaves returns out by the noise that the first pass fits
+        rays = pulses.rays(sigma)
+        energy = _pulse_energies(rays, white or recording.white, recording.energies)
+        estimates, sigma = fit_performance(rays, energy, all_known=True)
+    lost = 1 - rays.returns.astype(np.float64)
+    bias = _pulse_bias(pulses)
+    return Measured(stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True)
+
+
+def _check_rays(count: int, name: str) -> None:
+    """Raise LidarError for too few rays on smooth surfaces."""
+    if count < MIN_RAYS:
+        raise LidarError(
+            f"{name} has {count} rays on smooth surfaces, not {MIN_RAYS}: record walls or a floor, "
+            "in the sensor's axes."
+        )
+
+
+def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
+    """Cast a ray into each cell; return ranges of the scene (r, c), metres, NaN without a hit."""
+    rays = stack.directions.reshape(-1, 3)
+    sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
+    pose = np.eye(4) if poses is None else poses.matrices[0]
+    ranges = Scanner(scene, sensor).ranges(pose[None], number=0).reshape(stack.rough_sigma.shape)
+    return np.where(np.isfinite(ranges), ranges, np.nan).astype(np.float64)
+
+
+def _check_pose(near_share: float, name: str) -> None:
+    """Raise LidarError unless half of the ranges are near the ranges of the scene."""
+    if not near_share > _MIN_SCENE_SHARE:
+        message = f"less than half of {name} is within {SCENE_TOLERANCE_M} m of the scene"
+        raise LidarError(f"{message}: give the sensor's --pose in it, or no scene.")
+
+
+def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
+    """Compute the curve of the share of lost pulses by the range of the scene, (r, c)."""
+    surfaces = find_surfaces(stack, expected, 0 * stack.rough_sigma)
+    cells = surfaces.smooth & (stack.trials > 0)
+    returned = np.isfinite(stack.ranges).sum(axis=0)
+    lost = 1 - returned[cells] / stack.trials[cells]
+    return _curve(expected[cells], lost)
+
+
+def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
+    """Return the mean energies of the returns of rays (k,), or None if unknown.
+
+    The energy is 1 for a white surface at 10 m; or the energy is the intensity, if the intensities
+    of the recording `are_energies`. `white` is the intensity of a white surface, None if unknown.
+    """
+    if not np.isfinite(rays.intensity).all():
+        return None
+    if white:
+        reflectance = np.maximum(rays.intensity / white, _MIN_REFLECTANCE)
+        return np.asarray(reflectance * (10 / rays.distance) ** 2)
+    return rays.intensity if are_energies else None
+
+
+def _bias(
+    stack: SweepStack, rays: SmoothRays, sigma: Floats, expected: Floats | None
+) -> dict[int, Estimate]:
+    """Estimate the bias of each row of the stack, {row: metres}, by rays that are not steep.
+
+    Bias is the difference from the scene's ranges `expected` (r, c), or from large planes. Ranges
+    have standard deviations `sigma` (r, c), metres.
+    """
+    flat = rays.select(rays.slope < FLAT_TANGENT * rays.distance)
+    cell = flat.row, flat.column
+    if expected is not None:
+        return _mean_by_row(flat.row, flat.distance - expected[cell])
+    error_m = sigma[cell] / np.sqrt(flat.returns) + _MIN_RANGE_ERROR_M
+    return ring_bias(flat, stack.directions[cell], error_m)
+
+
+def _pulse_bias(pulses: Pulses) -> dict[int, Estimate]:
+    """Estimate the bias of each row, {row: metres}, by returns of pulses that are not steep."""
+    returned = np.isfinite(pulses.residual) & (pulses.slope < FLAT_TANGENT * pulses.expected)
+    return _mean_by_row(pulses.row[returned], pulses.residual[returned])
+
+
+def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
+    """Estimate the mean of the errors (k,) of each row (k,): {row: metres}."""
+    return {number: Estimate.from_values(errors[row == number]) for number in set(row.tolist())}
+
+
+def _root_mean(variances: Floats) -> dict[str, float] | None:
+    """Estimate the root of the mean of finite variances (n,); None for too few variances."""
+    finite = variances[np.isfinite(variances)]
+    if len(finite) < MIN_RAYS:
+        return None
+    return Estimate.from_values(finite).power(0.5)._asdict()
+
+
+def _curve(x: Floats, values: Floats, power: float = 1.0) -> Curve:
+    """Compute a curve: a power of the mean of values (k,) in parts of x (k,), of equal numbers."""
+    finite = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
+    order = finite[np.argsort(x[finite], kind="stable")]
+    parts = np.array_split(order, min(_CURVE_POINTS, len(order) // MIN_RAYS) or 1)
+    return [
+        {"x": float(np.median(x[part]))} | Estimate.from_values(values[part]).power(power)._asdict()
+        for part in parts
+        if len(part) >= MIN_RAYS
+    ]

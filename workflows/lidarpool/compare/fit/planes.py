@@ -1,0 +1,331 @@
+"""Motions of a sensor by the changes of the ranges of smooth surfaces.
+
+In the direction d, the plane n · x = c is nearer by n · s / (n · d) after a shift s of the sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.sampling import even_indices
+
+from .estimates import MIN_RAYS, sandwich
+from .sight import Evidence, RigidMotion, count_objects
+from .stack import SweepStack, finite_median
+from .surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfaces
+
+SWEEP_PAIRS = 8  # pairs of sweeps that are compared
+ARM_M = 10.0  # distance at which rotations are expressed in metres
+# noise of ranges, and motion, for which rays are weighted, metres
+_ASSUMED_NOISE_M = 0.02
+_ASSUMED_SHIFT_M = 0.5
+_MIN_EXPLAINED_SHARE = 0.5  # of the rays that a motion changes
+_MAX_FACE_M = 0.3  # shift beyond which rays leave the faces of cars
+_VEHICLE_M = 4.0  # no front of a vehicle is as wide
+_CALM_FACTOR = 4.0  # of the median change, beyond which a change is of something that moves
+_CALM_SIGMAS = 6.0
+# change of a range that may be noise, at least, and for each metre
+_STAYED_M = 0.05
+_STAYED_PER_M = 0.01
+
+# Creep
+_CREEP_SWEEPS = 24  # sweeps, at most
+_CREEP_RAYS = 20_000  # rays, at most
+_SECTORS = 36  # of a revolution; errors of the rays of a sector are alike
+_CREEP_SIGMAS = 5.0  # of a significant motion
+# share of the returns of a ray that are nearer to their median than so many standard deviations
+_MIN_NEAR_SHARE = 0.95
+_MAX_CREEP_SIGMAS = 10.0
+_TUKEY_LIMITS = (20.0, 10.0, 4.7, 4.7, 4.7)  # standard deviations beyond which rays do not count
+_PRIOR_M = 1.0  # standard deviation of motions that no ray shows
+_OFFSET = 6  # column of the offset of all ranges
+
+
+@dataclass(frozen=True, eq=False)
+class RangeChanges:
+    """Changes of the ranges of smooth surfaces between two sweeps."""
+
+    surfaces: Surfaces  # of the first sweep
+    # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
+    chosen: Bools
+    change: Floats  # (r, c): metres, second less first, without the change by shifted azimuths
+    points: Floats  # (r, c, 3): of the first sweep, metres
+    sigma_m: Floats  # (r, c): rough standard deviation of ranges
+
+    @classmethod
+    def between(cls, stack: SweepStack, first: int, second: int) -> RangeChanges:
+        """Compare the ranges of two sweeps where the first sweep meets smooth surfaces."""
+        distance = stack.ranges[first].astype(np.float64)
+        # Changes of ranges from sweep to sweep are no noise if the sensor moves.
+        surfaces = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
+        with np.errstate(invalid="ignore"):
+            azimuth_change = stack.azimuth_offsets[second] - stack.azimuth_offsets[first]
+            change = stack.ranges[second] - distance - surfaces.azimuth_slope * azimuth_change
+            is_flat = surfaces.slope < FLAT_TANGENT * distance
+            chosen = surfaces.smooth & np.isfinite(change) & is_flat
+        points = distance[..., None] * stack.directions
+        return cls(surfaces, chosen, change, points, stack.rough_sigma)
+
+    @cached_property
+    def design(self) -> Floats:
+        """Changes (k, 4) of the ranges of chosen rays with the motion: shift, and yaw at `ARM_M`.
+
+        Yaw is in metres, so that the unknowns are of about the same size.
+        """
+        yaw = self.surfaces.azimuth_slope[self.chosen] / ARM_M
+        return np.column_stack([-self.surfaces.scaled_normal[self.chosen], yaw])
+
+    @cached_property
+    def distance(self) -> Floats:
+        """Ranges (k,) of the chosen rays in the first sweep, metres."""
+        return np.linalg.norm(self.points[self.chosen], axis=1)
+
+    @cached_property
+    def normal_error(self) -> Floats:
+        """Errors (k,) of the normals at the chosen rays, radians.
+
+        Normals are of points two columns away on either side: normals of close points are inexact.
+        """
+        step_rad = 2 * np.pi / self.change.shape[1]
+        return np.asarray(_ASSUMED_NOISE_M / (np.sqrt(10) * self.distance * step_rad))
+
+    @cached_property
+    def noise(self) -> Floats:
+        """Assumed noise (k,) of the changes of the chosen rays, metres."""
+        noise = _ASSUMED_NOISE_M + MAX_KINK_PER_M * self.distance
+        return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
+
+    def motion(self) -> RigidMotion | None:
+        """Fit the motion of the sensor; None unless a motion explains most changes it predicts."""
+        change = self.change[self.chosen]
+        if len(change) < MIN_RAYS:
+            return None
+        changed = np.abs(change) > 5 * self.noise  # in a street, few rays show the motion
+        for rays in (slice(None), changed):
+            motion = _rigid_motion(self.design[rays], change[rays], self.noise[rays])
+            large = self._large(motion)
+            if large.sum() < MIN_RAYS:
+                continue
+            predicted = (self.design @ motion)[large]
+            explained = np.abs(change[large] - predicted) < np.abs(predicted) / 2
+            if explained.mean() >= _MIN_EXPLAINED_SHARE:
+                return RigidMotion(motion[:3], motion[3] / ARM_M)
+        return None
+
+    def _large(self, motion: Floats) -> Bools:
+        """Mark the chosen rays (k,) that a motion (4,) changes by more than noise."""
+        predicted = self.design @ motion
+        residual = np.abs(self.change[self.chosen] - predicted)
+        scale = 1.4826 * np.median(residual / self.noise)
+        shift_m = np.linalg.norm(motion[:3])
+        limit = np.hypot(3 * scale * self.noise, 3 * self.normal_error * shift_m)
+        return np.asarray(np.abs(predicted) > limit)
+
+    def evidence(self, motion: RigidMotion) -> Evidence:
+        """Count objects for and against a motion among the surfaces that the motion changes.
+
+        A surface wider than a vehicle counts as several objects.
+        """
+        if len(self.change[self.chosen]) < MIN_RAYS:
+            return Evidence(0, 0, 0)
+        values = np.append(motion.shift, motion.yaw_rad * ARM_M)
+        large = self._large(values)
+        predicted = (self.design @ values)[large]
+        change = self.change[self.chosen][large]
+        points = self.points[self.chosen][large]
+        moved = np.abs(change - predicted) < np.abs(predicted) / 2
+        stayed = np.abs(change) < np.abs(predicted) / 2
+        kinds = [moved, stayed & ~moved, ~moved & ~stayed]
+        evidence = count_objects(points, kinds, _VEHICLE_M)
+        if np.linalg.norm(motion.shift) > _MAX_FACE_M:
+            return evidence._replace(unexplained=0)
+        return evidence
+
+    def axes(self) -> tuple[Floats, Floats]:
+        """Return the axes (3, 3) of the normals of surfaces whose ranges stayed, and shares (3,).
+
+        A share is the mean square of the normals' components on an axis, ascending: a shift along
+        an axis of a small share changes few of these ranges.
+        """
+        ranges = np.linalg.norm(self.points, axis=-1)
+        with np.errstate(invalid="ignore"):
+            limit = np.maximum(_STAYED_M, _CALM_SIGMAS * self.sigma_m) + _STAYED_PER_M * ranges
+            stayed = self.surfaces.smooth & (np.abs(self.change) < limit)
+        normals = self.surfaces.scaled_normal[stayed]
+        if len(normals) < MIN_RAYS:
+            return np.eye(3), np.zeros(3)
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        shares, axes = np.linalg.eigh(normals.T @ normals / len(normals))
+        return axes.T, shares
+
+
+def range_scatter(stack: SweepStack, lag: int) -> float:
+    """Return the typical change of the range of a smooth surface in `lag` sweeps, metres.
+
+    The result is a mean without the changes of things that move: ranges may be rounded to more
+    than their noise, so that a median is 0.
+    """
+    scatter = []
+    for first in even_indices(stack.sweep_count - lag, SWEEP_PAIRS).tolist():
+        changes = RangeChanges.between(stack, first, first + lag)
+        sizes = np.abs(changes.change[changes.chosen])
+        if len(sizes) >= MIN_RAYS:
+            by_noise = _CALM_SIGMAS * np.median(changes.sigma_m[changes.chosen])
+            limit = max(_CALM_FACTOR * np.median(sizes), by_noise)
+            scatter.append(sizes[sizes <= limit].mean())
+    return float(np.median(scatter)) if scatter else 0.0
+
+
+def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
+    """Fit a motion (4,) to changes of ranges (k,): shift x, y, z and yaw at `ARM_M`, metres.
+
+    A row of `design` (k, 4) is the change of the range with the motion; `noise` (k,) is the noise
+    of `change`, metres. Components along principal axes of the covariance that are not significant
+    are 0. Huber's estimate: few rays of things that move count little.
+    """
+    motion: Floats = np.zeros(4)
+    if len(change) < MIN_RAYS:
+        return motion
+    for _ in range(30):
+        residual = np.abs(change - design @ motion) / noise
+        weight = np.sqrt(np.minimum(1, 2 / np.maximum(residual, 1e-9))) / noise
+        weighted = design * weight[:, None]
+        motion = np.asarray(np.linalg.lstsq(weighted, change * weight, rcond=1e-6)[0], np.float64)
+    covariance = sandwich(weighted, (change - design @ motion) * weight)
+    variance, axes = np.linalg.eigh(covariance)
+    components = axes.T @ motion
+    significant = np.abs(components) > 5 * np.sqrt(np.maximum(variance, 0)) + 1e-9
+    motion = axes @ np.where(significant, components, 0.0)
+    return np.asarray(motion)
+
+
+class Creep(NamedTuple):
+    """Steady motion of a sensor over a recording; 0 where noise may explain the changes."""
+
+    shift: Floats  # (3,): metres from sweep to sweep
+    rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
+    spread_m: float  # standard deviation by the motion of the ranges that the motion changes
+    effect: float  # the same, over the standard deviation by noise
+
+
+def fit_creep(stack: SweepStack) -> Creep:
+    """Fit the steady motion of a sensor to the ranges of all sweeps.
+
+    Each sweep has a small motion from the mean of all, by Tukey's biweight: rays of things that
+    move do not count. The steady motion is their slope. Its errors are those of noise, and those of
+    sectors of a revolution, by leaving out each (jackknife): one thing that moves is no motion of
+    the sensor. Nor is an offset that grows in all ranges, as of a sensor that warms up.
+    """
+    rays = _CreepRays.of_stack(stack)
+    if len(rays.design) < MIN_RAYS:
+        return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0)
+    time = rays.numbers - rays.numbers.mean()
+    slope = rays.steady_motion(time / (time**2).sum())
+    spread = slope.replicates - slope.replicates.mean(axis=0)
+    covariance = slope.covariance + (_SECTORS - 1) / _SECTORS * spread.T @ spread
+    variance, axes = np.linalg.eigh(covariance[:_OFFSET, :_OFFSET])
+    components = axes.T @ slope.values[:_OFFSET]
+    significant = np.abs(components) > _CREEP_SIGMAS * np.sqrt(variance)
+    motion = axes @ np.where(significant, components, 0.0)
+    spread_m = np.abs(rays.design[:, :_OFFSET] @ motion) * time.std()
+    # In a street, few rays show the motion.
+    shown = np.argsort(spread_m / rays.sigma)[-MIN_RAYS:]
+    effect = float((spread_m / rays.sigma)[shown[0]])
+    return Creep(motion[:3], motion[3:] / ARM_M, float(np.median(spread_m[shown])), effect)
+
+
+class _SweepMotion(NamedTuple):
+    """Motion of a sensor from the mean of all sweeps, and its errors; columns of `_CreepRays`."""
+
+    values: Floats  # (7,)
+    covariance: Floats  # (7, 7): by noise
+    replicates: Floats  # (sectors, 7): motions without the rays of each sector
+
+
+@dataclass(frozen=True, eq=False)
+class _CreepRays:
+    """Rays on smooth surfaces of the mean of all sweeps."""
+
+    numbers: Ints  # (t,): numbers of the sweeps
+    # (k, 7): changes of ranges with the shift, with the rotation at `ARM_M`, and with the offset
+    design: Floats
+    change: Floats  # (t, k): ranges less their medians, metres; NaN without a return
+    sigma: Floats  # (k,): standard deviation of noise, metres
+    sector: Ints  # (k,)
+
+    @classmethod
+    def of_stack(cls, stack: SweepStack) -> _CreepRays:
+        """Choose rays and sweeps evenly."""
+        numbers = even_indices(stack.sweep_count, _CREEP_SWEEPS)
+        median = finite_median(stack.ranges, 0)
+        count = np.isfinite(stack.ranges).sum(axis=0)
+        surfaces = find_surfaces(stack, median, stack.rough_sigma / np.sqrt(np.maximum(count, 1)))
+        with np.errstate(invalid="ignore"):
+            chosen = surfaces.smooth & stack.steady & (surfaces.slope < FLAT_TANGENT * median)
+            near = np.abs(stack.ranges - median) < _MAX_CREEP_SIGMAS * stack.rough_sigma
+        chosen &= near.sum(axis=0) >= _MIN_NEAR_SHARE * count  # nothing passes in front
+        cell = np.nonzero(chosen & (count > stack.sweep_count / 2))
+        rays = even_indices(len(cell[0]), _CREEP_RAYS)
+        row = cell[0][rays]
+        column = cell[1][rays]
+        directions = stack.directions[row, column]
+        normals = surfaces.scaled_normal[row, column]
+        # A rotation w turns the direction d by w x d: the range changes by w · (d x gradient).
+        lever = -np.cross(directions, normals) * median[row, column, None]
+        change = stack.ranges[numbers[:, None], row, column].astype(np.float64)
+        change -= surfaces.azimuth_slope[row, column] * stack.azimuth_offsets[
+            numbers[:, None], row, column
+        ].astype(np.float64)
+        return cls(
+            numbers=numbers,
+            design=np.hstack([-normals, lever / ARM_M, np.ones((len(row), 1))]),
+            change=change - median[row, column],
+            sigma=stack.rough_sigma[row, column],
+            sector=column * _SECTORS // stack.ranges.shape[2],
+        )
+
+    def steady_motion(self, contrast: Floats) -> _SweepMotion:
+        """Return the sum of the sweeps' motions by `contrast` (t,)."""
+        motions = [self._sweep_motion(change) for change in self.change]
+        return _SweepMotion(
+            np.tensordot(contrast, [motion.values for motion in motions], 1),
+            np.tensordot(contrast**2, [motion.covariance for motion in motions], 1),
+            np.tensordot(contrast, [motion.replicates for motion in motions], 1),
+        )
+
+    def _sweep_motion(self, change: Floats) -> _SweepMotion:
+        """Fit the motion of a sweep to the changes of its ranges (k,)."""
+        returned = np.isfinite(change)
+        design = self.design[returned] / self.sigma[returned, None]
+        values = change[returned] / self.sigma[returned]
+        prior = np.eye(design.shape[1]) / _PRIOR_M**2
+        weight, scale = _tukey_weights(design, values, prior)
+        weighted = design * weight[:, None]
+        is_in = (self.sector[returned] == np.arange(_SECTORS)[:, None]).astype(np.float64)
+        products = (weighted[:, :, None] * design[:, None, :]).reshape(len(design), -1)
+        matrices = (is_in @ products).reshape(_SECTORS, *prior.shape)
+        sides = is_in @ (weighted * values[:, None])
+        inverse = np.linalg.inv(matrices.sum(axis=0) + prior)
+        left_out = matrices.sum(axis=0) - matrices + prior
+        rest = (sides.sum(axis=0) - sides)[..., None]
+        replicates = np.linalg.solve(left_out, rest)[..., 0]
+        return _SweepMotion(inverse @ sides.sum(axis=0), scale**2 * inverse, replicates)
+
+
+def _tukey_weights(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, float]:
+    """Return weights (k,) of values (k,) in a linear fit, and the standard deviation of residuals.
+
+    The limit beyond which values do not count shrinks, so that larger motions are found, too.
+    """
+    motion = np.zeros(design.shape[1])
+    for limit in _TUKEY_LIMITS:
+        residual = values - design @ motion
+        weight = np.maximum(1 - (residual / limit) ** 2, 0) ** 2
+        weighted = design * weight[:, None]
+        motion = np.linalg.solve(weighted.T @ design + prior, weighted.T @ values)
+    return weight, 1.4826 * float(np.median(np.abs(values - design @ motion)))

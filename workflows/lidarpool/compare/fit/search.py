@@ -1,0 +1,168 @@
+"""Finds the motion of a sensor between two sweeps that most of the changed objects show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+
+from .planes import ARM_M, RangeChanges
+from .sight import RigidMotion, Sight, SightPair
+from .stack import SweepStack
+
+MIN_SHIFT_M = 0.02  # shift from which on a sensor moves
+MIN_YAW_RAD = 0.003  # yaw from which on a sensor moves
+_MIN_OBJECTS = 3  # objects that show a motion; two without a contradiction
+_SIMILAR_SHARE = 0.95  # of scores of the same motion
+
+# Motions that are tried: of cars, and of turns on the spot.
+_MAX_SPEED_M_S = 70.0
+_MAX_SHIFT_M = 12.0
+_FIRST_SHIFT_M = 0.05
+_SHIFT_STEP = 0.05  # relative
+_DIRECTIONS = 36  # in a plane of free directions
+_FREE_SHARE = 0.02  # share of an axis of `RangeChanges.axes` along which a shift is free
+_MAX_YAW_DEG = 45.0
+_YAW_STEP_DEG = 0.25
+_COARSE_POINTS = 120
+_CANDIDATES = 20
+_BATCH = 2000  # motions that are tried at once
+_REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, metres at a distance of `ARM_M`
+_FINE_POINTS = 600
+_CENTRE_STEPS = 15  # of the last size, to a side
+_SIMILAR_POINTS = 10  # by which scores of a motion's middle differ
+_THINGS = 3  # that are tried, the largest first
+
+
+def motion_between(
+    stack: SweepStack, first: int, second: int, period_ns: float | None
+) -> RigidMotion | None:
+    """Find the motion of a sensor between two sweeps; None if the sensor may stand.
+
+    `period_ns` is the time from sweep to sweep, if known.
+    """
+    changes = RangeChanges.between(stack, first, second)
+    pair = SightPair.of_sweeps(Sight.of_sweep(stack, first), Sight.of_sweep(stack, second))
+    max_shift_m = _MAX_SHIFT_M
+    if period_ns:
+        max_shift_m = min(max_shift_m, _MAX_SPEED_M_S * period_ns / 1e9 * (second - first))
+    by_planes = changes.motion()
+    if by_planes is not None and not _is_shown(by_planes, pair, changes):
+        by_planes = None
+    by_sight = _shown_by_sight(pair, changes, max_shift_m)
+    if by_sight is None:
+        return by_planes
+    by_sight = _centred(pair, by_sight)
+    if by_planes is None:
+        return by_sight
+    # Planes are more exact, unless the rays have left them.
+    sample = pair.sample(_FINE_POINTS)
+    planes_score, sight_score = (pair.score(motion, *sample) for motion in (by_planes, by_sight))
+    return by_planes if planes_score > _SIMILAR_SHARE * sight_score else by_sight
+
+
+def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bool:
+    """Return True if more objects show a motion than speak against the motion."""
+    if np.linalg.norm(motion.shift) < MIN_SHIFT_M and abs(motion.yaw_rad) < MIN_YAW_RAD:
+        return False
+    evidence = pair.evidence(motion), changes.evidence(motion)
+    moved, stayed, unexplained = np.max(evidence, axis=0).tolist()
+    against = stayed + unexplained
+    is_clear = moved >= _MIN_OBJECTS or (moved == _MIN_OBJECTS - 1 and not against)
+    return bool(is_clear and moved > against)
+
+
+def _shown_by_sight(
+    pair: SightPair, changes: RangeChanges, max_shift_m: float
+) -> RigidMotion | None:
+    """Search motions until one is shown, or few objects are left that changed.
+
+    The motion that explains most points may be that of a car beside the sensor.
+    """
+    remaining = pair
+    for _ in range(_THINGS):
+        if sum(remaining.evidence(None)) < _MIN_OBJECTS - 1:
+            return None
+        motion = _best_motion(remaining, changes, max_shift_m)
+        if _is_shown(motion, pair, changes):
+            return motion
+        remaining = remaining.without_explained(motion)
+    return None
+
+
+def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
+    """Find the motion that brings most points of two sweeps to one place."""
+    motions = _coarse_motions(_free_axes(changes), max_shift_m)
+    sample = pair.sample(_COARSE_POINTS)
+    scores = np.concatenate([pair.score(batch, *sample) for batch in _batches(motions)])
+    candidates = _chosen(motions, np.argsort(-scores, kind="stable")[:_CANDIDATES])
+    sample = pair.sample(_FINE_POINTS)
+    best, best_score = _highest(pair, candidates, sample)
+    for step_m in _REFINEMENTS_M:
+        while True:
+            steps = step_m * np.concatenate([np.eye(4), -np.eye(4)])
+            refined, score = _highest(pair, _moved_by(best, steps), sample)
+            if score <= best_score:
+                break
+            best, best_score = refined, score
+    return best
+
+
+def _free_axes(changes: RangeChanges) -> Floats:
+    """Return axes (m, 3) along which the sensor may shift; the two freest if there are none."""
+    axes, shares = changes.axes()
+    free = int((shares < _FREE_SHARE).sum())
+    return axes[: free or 2]
+
+
+def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
+    """Return turns on the spot, and shifts along one axis or in the plane of two axes (m, 3)."""
+    yaw_rad = np.radians(np.arange(_YAW_STEP_DEG, _MAX_YAW_DEG, _YAW_STEP_DEG))
+    directions = axes[:1]
+    if len(axes) > 1:
+        angles = np.pi * np.arange(_DIRECTIONS)[:, None] / _DIRECTIONS
+        directions = np.cos(angles) * axes[0] + np.sin(angles) * axes[1]
+    steps = np.log(max_shift_m / _FIRST_SHIFT_M) / np.log(1 + _SHIFT_STEP)
+    lengths = np.geomspace(_FIRST_SHIFT_M, max_shift_m, max(int(steps), 2))
+    shifts = (np.append(lengths, -lengths)[:, None, None] * directions).reshape(-1, 3)
+    yaws = np.concatenate([yaw_rad, -yaw_rad, np.zeros(len(shifts))])
+    return RigidMotion(np.concatenate([np.zeros((2 * len(yaw_rad), 3)), shifts]), yaws)
+
+
+def _batches(motions: RigidMotion) -> Iterator[RigidMotion]:
+    """Yield the motions in batches that fit into memory."""
+    for start in range(0, len(motions.shift), _BATCH):
+        yield _chosen(motions, slice(start, start + _BATCH))
+
+
+def _chosen(motions: RigidMotion, index: Any) -> RigidMotion:
+    """Select motions by index."""
+    return RigidMotion(motions.shift[index], motions.yaw_rad[index])
+
+
+def _highest(
+    pair: SightPair, motions: RigidMotion, sample: tuple[Floats, Floats]
+) -> tuple[RigidMotion, int]:
+    """Return the first of the motions with the highest score, and the score."""
+    scores = pair.score(motions, *sample)
+    return _chosen(motions, scores.argmax()), int(scores.max())
+
+
+def _moved_by(motion: RigidMotion, offsets: Floats) -> RigidMotion:
+    """Add shifts, and yaws at `ARM_M`, (…, 4) in metres, to a motion."""
+    return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
+
+
+def _centred(pair: SightPair, motion: RigidMotion) -> RigidMotion:
+    """Return the middle of the motions that explain two sweeps about as well as a motion."""
+    sample = pair.sample(_FINE_POINTS)
+    steps_m = np.arange(-_CENTRE_STEPS, _CENTRE_STEPS + 1) * _REFINEMENTS_M[-1]
+    for axis in np.eye(4):
+        offsets = steps_m[:, None] * axis
+        scores = pair.score(_moved_by(motion, offsets), *sample)
+        similar = scores > scores.max() - _SIMILAR_POINTS
+        motion = _moved_by(motion, offsets[similar].mean(axis=0))
+    return motion

@@ -1,0 +1,289 @@
+"""What one sweep sees at the points of another: evidence of a sensor's motion in few rays.
+
+In a street, a sensor that moves along the walls measures nearly the same ranges in each sweep: only
+parked cars and posts move past. Cars that drive past a sensor that stands look alike, so a motion
+is judged by all that both sweeps see: by the objects that the motion brings to one place, by the
+objects that were in one place without the motion, and by those that neither explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.sampling import even_indices
+
+from .stack import SweepStack
+
+# Tolerance of ranges: at least, for each standard deviation of noise, and for each metre.
+_TOLERANCE_M = 0.05
+_TOLERANCE_SIGMAS = 6.0
+_TOLERANCE_PER_M = 0.01
+# Cells around a direction, rows and columns to a side, in which an object would have returned.
+_EMPTY_ROWS = 1
+_EMPTY_COLUMNS = 3
+_MAX_RANGE_SHARE = 0.7  # of the largest ranges, up to which an object would have returned
+_MAX_POINTS = 20_000  # points of a sweep that are looked up in the other sweep
+_MAX_DISTANCE_M = 60.0  # farther objects are too small
+_CLUSTER_M = 2.0  # points of one object are closer
+_MIN_CLUSTER_POINTS = 3
+_LONGEST_VEHICLE_M = 20.0  # longer objects do not move
+_OWN_VEHICLE_M = 2.5  # from the sensor to its vehicle
+_STAYED = 1  # index of the field of `Evidence`
+WALL_OBJECTS = 3  # objects that a wall counts as
+
+# What a sweep says of a point: there is a surface, nothing is known, or a ray passed through.
+_SURFACE = 1
+_UNKNOWN = 0
+_EMPTY = -1
+_KNOWN = (_EMPTY, _SURFACE)
+
+
+class RigidMotion(NamedTuple):
+    """Motion of a sensor from one sweep to another, in the sensor frame of the first.
+
+    Leading axes (…) are of several motions.
+    """
+
+    shift: Floats  # (…, 3): metres
+    yaw_rad: Floats  # (…)
+
+    def to_first(self, points: Floats) -> Floats:
+        """Convert points (n, 3) of the second sweep to the frame of the first: (…, n, 3)."""
+        return np.asarray(_rotated(points, self.yaw_rad[..., None]) + self.shift[..., None, :])
+
+    def to_second(self, points: Floats) -> Floats:
+        """Convert points (n, 3) of the first sweep to the frame of the second: (…, n, 3)."""
+        return _rotated(points - self.shift[..., None, :], -self.yaw_rad[..., None])
+
+
+def _rotated(points: Floats, yaw_rad: Floats) -> Floats:
+    """Rotate points (…, 3) about the z axis by angles (…)."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
+    return np.stack([c * x - s * y, s * x + c * y, np.broadcast_to(z, (c * x).shape)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Nearest and farthest surfaces of a sweep around each direction."""
+
+    elevation_rad: Floats  # (r,): of the rows, descending
+    step_rad: float  # width of a column
+    row_phase: Floats  # (r,): azimuths of the pulses of a row less those of its columns, in steps
+    points: Floats  # (n, 3): points on objects wider than a column, metres
+    # (r - 1, c), metres: smallest and largest range in the rows i and i + 1, and in the columns
+    # beside; inf where rays passed without a return, -inf where nothing is known
+    lower_m: Floats
+    upper_m: Floats
+    empty_m: float  # range up to which rays without a return have met nothing
+    tolerance_m: float
+
+    @classmethod
+    def of_sweep(cls, stack: SweepStack, number: int) -> Sight:
+        """Return what the sweep `number` of a stack sees."""
+        ranges = stack.ranges[number].astype(np.float64)
+        returned = np.isfinite(ranges)
+        columns = ranges.shape[1]
+        step_rad = 2 * np.pi / columns
+        azimuth = np.arctan2(stack.directions[..., 1], stack.directions[..., 0])
+        phase = (azimuth / step_rad - np.arange(columns) + columns / 2) % columns - columns / 2
+        nearest = _pairs_of_rows(
+            _beside(np.where(returned, ranges, np.inf), np.minimum), np.minimum
+        )
+        farthest = _pairs_of_rows(
+            _beside(np.where(returned, ranges, -np.inf), np.maximum), np.maximum
+        )
+        is_unknown = ~np.isfinite(nearest) & ~_empty_around(returned | ~stack.covered[number])
+        noise_m = float(np.quantile(stack.rough_sigma, 0.25))
+        tolerance_m = max(_TOLERANCE_M, _TOLERANCE_SIGMAS * noise_m)
+        wide = _is_wide(ranges, tolerance_m) & (ranges < _MAX_DISTANCE_M)
+        points = (ranges[..., None] * stack.directions)[wide]
+        return cls(
+            elevation_rad=np.radians(stack.elevation_deg),
+            step_rad=step_rad,
+            row_phase=np.median(phase, axis=1),
+            points=points[even_indices(len(points), _MAX_POINTS)],
+            lower_m=np.where(is_unknown, -np.inf, nearest),
+            upper_m=np.where(np.isfinite(nearest), farthest, nearest * np.where(is_unknown, -1, 1)),
+            empty_m=_MAX_RANGE_SHARE * float(np.quantile(ranges[returned], 0.98)),
+            tolerance_m=tolerance_m,
+        )
+
+    def look_up(self, points: Floats) -> Ints:
+        """Say of points (…, 3) in the sensor frame: `_SURFACE`, `_UNKNOWN` or `_EMPTY`, (…)."""
+        x, y, z = np.moveaxis(points, -1, 0)
+        across = np.hypot(x, y)
+        distance = np.hypot(across, z)
+        # Points without a row are beyond the field of view.
+        row = np.interp(
+            -np.arctan2(z, across),
+            -self.elevation_rad,
+            np.arange(len(self.elevation_rad)),
+            left=np.nan,
+            right=np.nan,
+        )
+        in_view = np.isfinite(row)
+        upper_row = np.clip(np.nan_to_num(row).astype(np.int64), 0, len(self.lower_m) - 1)
+        azimuth_steps = np.arctan2(y, x) / self.step_rad - self.row_phase[upper_row]
+        cell = upper_row, np.round(azimuth_steps).astype(np.int64) % self.lower_m.shape[1]
+        lower_m = self.lower_m[cell]
+        tolerance_m = self.tolerance_m + _TOLERANCE_PER_M * distance
+        passed = distance < lower_m - tolerance_m
+        passed &= np.isfinite(lower_m) | (distance < self.empty_m)
+        surface_m = np.clip(distance, lower_m, self.upper_m[cell])
+        met = np.abs(distance - surface_m) <= tolerance_m
+        return np.where(in_view & passed, _EMPTY, np.where(in_view & met, _SURFACE, _UNKNOWN))
+
+
+def _beside(values: Floats, reduce: np.ufunc) -> Floats:
+    """Reduce values (r, c) over each column and the columns beside."""
+    return np.asarray(
+        reduce(reduce(values, np.roll(values, 1, axis=1)), np.roll(values, -1, axis=1))
+    )
+
+
+def _pairs_of_rows(values: Floats, reduce: np.ufunc) -> Floats:
+    """Reduce values (r, c) over each row and the next row: (r - 1, c), or (1, c) of one row."""
+    return np.asarray(reduce(values[:-1], values[1:])) if len(values) > 1 else values
+
+
+def _empty_around(returned: Bools) -> Bools:
+    """Mark pairs of rows (r - 1, c) around which no cell has a return; `returned` is (r, c)."""
+    wide = returned.copy()
+    for shift in range(1, _EMPTY_COLUMNS + 1):
+        wide |= np.roll(returned, shift, axis=1) | np.roll(returned, -shift, axis=1)
+    tall = wide.copy()
+    for shift in range(1, _EMPTY_ROWS + 1):
+        tall[shift:] |= wide[:-shift]
+        tall[:-shift] |= wide[shift:]
+    return ~(tall[:-1] | tall[1:]) if len(tall) > 1 else ~tall
+
+
+def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
+    """Mark cells (r, c) beside which the next cell of the row is of the same surface."""
+    with np.errstate(invalid="ignore"):
+        joined = np.abs(np.diff(ranges, axis=1, append=ranges[:, :1])) < (
+            tolerance_m + _TOLERANCE_PER_M * ranges
+        )
+    return np.asarray(joined | np.roll(joined, 1, axis=1))
+
+
+class Evidence(NamedTuple):
+    """Numbers of objects by what explains that both sweeps see them."""
+
+    moved: int  # the motion, and not that the sensor stands
+    stayed: int  # that the sensor stands, and not the motion
+    unexplained: int  # neither
+
+
+@dataclass(frozen=True, eq=False)
+class SightPair:
+    """Two sweeps, and what each says of the points of the other if the sensor stands."""
+
+    first: Sight
+    second: Sight
+    seen_first: Ints  # (n,): what the second sweep says of the points of the first
+    seen_second: Ints  # (m,): what the first sweep says of the points of the second
+
+    @classmethod
+    def of_sweeps(cls, first: Sight, second: Sight) -> SightPair:
+        """Look up the points of each sweep in the other."""
+        return cls(first, second, second.look_up(first.points), first.look_up(second.points))
+
+    def sample(self, count: int) -> tuple[Floats, Floats]:
+        """Return points of the first sweep and of the second, about `count` of each kind.
+
+        Points of the first kind are in empty space by the other sweep if the sensor stands, points
+        of the second kind are on surfaces.
+        """
+        seen = np.append(self.seen_first, self.seen_second)
+        shares = {kind: min(1.0, count / max((seen == kind).sum(), 1)) for kind in _KNOWN}
+        samples = []
+        for points, seen_points in (
+            (self.first.points, self.seen_first),
+            (self.second.points, self.seen_second),
+        ):
+            rows = [np.flatnonzero(seen_points == kind) for kind in _KNOWN]
+            chosen = [
+                indices[even_indices(len(indices), round(shares[kind] * len(indices)))]
+                for kind, indices in zip(_KNOWN, rows, strict=True)
+            ]
+            samples.append(points[np.concatenate(chosen)])
+        return samples[0], samples[1]
+
+    def score(self, motions: RigidMotion, first: Floats, second: Floats) -> Ints:
+        """Count the points of each sweep (n, 3) on surfaces of the other, less those in space."""
+        seen_first = self.second.look_up(motions.to_second(first)).sum(axis=-1)
+        return np.asarray(seen_first + self.first.look_up(motions.to_first(second)).sum(axis=-1))
+
+    def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
+        """Return what each sweep says of the points of the other if the sensor moves."""
+        in_second = motion.to_second(self.first.points)
+        in_first = motion.to_first(self.second.points)
+        return self.second.look_up(in_second), self.first.look_up(in_first)
+
+    def evidence(self, motion: RigidMotion | None) -> Evidence:
+        """Count objects for and against a motion; without a motion, those that changed."""
+        at_rest = np.append(self.seen_first, self.seen_second)
+        if motion is None:
+            points = np.concatenate([self.first.points, self.second.points])
+            nothing = np.zeros(len(points), bool)
+            return count_objects(points, [nothing, nothing, at_rest == _EMPTY], _LONGEST_VEHICLE_M)
+        in_motion = np.append(*self._seen_in_motion(motion))
+        points = np.concatenate([self.first.points, motion.to_first(self.second.points)])
+        kinds = [
+            (at_rest == _EMPTY) & (in_motion == _SURFACE),
+            (at_rest == _SURFACE) & (in_motion == _EMPTY),
+            (at_rest == _EMPTY) & (in_motion == _EMPTY),
+        ]
+        return count_objects(points, kinds, _LONGEST_VEHICLE_M)
+
+    def without_explained(self, motion: RigidMotion) -> SightPair:
+        """Return the pair without the changed points that a motion explains, as of a car."""
+        seen_first, seen_second = (
+            np.where((at_rest == _EMPTY) & (in_motion == _SURFACE), _UNKNOWN, at_rest)
+            for at_rest, in_motion in zip(
+                (self.seen_first, self.seen_second), self._seen_in_motion(motion), strict=True
+            )
+        )
+        return replace(self, seen_first=seen_first, seen_second=seen_second)
+
+
+def count_objects(points: Floats, kinds: Sequence[Bools], wide_m: float) -> Evidence:
+    """Count the objects that points (n, 3) belong to, by the kind of most points of an object.
+
+    `kinds` are masks (n,) for the fields of `Evidence`. An object wider than `wide_m`, seen from
+    above, counts as `WALL_OBJECTS`. An object beside the sensor may be the sensor's own vehicle, of
+    which nothing follows if it stays.
+    """
+    from scipy.ndimage import label
+
+    counted = np.any(kinds, axis=0)
+    if not counted.any():
+        return Evidence(0, 0, 0)
+    positions = points[counted, :2]
+    cells = np.floor(positions / _CLUSTER_M).astype(np.int64)
+    cells -= cells.min(axis=0)
+    occupied = np.zeros(cells.max(axis=0) + 1, bool)
+    occupied[cells[:, 0], cells[:, 1]] = True
+    labels, count = label(occupied, np.ones((3, 3)))
+    cluster = labels[cells[:, 0], cells[:, 1]] - 1
+    sizes = np.stack([np.bincount(cluster, kind[counted], count) for kind in kinds])
+    kind = sizes.argmax(axis=0)
+    lower = np.full((count, 2), np.inf)
+    upper = np.full((count, 2), -np.inf)
+    distance = np.full(count, np.inf)
+    np.minimum.at(lower, cluster, positions)
+    np.maximum.at(upper, cluster, positions)
+    np.minimum.at(distance, cluster, np.linalg.norm(positions, axis=1))
+    is_wide = np.linalg.norm(upper - lower, axis=1) > wide_m
+    objects = np.where(is_wide, WALL_OBJECTS, 1)
+    objects[sizes.max(axis=0) < _MIN_CLUSTER_POINTS] = 0
+    objects[(kind == _STAYED) & (distance < _OWN_VEHICLE_M)] = 0
+    return Evidence(*np.bincount(kind, objects, 3).astype(int).tolist())
