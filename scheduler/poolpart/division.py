@@ -17,8 +17,10 @@ from distributed import Client
 from .dashboard_page import close_page
 from .errors import PoolError
 from .fence import enclose, lower
-from .inherit import begin_inheritance, end_inheritance, workers_informed
+from .inherit import begin_inheritance, inherited_names, workers_informed
 from .internals.scheduler import asks_for, lift_restrictions
+from .membership import release
+from .registration import forget_registrations
 from .rules import Rule, check_count, divide
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
@@ -160,9 +162,10 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
             elif name in steward.rules and steward.rules[name].exclusive:
                 lower(scheduler, name)
     except PoolError:  # this version of Dask lacks what fences need
-        for name in rules.keys() - steward.rules.keys():
+        added = rules.keys() - steward.rules.keys()
+        for name in added:
             lower(scheduler, name)
-            end_inheritance(scheduler, name)
+        release(scheduler, added)
         raise
     statistics_of(scheduler)
     return note
@@ -266,10 +269,22 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
 # -- dissolving partitions ------------------------------------------------------------------------
 
 
-async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: float) -> list[str]:
+def ask_to_dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+    """Ask the steward to undo partitions, or every partition if `names` is None; see `dissolve`."""
+    arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
+    try:
+        dissolved: list[str] = ask(client, dissolve, **arguments)
+    finally:
+        forget_registrations()
+    return dissolved
+
+
+async def dissolve(
+    steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
+) -> list[str]:
     """Undo partitions, or every partition if `names` is None, and return their names.
 
-    See `Pool.dissolve`.
+    See `Pool.dissolve`. `client_id` is of the client that asks; it has to register again.
     """
     scheduler = steward.scheduler
     await _wait_for_tasks(steward, names, timeout_s)
@@ -281,9 +296,9 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         del steward.rules[name]
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
-        end_inheritance(scheduler, name)
+    release(scheduler, dissolved, client_id, had_rule=True)
     if names is None:  # also in partitions that workers were started with, which have no rule
-        end_inheritance(scheduler, None)
+        release(scheduler, inherited_names(scheduler), client_id)
     if not steward.rules:
         close_page(scheduler)
         forget_statistics(scheduler)

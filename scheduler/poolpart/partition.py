@@ -13,17 +13,18 @@ from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
-from .division import ask, dissolve, grow, shrink
+from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
 from .for_each import ItemTasks
 from .internals.names import MAP, require
 from .mapping import Results, Stage
-from .membership import addresses_of, check_slots, forget_memberships
+from .membership import MemberName, register
 from .notebook import table_of_partitions
 from .pipe import Pipe
 from .rules import check_count
 from .stats import PartitionStats, stats_of
 from .task_context import own_client
+from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, on_scheduler
 
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
@@ -63,10 +64,10 @@ class Partition:
         self.name = name
         self.note = note
         self._client = client
-        self._by_rule = by_rule
+        self.by_rule = by_rule
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Partition, (self.name, None, self.note, self._by_rule)
+        return Partition, (self.name, None, self.note, self.by_rule)
 
     @property
     def client(self) -> Client:
@@ -164,9 +165,8 @@ class Partition:
         resources = self._taking(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
-            workers = names = [str(name) for name in several]  # LocalCluster's are numbers
-            if asks:
-                workers = addresses_of(self.client, self.name, names)
+            # LocalCluster's are numbers.
+            workers = [MemberName(name) if asks else str(name) for name in several]
         return self.client.submit(
             function,
             *args,
@@ -184,7 +184,7 @@ class Partition:
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
         if asks:
-            self._by_rule = check_slots(self.client, self.name, slots, self._by_rule)
+            self.by_rule = register(self.client, self.name, slots, self.by_rule)
         return {self.name: slots}
 
     def map(
@@ -199,6 +199,7 @@ class Partition:
         retries: int = 0,
         slots: int = 1,
         return_exceptions: bool = False,
+        empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> Results:
         """Call a function for each item; returns an iterator of the results.
@@ -233,6 +234,9 @@ class Partition:
         return_exceptions
             Errors that `function` raises are results, in their places. A map over this map gets
             them as arguments. An item that kills its workers still ends the map.
+        empty_s
+            Seconds for which the map waits if the partition has no workers and none is starting,
+            waiting in a queue, or added by `adapt`; `math.inf` for ever.
         kwargs
             Keyword arguments of each call. Bind those that have the name of an option with
             `functools.partial`; scatter large ones, and give the futures.
@@ -241,8 +245,8 @@ class Partition:
         -------
         Results
             An iterator. It raises an error of `function` after the results before it; a note
-            names the item. It raises PoolError if the partition is dissolved meanwhile, and
-            CancelledError after `Client.restart`. To stop early, close or delete the iterator:
+            names the item. It raises PoolError if the partition is dissolved meanwhile or has no
+            workers for `empty_s`, and CancelledError after `Client.restart`. To stop early, close or delete the iterator:
             waiting tasks are cancelled. ``len`` is the number of items if each iterable has one, so
             that progress bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts
             those read. ``client.gather`` of it is an iterator of the same results.
@@ -250,7 +254,7 @@ class Partition:
         Raises
         ------
         ValueError
-            If the window, the chunk or `slots` is below 1, or `retries` below 0.
+            If the window, the chunk or `slots` is below 1, or `retries` or `empty_s` below 0.
         PoolError
             If the partition was dissolved, or the function is a coroutine function.
         """
@@ -269,7 +273,8 @@ class Partition:
             slots=slots,
             return_exceptions=return_exceptions,
             keywords=kwargs,
-            by_rule=self._by_rule,
+            by_rule=self.by_rule,
+            empty_s=empty_s,
         )
         return Results(stage, iterables)
 
@@ -283,6 +288,7 @@ class Partition:
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
+        empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> int:
         """Call a function for each item that comes through a pipe, in a task each.
@@ -301,6 +307,8 @@ class Partition:
             meanwhile.
         priority, retries, slots
             Of each task, as in `submit`.
+        empty_s
+            Seconds for which tasks wait for a partition without workers, as in `map`.
         kwargs
             Keyword arguments of each call. Bind those that have the name of an option with
             `functools.partial`.
@@ -314,6 +322,9 @@ class Partition:
         ------
         PipeFailed
             If the pipe was failed or deleted. Tasks that have not started are cancelled.
+        PoolError
+            If the partition is dissolved meanwhile, or has no workers for `empty_s` while tasks
+            wait. The pipe fails with it.
         Exception
             What the function raises first; a note names the item. The pipe fails with it, so that
             producers end, and tasks that have not started are cancelled.
@@ -325,7 +336,7 @@ class Partition:
         """
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
         self._taking(slots)
-        tasks = ItemTasks(self, pipe, function, window, options)
+        tasks = ItemTasks(self, pipe, function, window, options, empty_s)
         tasks.run()
         return tasks.count
 
@@ -510,8 +521,7 @@ class Partition:
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""
-        ask(self.client, dissolve, names=[self.name], timeout_s=timeout_s)
-        forget_memberships()
+        ask_to_dissolve(self.client, [self.name], timeout_s)
 
 
 def _refuse_coroutine(name: str, function: Callable[..., Any]) -> None:

@@ -369,11 +369,13 @@ class Pipe:
         """Number of items that this object has taken and not returned."""
         return len(self._buffer)
 
-    def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
+    def take_beside(
+        self, futures: Sequence[Future], limit: int, seconds: float
+    ) -> tuple[list[Any], bool]:
         """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
 
-        For `Partition.for_each`, which waits beside its running tasks. With a limit of 0, the call
-        waits for the end of the pipe or of a task. Raises `PipeFailed`.
+        For `Partition.for_each`, which waits beside its running tasks, for `seconds` at most. With
+        a limit of 0, the call waits for the end of the pipe or of a task. Raises `PipeFailed`.
 
         Returns
         -------
@@ -390,7 +392,8 @@ class Pipe:
         closed = False
         if not (limit and self._buffer):
             keys = [future.key for future in futures]
-            reply = self._fill_buffer(math.inf, is_settled, keys=keys, limit=limit)
+            deadline = time.monotonic() + seconds
+            reply = self._fill_buffer(deadline, is_settled, keys=keys, limit=limit)
             closed = reply["closed"]
         return self._unpack(self._remove(limit)), closed
 

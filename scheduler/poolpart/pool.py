@@ -12,9 +12,8 @@ from distributed import Client
 
 from .adapting import adaptive_names
 from .dashboard_page import leave_page, partitions_page
-from .division import ask, declare, dissolve
+from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
-from .membership import forget_memberships
 from .notebook import table_of_partitions
 from .partition import Partition
 from .pipe_states import names_of_pipes
@@ -176,8 +175,7 @@ class Pool:
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             if self._partition_names:  # by now `dissolve` may have undone them
-                ask(self.client, dissolve, names=self._partition_names, timeout_s=30.0)
-                forget_memberships()
+                ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
@@ -337,9 +335,8 @@ class Pool:
         PoolError
             If their tasks have not ended; then everything stays.
         """
-        names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
+        names = ask_to_dissolve(self.client, None, timeout_s)
         self._partition_names.clear()
-        forget_memberships()
         return names
 
     def _divide(
@@ -368,7 +365,6 @@ class Pool:
         for part in parts.values():
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
-        forget_memberships()
         self._partition_names += parts
         remainder = Pool(self.client, remaining_workers)
         remainder._partition_names = self._partition_names
