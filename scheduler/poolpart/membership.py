@@ -215,9 +215,7 @@ def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None)
     )
 
 
-def release(
-    scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False
-) -> None:
+def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False) -> None:
     """End inheritance in partitions without a rule, unless further clients are registered.
 
     Parameters
@@ -289,9 +287,7 @@ def addresses_of(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]
     }
     addresses: list[str] = []
     for worker in map(str, workers):
-        matches = [
-            address for address, member in members.items() if worker in (address, member)
-        ]
+        matches = [address for address, member in members.items() if worker in (address, member)]
         if not matches and ("://" not in worker or worker in scheduler.workers):
             present = ", ".join(sorted(members.values())[:9]) or "none at the moment"
             raise PoolError(

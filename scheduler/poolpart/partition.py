@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from typing import Any, Self
@@ -143,28 +143,37 @@ class Partition:
             Slots of one worker that it takes while it runs. In a task of a partition they are
             lent to others while it waits for other tasks.
         workers
-            Name or address of the member to run on, or a list of them. Names become the present
-            addresses: if these workers leave, or are started again, the task waits for ever.
+            Name or address of the member to run on, or a list of them. Names become the addresses
+            that the members have when the task arrives: if these workers leave, or are started
+            again, the task waits for ever.
 
         Returns
         -------
         Future
+            Its `result` raises PoolError if the partition was dissolved, none of its workers has
+            so many slots, or a worker belongs to another partition. Without any workers the task
+            waits for one.
 
         Raises
         ------
         ValueError
             If `slots` is below 1.
         PoolError
-            If the partition was dissolved, none of its workers has so many slots, a worker belongs
-            to another, or the function is a coroutine function. Without any workers the task waits
-            for one. The client asks at most once a second, of names each time, and not within an
-            event loop.
+            If the function is a coroutine function, or an option cannot be given; also, for the
+            first task of a client, what `result` would raise. The first task waits for an answer
+            of the scheduler, unless the client is asynchronous; later tasks do not.
         """
-        _refuse_coroutine(self.name, function)
+        _check_function(self.name, function)
+        _refuse_options("submit", kwargs, **_OF_TASKS)
         asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
         resources = self._taking(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
+            if not isinstance(several, Iterable):
+                raise PoolError(
+                    f"The workers of a task are {workers!r}: give the name or address of a member "
+                    f"of partition {self.name!r}, or a list of these."
+                )
             # LocalCluster's are numbers.
             workers = [MemberName(name) if asks else str(name) for name in several]
         return self.client.submit(
@@ -246,10 +255,11 @@ class Partition:
         Results
             An iterator. It raises an error of `function` after the results before it; a note
             names the item. It raises PoolError if the partition is dissolved meanwhile or has no
-            workers for `empty_s`, and CancelledError after `Client.restart`. To stop early, close or delete the iterator:
-            waiting tasks are cancelled. ``len`` is the number of items if each iterable has one, so
-            that progress bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts
-            those read. ``client.gather`` of it is an iterator of the same results.
+            workers for `empty_s`, and CancelledError after `Client.restart`. To stop early, close
+            or delete the iterator: waiting tasks are cancelled. ``len`` is the number of items if
+            each iterable has one, so that progress bars such as ``tqdm(partition.map(…))`` work,
+            and `Results.done` counts those read. ``client.gather`` of it is an iterator of the
+            same results.
 
         Raises
         ------
@@ -259,7 +269,7 @@ class Partition:
             If the partition was dissolved, or the function is a coroutine function.
         """
         require(MAP)
-        _refuse_coroutine(self.name, function)
+        _check_function(self.name, function)
         self._taking(slots)
         stage = Stage(
             self.client,
@@ -335,6 +345,8 @@ class Partition:
         36
         """
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
+        _check_function(self.name, function)
+        _refuse_options("for_each", kwargs, **_OF_TASKS)
         self._taking(slots)
         tasks = ItemTasks(self, pipe, function, window, options, empty_s)
         tasks.run()
@@ -367,6 +379,7 @@ class Partition:
         >>> total.result()                                               # doctest: +SKIP
         1000000000.0
         """
+        _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
@@ -384,8 +397,9 @@ class Partition:
         Raises
         ------
         PoolError
-            If the partition has no workers.
+            If the partition has no workers, or `workers` is given.
         """
+        _refuse_options("scatter", options, workers="the data is put on members of the partition")
         addresses = [worker.address for worker in self.workers]
         if not addresses:  # to Dask that would be any worker
             raise PoolError(f"Partition {self.name!r} has no workers to keep data.")
@@ -524,12 +538,30 @@ class Partition:
         ask_to_dissolve(self.client, [self.name], timeout_s)
 
 
-def _refuse_coroutine(name: str, function: Callable[..., Any]) -> None:
-    """Raise if a function would run in the event loop of a worker.
+_SLOTS_INSTEAD = "slots=2 takes two slots of the partition"
+_BOUND = "; bind an argument of the function that has this name by functools.partial"
+# {option of Dask that `submit` sets: what to give instead}
+_OF_TASKS = {
+    "resources": _SLOTS_INSTEAD + _BOUND,
+    "pure": "each call runs by itself, unless calls have the same key" + _BOUND,
+}
+
+
+def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> None:
+    """Raise PoolError if options of Dask were given that the partition sets itself."""
+    for option, advice in instead.items():
+        if option in options:
+            raise PoolError(f"Partition.{method} sets {option} itself: {advice}.")
+
+
+def _check_function(name: str, function: Callable[..., Any]) -> None:
+    """Raise if a function would run in the event loop of a worker, or cannot be called.
 
     Nobody knows there which task submits something, so that the tasks which a coroutine submits
     would leave the partition; and a coroutine cannot lend its slot while it waits for them.
     """
+    if not callable(function):
+        raise PoolError(f"A task of partition {name!r} needs a function, not {function!r}.")
     if inspect.iscoroutinefunction(function):
         raise PoolError(
             f"Partition {name!r} takes plain functions, and {funcname(function)} is a coroutine "

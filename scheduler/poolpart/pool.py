@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any, Self
 
@@ -273,6 +273,12 @@ class Pool:
         )
         selectors: list[Rule] = [rule(n, **common) for n, rule in numbers if n is not None]
         if workers is not None:
+            if isinstance(workers, str) or not isinstance(workers, Iterable):
+                raise PoolError(
+                    f"The workers of partition {name!r} are {workers!r}: give a list of names or "
+                    f"addresses, such as [{str(workers)!r}], or a number by n_workers."
+                )
+            workers = list(workers)
             selectors.append(named(*workers, **common))
         if len(selectors) != 1:
             raise PoolError(
@@ -346,6 +352,11 @@ class Pool:
 
         Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
         """
+        if not isinstance(rules, Mapping):
+            raise PoolError(
+                f"The rules are {rules!r}: give them by partition, such as "
+                '{"IO": n_workers(2), "OTHER": rest()}.'
+            )
         for name, rule in rules.items():
             check_name(name)
             if not isinstance(rule, Rule):
@@ -358,8 +369,9 @@ class Pool:
             declare,
             rules=dict(rules),
             initial_rules=dict(initial_rules),
-            pool={worker.name: worker.gpus for worker in self.workers},
+            pool={worker.name: worker for worker in self.workers},
             known_partitions=set(self.partitions()),
+            own_partitions=set(self._partition_names),
         )
         parts = {name: Partition(name, self.client, note, True) for name, note in notes.items()}
         for part in parts.values():
