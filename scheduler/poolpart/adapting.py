@@ -105,6 +105,11 @@ class _Record:
     missing_slots: float = 0.0  # at the last report
     superfluous_since: dict[str, float] = field(default_factory=dict)  # {queued job: time}
 
+    @property
+    def is_current(self) -> bool:
+        """Whether the process that starts jobs has reported them, and is not dead."""
+        return time.monotonic() - self.reported_at <= _LOST_S
+
 
 class Adaptation(SchedulerPlugin):
     """The record of partitions whose jobs a cluster object starts."""
@@ -368,17 +373,6 @@ def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool
     return slots_of_new_worker(dask_scheduler, name) > 0
 
 
-def max_running_tasks(name: str, slots: int, dask_scheduler: Any = None) -> int:
-    """Return the number of tasks that a partition runs at a time, now or with all its jobs.
-
-    `slots` is the number of slots that each task takes.
-    """
-    workers = dask_scheduler.workers.values()
-    running = sum(int(worker.resources.get(name, 0)) // slots for worker in workers)
-    max_workers, slots_per_worker = _upper_bound(dask_scheduler, name)
-    return max(running, max_workers * (slots_per_worker // slots))
-
-
 def adaptive_names(dask_scheduler: Any = None) -> set[str]:
     """Return the names of adaptive partitions, which may have no workers."""
     adaptation = _adaptation_of(dask_scheduler)
@@ -394,6 +388,17 @@ def slots_of_new_worker(scheduler: Any, name: str) -> int:
     return _upper_bound(scheduler, name)[1]
 
 
+def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
+    """Return the number of tasks that a partition runs at a time, now or with all its jobs.
+
+    `slots` is the number of slots that each task takes.
+    """
+    workers = scheduler.workers.values()
+    running = sum(int(worker.resources.get(name, 0)) // slots for worker in workers)
+    max_workers, slots_per_worker = _upper_bound(scheduler, name)
+    return max(running, max_workers * (slots_per_worker // slots))
+
+
 def max_slots(scheduler: Any, name: str) -> int:
     """Return the slots of a partition with all its jobs; 0 if the partition is fixed."""
     return math.prod(_upper_bound(scheduler, name))
@@ -404,8 +409,15 @@ def queued_jobs_of(scheduler: Any, name: str) -> int:
     record = _record(scheduler, name)
     if record is None or record.kind.bounds is None:
         return 0
-    is_current = time.monotonic() - record.reported_at <= _LOST_S
-    return record.queued_jobs if is_current else 0
+    return record.queued_jobs if record.is_current else 0
+
+
+def expects_workers(scheduler: Any, name: str) -> bool:
+    """Return whether jobs of a partition wait in a queue, start, or may be started."""
+    record = _record(scheduler, name)
+    if record is None or not record.is_current:
+        return False
+    return record.kind.bounds is not None or record.queued_jobs > 0
 
 
 def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:

@@ -17,9 +17,11 @@ from distributed import Client
 from .dashboard_page import close_page
 from .errors import PoolError
 from .fence import enclose, lower
-from .inherit import begin_inheritance, end_inheritance, workers_informed
+from .inherit import begin_inheritance, inherited_names, workers_informed
 from .internals.scheduler import asks_for, lift_restrictions
-from .rules import Rule, check_count, divide
+from .membership import release
+from .registration import forget_registrations
+from .rules import Rule, check_count, divide, rest, shortfalls
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
 from .workers import WorkerInfo, on_scheduler
@@ -63,8 +65,9 @@ async def declare(
     steward: Steward,
     rules: Mapping[str, Rule],
     initial_rules: Mapping[str, Rule],
-    pool: Mapping[str, tuple[str, ...]],
+    pool: Mapping[str, WorkerInfo],
     known_partitions: Collection[str],
+    own_partitions: Collection[str],
 ) -> tuple[dict[str, str], list[WorkerInfo]]:
     """Make all new partitions or none, and follow their rules afterwards.
 
@@ -77,9 +80,11 @@ async def declare(
     initial_rules
         {partition: rule by which workers are chosen at first}.
     pool
-        {name of a worker to choose from: UUIDs of its GPUs}.
+        {name of a worker to choose from: the worker as the client saw it, with its GPUs}.
     known_partitions
         Partitions that the client knew when it sent the request. It may make them again.
+    own_partitions
+        Partitions that were made from the same pool: workers that they have are not missed.
 
     Returns
     -------
@@ -101,8 +106,20 @@ async def declare(
         replace(seat.info, resources=steward.target_resources(seat)) for seat in seats.values()
     ]
     # By name: a restarted worker has another address.
-    candidates = [worker.with_gpus(pool[worker.name]) for worker in present if worker.name in pool]
+    candidates = [w.with_gpus(pool[w.name].gpus) for w in present if w.name in pool]
     chosen, notes = divide(initial_rules, candidates)
+    as_seen = [
+        worker
+        if worker.partitions & {*own_partitions}
+        else replace(worker, resources=pool[worker.name].resources)
+        for worker in candidates
+    ]
+    notes = {**shortfalls(initial_rules, candidates, as_seen), **notes}
+    other = steward.remainder()
+    for name in rules:
+        if isinstance(rules[name], rest) and other not in (None, *rules):
+            note = f"workers that join later go to partition {other!r}, which has the rest already"
+            notes[name] = "; ".join(filter(None, (notes.get(name), note)))
     for name in rules:
         # Workers that may be in the partition already: it is made again.
         permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
@@ -112,11 +129,7 @@ async def declare(
             if name in worker.partitions and worker.address not in permitted
         ]
         if foreign:
-            raise PoolError(
-                f"Partition {name!r} exists already, with {names_of(seats[a] for a in foreign)}, "
-                "which this call did not see, or does not choose: use "
-                f"Pool.partitions()[{name!r}] of a new pool, or give another name."
-            )
+            raise PoolError(_exists(steward, name, [seats[address] for address in foreign]))
     common_note = _begin(steward, rules)
     for worker in candidates:
         if worker.gpus:
@@ -130,6 +143,30 @@ async def declare(
     await _expect_arrival(steward, members)
     notes_of_all = {name: "; ".join(filter(None, (notes.get(name), common_note))) for name in rules}
     return notes_of_all, [worker for worker in candidates if seats[worker.address] not in members]
+
+
+def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
+    """Say that workers which a rule does not take have its partition, and what to do."""
+    if name in steward.rules:
+        return (
+            f"Partition {name!r} exists already, with {names_of(members)}, "
+            "which this call did not see, or does not choose: use "
+            f"Pool.partitions()[{name!r}] of a new pool, or give another name."
+        )
+    use = f"use Pool.partitions()[{name!r}] as it is"
+    for seat in members:
+        names = [resource for resource, slots in seat.original.items() if slots]
+        if len(names) > 1:
+            return (
+                f"Worker {seat.info.name} was started with the resources {', '.join(names)}, and "
+                f"a worker belongs to one partition: {use}, or start the worker with --resources "
+                f'"{name}=1" alone.'
+            )
+    return (
+        f"Workers were started with the resource {name!r}, and the rule does not take all of them "
+        f"({names_of(members)} would be left): {use}, or give a rule that takes all, such as "
+        "rest(), or another name."
+    )
 
 
 async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
@@ -160,9 +197,10 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
             elif name in steward.rules and steward.rules[name].exclusive:
                 lower(scheduler, name)
     except PoolError:  # this version of Dask lacks what fences need
-        for name in rules.keys() - steward.rules.keys():
+        added = rules.keys() - steward.rules.keys()
+        for name in added:
             lower(scheduler, name)
-            end_inheritance(scheduler, name)
+        release(scheduler, added)
         raise
     statistics_of(scheduler)
     return note
@@ -266,10 +304,22 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
 # -- dissolving partitions ------------------------------------------------------------------------
 
 
-async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: float) -> list[str]:
+def ask_to_dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+    """Ask the steward to undo partitions, or every partition if `names` is None; see `dissolve`."""
+    arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
+    try:
+        dissolved: list[str] = ask(client, dissolve, **arguments)
+    finally:
+        forget_registrations()
+    return dissolved
+
+
+async def dissolve(
+    steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
+) -> list[str]:
     """Undo partitions, or every partition if `names` is None, and return their names.
 
-    See `Pool.dissolve`.
+    See `Pool.dissolve`. `client_id` is of the client that asks; it has to register again.
     """
     scheduler = steward.scheduler
     await _wait_for_tasks(steward, names, timeout_s)
@@ -281,9 +331,9 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         del steward.rules[name]
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
-        end_inheritance(scheduler, name)
+    release(scheduler, dissolved, client_id, had_rule=True)
     if names is None:  # also in partitions that workers were started with, which have no rule
-        end_inheritance(scheduler, None)
+        release(scheduler, inherited_names(scheduler), client_id)
     if not steward.rules:
         close_page(scheduler)
         forget_statistics(scheduler)

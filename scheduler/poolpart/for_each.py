@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from dask.utils import funcname
 from distributed import Future, wait
 
-from .adapting import max_running_tasks
-from .errors import PipeFailed
+from .errors import PipeFailed, PoolError
+from .membership import prospects
 from .pipe import Pipe
-from .workers import on_scheduler
+from .worker_wait import WorkerWait, check_wait
 
 if TYPE_CHECKING:
     from .partition import Partition
@@ -36,7 +36,9 @@ class ItemTasks:
         function: Callable[..., Any],
         window: int | None,
         options: dict[str, Any],
+        empty_s: float,
     ) -> None:
+        check_wait(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
             raise ValueError(f"window is {window!r}; give a whole number, 1 or more.")
         self.count = 0  # items that have a task, or had
@@ -47,8 +49,9 @@ class ItemTasks:
         self._options = options  # of `Partition.submit`, and keyword arguments of the function
         # {key of a task: the task, the number of its item and the item}
         self._running: dict[str, tuple[Future, int, Any]] = {}
-        self._window = 1
+        self._window = window or 1
         self._next_look = 0.0
+        self._wait = WorkerWait(partition.name, "for_each", empty_s)
 
     def run(self) -> None:
         """Run tasks until the pipe is closed and all tasks have ended.
@@ -62,32 +65,37 @@ class ItemTasks:
                 free = max(0, self._window - len(self._running))
                 futures = [future for future, _, _ in self._running.values()]
                 if drained or (closed and not free):
-                    wait(futures, return_when="FIRST_COMPLETED")
+                    with suppress(TimeoutError):
+                        wait(futures, timeout=LOOK_S, return_when="FIRST_COMPLETED")
                 else:
-                    items, closed = self._pipe.take_beside(futures, free)
+                    items, closed = self._pipe.take_beside(futures, free, LOOK_S)
                     drained = closed and not self._pipe.buffered and len(items) < free
                     self._submit(items)
                 self._check()
         except BaseException as error:
             self._partition.client.cancel([future for future, _, _ in self._running.values()])
             if not isinstance(error, PipeFailed):
+                reason = f"{funcname(self._function)} has failed: {error!r}"
                 with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
-                    self._pipe.fail(f"{funcname(self._function)} has failed: {error!r}")
+                    self._pipe.fail(str(error) if isinstance(error, PoolError) else reason)
             raise
 
     def _look(self) -> None:
-        """Read the number of slots: partitions grow and shrink."""
-        if self._given_window is not None:
-            self._window = self._given_window
-        elif time.monotonic() > self._next_look:
-            running = on_scheduler(
-                self._partition.client,
-                max_running_tasks,
-                name=self._partition.name,
-                slots=self._options["slots"],
-            )
-            self._window = max(2, 2 * running)
-            self._next_look = time.monotonic() + LOOK_S
+        """Read the number of slots: partitions grow, shrink, and lose workers.
+
+        PoolError if tasks could never run, or have waited for workers too long.
+        """
+        if time.monotonic() <= self._next_look:
+            return
+        partition = self._partition
+        of_partition = prospects(
+            partition.client, partition.name, self._options["slots"], partition.by_rule
+        )
+        if self._given_window is None:
+            self._window = max(2, 2 * of_partition.running)
+        if self._running:
+            self._wait.check(of_partition)
+        self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self, items: Sequence[Any]) -> None:
         """Submit a task for each item."""

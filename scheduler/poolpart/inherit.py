@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -48,8 +47,6 @@ class Inheritance(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        # {partition that workers were started with: clients that submit to it, by id}
-        self.clients: dict[str, set[str]] = defaultdict(set)
         self.note = ""  # for users: what does not work with this version of Dask
         self._rules = Rules()
         self._choice: WorkerChoice | None = None
@@ -83,13 +80,6 @@ class Inheritance(SchedulerPlugin):
         resources = task.resource_restrictions
         return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}
 
-    def remove_client(self, scheduler: Any, client: str) -> None:
-        """End inheritance in partitions whose last client has left."""
-        for name in [name for name, clients in self.clients.items() if client in clients]:
-            self.clients[name].discard(client)
-            if not self.clients[name]:
-                end_inheritance(scheduler, name)
-
     def uninstall(self) -> None:
         """Take the rules back."""
         self._rules.take_back()
@@ -98,19 +88,13 @@ class Inheritance(SchedulerPlugin):
         self.scheduler.remove_plugin(NAME)
 
 
-def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None = None) -> str:
+def begin_inheritance(names: Iterable[str], scheduler: Any) -> str:
     """Have nested tasks and shuffles of partitions stay in their partition.
 
-    Inheritance lasts until the partition is dissolved or, in a partition that workers were started
-    with, until the last client (given by id) has left. Returns a remark for users on features that
-    this version of Dask lacks, or "".
+    Returns a remark for users on features that this version of Dask lacks, or "".
     """
     rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
     for name in names:
-        if client is not None and (name not in rule.names or name in rule.clients):
-            rule.clients[name].add(client)
-        elif client is None:
-            rule.clients.pop(name, None)
         if name not in rule.names:
             rule.names.add(name)
             if rule.lends:
@@ -118,21 +102,19 @@ def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None =
     return rule.note
 
 
-def is_inherited(scheduler: Any, name: str) -> bool:
-    """Return whether nested tasks of a partition belong to the partition."""
+def inherited_names(scheduler: Any) -> frozenset[str]:
+    """Return the partitions whose nested tasks belong to them."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
-    return rule is not None and name in rule.names
+    return frozenset() if rule is None else frozenset(rule.names)
 
 
-def end_inheritance(scheduler: Any, name: str | None) -> None:
-    """End inheritance in a partition, or in all partitions if the name is None."""
+def end_inheritance(scheduler: Any, name: str) -> None:
+    """End inheritance in a partition."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
-    if rule is None:
+    if rule is None or name not in rule.names:
         return
-    for ended in rule.names & (rule.names if name is None else {name}):
-        rule.names.discard(ended)
-        rule.clients.pop(ended, None)
-        _inform_workers(scheduler, ended, None)
+    rule.names.discard(name)
+    _inform_workers(scheduler, name, None)
     if not rule.names:
         rule.uninstall()
 

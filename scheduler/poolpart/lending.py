@@ -372,8 +372,11 @@ def lending_plugin(name: str) -> bytes:
         def teardown(self, worker: Any) -> None:
             if self.lender is not None:
                 from poolpart.lending import end_lending
+                from poolpart.registration import forget_registrations
 
                 end_lending(worker, name)
+                # The scheduler has removed the registrations of all clients.
+                forget_registrations(name)
 
         def transition(self, key: Any, start: str, finish: str, **kwargs: Any) -> None:
             if self.lender is not None:

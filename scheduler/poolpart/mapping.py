@@ -25,11 +25,11 @@ from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
-from .adapting import max_running_tasks
+from .errors import PoolError
 from .internals.client import when_done
 from .lending import slots_lent
-from .membership import check_slots
-from .workers import on_scheduler
+from .membership import Prospects, prospects
+from .worker_wait import WAIT_S, WorkerWait, check_wait
 
 logger = logging.getLogger(__name__)
 
@@ -203,24 +203,18 @@ class Stage:
     keywords: dict[str, Any] = field(default_factory=dict)
     result_position: int = 0  # number of the argument that is a result of the stage before
     by_rule: bool = False  # the partition can be dissolved
+    empty_s: float = WAIT_S  # longest wait without workers
 
     def __post_init__(self) -> None:
         for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < minimum):
                 raise ValueError(f"{name} is {value!r}; give a whole number, {minimum} or more.")
+        check_wait(self.empty_s)
 
-    def running(self) -> int:
-        """Tasks of this stage that run at a time, with all workers that may be started.
-
-        PoolError if the partition was dissolved: the tasks would wait for ever.
-        """
-        running: int = on_scheduler(
-            self.client, max_running_tasks, name=self.partition, slots=self.slots
-        )
-        if not running:
-            check_slots(self.client, self.partition, self.slots, self.by_rule)
-        return running
+    def prospects(self) -> Prospects:
+        """Ask what the tasks of this stage may expect of the partition."""
+        return prospects(self.client, self.partition, self.slots, self.by_rule)
 
     def send(
         self,
@@ -289,6 +283,7 @@ class Results(Iterator[Any]):
         else:
             self._stages: tuple[Stage, ...] = (stage,)
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
+            self._waits = [_wait_of(stage)]
             self._look()
         self._submit()
 
@@ -296,6 +291,7 @@ class Results(Iterator[Any]):
         """Take over an unread map, as the stages before the last."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*previous._stages, stage)
+        self._waits = [*previous._waits, _wait_of(stage)]
         self._source = ((*row, call) for call, row in zip(calls, previous._source, strict=False))
         self._items_read = previous._items_read
         self._look()
@@ -373,11 +369,14 @@ class Results(Iterator[Any]):
             self.close()
 
     def _look(self) -> None:
-        """Read the number of slots: partitions grow, shrink, and lose workers."""
-        self._slots = [stage.running() for stage in self._stages]
-        for stage, slots in zip(self._stages, self._slots, strict=True):
-            if not slots:
-                logger.warning("Partition %r has no workers: a map on it waits.", stage.partition)
+        """Read the number of slots: partitions grow, shrink, and lose workers.
+
+        PoolError if tasks of a stage could never run, or have waited for workers too long.
+        """
+        prospects = [stage.prospects() for stage in self._stages]
+        self._slots = [of_stage.running for of_stage in prospects]
+        for wait, of_stage in zip(self._waits, prospects, strict=True):
+            wait.check(of_stage)
         self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self) -> None:
@@ -504,7 +503,7 @@ class Results(Iterator[Any]):
         try:
             future.result()
         except Exception as error:
-            if not _of_item(error) and not future.cancelled():
+            if not (_of_item(error) or future.cancelled() or isinstance(error, PoolError)):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(
                     f"{NOTE}the task was for items {chunk.first} to {last} of a map; unless "
@@ -512,6 +511,10 @@ class Results(Iterator[Any]):
                 )
             raise
         raise AssertionError("the task has not failed")
+
+
+def _wait_of(stage: Stage) -> WorkerWait:
+    return WorkerWait(stage.partition, "a map", stage.empty_s)
 
 
 def _of_item(error: BaseException | None) -> bool:

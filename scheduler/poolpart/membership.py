@@ -1,147 +1,298 @@
-"""Members of a partition as a client knows them, so that no task waits in vain."""
+"""Tasks that could never run are refused by the scheduler, so that submitting asks nothing.
+
+A client registers with the scheduler before its first task for a partition (`register`). From then
+on, tasks from inside tasks of the partition belong to the partition (`inherit.py`), and a rule
+looks at each graph of the client when the graph arrives. Tasks for a partition that was dissolved,
+for more slots than any worker of the partition has, or for a worker outside the partition fail with
+a `PoolError`; otherwise they would wait for ever. Tasks of other clients are not looked at.
+
+The scheduler knows the members at that moment. A client that asked for them would wait for the
+answer of a busy scheduler, and the answer would be old when it arrives.
+
+The registration ends with the connection of the client. It also ends when the partition is
+dissolved, by the client itself, or without any client outside tasks that uses the partition: then
+workers are told that their clients have to register again.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .adapting import slots_of_new_worker
+from .adapting import expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
-from .inherit import begin_inheritance, is_inherited, workers_informed
+from .inherit import begin_inheritance, end_inheritance, inherited_names, workers_informed
+from .internals.method_rules import Rules, rule_for_arriving_graphs
+from .internals.names import REFUSING, require
+from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import task_of_thread
+from .registration import is_registered, note_registration
 from .steward import NAME as STEWARD
 from .steward import Steward
 from .workers import on_scheduler
 
-KEEP_S = 1.0  # for which an answer is kept: a request for each task would take a millisecond
+logger = logging.getLogger(__name__)
+
+NAME = "poolpart-registrations"
+
+
+class MemberName(str):
+    """Name or address of a member of a partition; the scheduler looks its address up."""
+
+    __slots__ = ()
+
+
+def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
+    """Register a client for a partition, once; return whether the partition has, or had, a rule.
+
+    Parameters
+    ----------
+    client, name
+        The client and the partition.
+    slots
+        Slots of the client's first task.
+    by_rule
+        Whether the caller knows that the partition has, or had, a rule.
+
+    Raises
+    ------
+    PoolError
+        If the first task could never run, the scheduler lacks this package, or the client is
+        closed or asynchronous.
+    """
+    if is_registered(client, name):
+        return by_rule
+    connection = client.scheduler_comm
+    has_or_had_rule, objection = on_scheduler(
+        client,
+        _register,
+        name=name,
+        slots=slots,
+        by_rule=by_rule,
+        client_id=client.id,
+        in_task=task_of_thread() is not None,
+    )
+    if objection:
+        raise PoolError(objection)
+    note_registration(client, name, connection)
+    return bool(has_or_had_rule)
 
 
 @dataclass(frozen=True)
-class Membership:
-    """Members of a partition when the scheduler was asked."""
+class Prospects:
+    """What tasks of a partition may expect of its workers."""
 
-    names: Mapping[str, str]  # {address of a present member: its name}
-    max_slots: float  # of one member, including members that are starting or may be started
-    has_rule: bool  # the scheduler has a rule for the partition
-    nonmembers: frozenset[str]  # addresses of all other workers
-
-
-# {client: {partition: (time.monotonic() of the request, its answer)}}
-_answers: WeakKeyDictionary[Client, dict[str, tuple[float, Membership]]] = WeakKeyDictionary()
+    running: int  # tasks that run at a time, now or with all workers that may be started
+    has_workers: bool  # now, or a worker is starting, waits in a queue, or may be started
+    objection: str  # why the tasks could never run, or ""
 
 
-def membership(client: Client, name: str, fresh: bool = False) -> Membership:
-    """Ask for the members of a partition, at most once a second unless `fresh`.
-
-    From then on, tasks from inside tasks of the partition belong to it, if they did not yet, until
-    the client closes.
-
-    Raises
-    ------
-    PoolError
-        If the scheduler lacks this package, or the client is closed or asynchronous.
-    """
-    answers = _answers.setdefault(client, {})
-    requested_at, answer = answers.get(name, (0.0, None))
-    if answer is None or fresh or time.monotonic() - requested_at > KEEP_S:
-        requested_at = time.monotonic()
-        in_task = task_of_thread() is not None
-        answer = on_scheduler(client, _look, name=name, client_id=client.id, in_task=in_task)
-        answers[name] = requested_at, answer
+def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects:
+    """Ask what tasks of so many slots may expect of a partition; arguments as of `register`."""
+    answer: Prospects = on_scheduler(client, _prospects, name=name, slots=slots, by_rule=by_rule)
     return answer
 
 
-def forget_memberships() -> None:
-    """Forget all answers, because a partition has changed."""
-    _answers.clear()
+# -- on the scheduler --------------------------------------------------------------------
 
 
-def check_slots(client: Client, name: str, slots: int, made_by_rule: bool) -> bool:
-    """Check that a partition may run a task; return whether the partition has, or had, a rule.
+class Registrations(SchedulerPlugin):
+    """Clients that use partitions, and the rule by which their tasks are refused."""
 
-    Raises
-    ------
-    PoolError
-        If the partition was dissolved, or no member has so many slots. Without any members the task
-        waits: the only member may be starting again.
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        # {partition: {id of a client: whether the client keeps the registrations of all clients}}
+        self.clients: dict[str, dict[str, bool]] = {}
+        self.with_rule: set[str] = set()  # partitions that have, or had, a rule
+        self._rules = Rules()
+        try:
+            require(REFUSING)
+            rule_for_arriving_graphs(self._rules, scheduler, self._check)
+        except PoolError as error:  # partitions are of use without
+            logger.warning("Partitions: tasks that could never run are not refused: %s", error)
+        scheduler.add_plugin(self)
+
+    # -- clients -----------------------------------------------------------------------
+
+    def add(self, name: str, client: str, keeps: bool, has_or_had_rule: bool) -> None:
+        """Register a client for a partition."""
+        self.clients.setdefault(name, {})[client] = keeps
+        if has_or_had_rule:
+            self.with_rule.add(name)
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Remove a client that has left."""
+        for name in [name for name, clients in self.clients.items() if client in clients]:
+            self.remove(name, client)
+
+    def remove(self, name: str, client: str) -> None:
+        """Remove the registration of a client, and all of a partition that nothing keeps."""
+        clients = self.clients[name]
+        clients.pop(client, None)
+        if not has_rule(self.scheduler, name) and not any(clients.values()):
+            clients.clear()
+            end_inheritance(self.scheduler, name)
+        if not clients:
+            del self.clients[name]
+            self.with_rule.discard(name)
+        if not self.clients:
+            self._rules.take_back()
+            self.scheduler.remove_plugin(NAME)
+
+    # -- tasks -------------------------------------------------------------------------
+
+    def _check(self, graph: dict[str, Any]) -> dict[str, Any]:
+        """Return the arguments of a graph, with addresses of members; PoolError to refuse it."""
+        annotations = graph["global_annotations"] or {}
+        client = graph["client"]
+        for resources in graph["annotations_by_type"].get("resources", {}).values():
+            self._refuse(client, resources)
+        resources = annotations.get("resources")
+        if not isinstance(resources, dict):  # none, or a function
+            return graph
+        self._refuse(client, resources)
+        workers = annotations.get("workers")
+        if not workers or not all(isinstance(worker, MemberName) for worker in workers):
+            return graph
+        [name] = resources
+        workers = addresses_of(self.scheduler, name, workers)
+        return {**graph, "global_annotations": {**annotations, "workers": workers}}
+
+    def _refuse(self, client: str, resources: Mapping[str, float]) -> None:
+        """Raise a PoolError if tasks of a client with these resources could never run."""
+        for name, slots in resources.items():
+            if client in self.clients.get(name, ()):
+                objection = objection_to(self.scheduler, name, slots, name in self.with_rule)
+                if objection:
+                    raise PoolError(objection)
+
+
+async def _register(
+    name: str,
+    slots: int,
+    by_rule: bool,
+    client_id: str,
+    in_task: bool,
+    dask_scheduler: Any = None,
+) -> tuple[bool, str]:
+    """Register a client, unless its task could never run.
+
+    Returns whether the partition has or had a rule, and why the task cannot run, or "".
     """
-    objection = ""
-    for fresh in (False, True):
-        members = membership(client, name, fresh)
-        objection = _objection(members, name, slots, made_by_rule)
-        if not objection:
-            return members.has_rule or made_by_rule
-    raise PoolError(objection)
+    registrations: Registrations | None = dask_scheduler.plugins.get(NAME)
+    ruled = has_rule(dask_scheduler, name)
+    was_ruled = registrations is not None and name in registrations.with_rule
+    has_or_had_rule = by_rule or ruled or was_ruled
+    objection = objection_to(dask_scheduler, name, slots, has_or_had_rule)
+    # The last request of a client that was killed may come after it has left.
+    if not objection and client_id in dask_scheduler.clients:
+        # A worker's client closes only with the worker, so that it must not prolong an inheritance
+        # that other clients have begun.
+        keeps = not (in_task and (ruled or name in inherited_names(dask_scheduler)))
+        registrations = registrations or Registrations(dask_scheduler)
+        registrations.add(name, client_id, keeps, has_or_had_rule)
+        if not ruled:  # or the division of the pool has begun it
+            begin_inheritance([name], dask_scheduler)
+        await workers_informed()
+    return has_or_had_rule, objection
 
 
-def _objection(members: Membership, name: str, slots: int, made_by_rule: bool) -> str:
-    """Return why a partition cannot run a task, or an empty string."""
-    if made_by_rule and not members.has_rule and not members.names:
+def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None) -> Prospects:
+    steward: Steward | None = dask_scheduler.plugins.get(STEWARD)
+    seats = steward.members(name) if steward is not None else []
+    has_workers = has_worker_for(dask_scheduler, name, slots)
+    return Prospects(
+        max_running_tasks(dask_scheduler, name, slots),
+        has_workers or bool(seats) or expects_workers(dask_scheduler, name),
+        objection_to(dask_scheduler, name, slots, by_rule),
+    )
+
+
+def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False) -> None:
+    """End inheritance in partitions without a rule, unless further clients are registered.
+
+    Parameters
+    ----------
+    scheduler, names
+        The scheduler, and the partitions.
+    client
+        Id of a client that has to register again.
+    had_rule
+        Whether these partitions had a rule until now.
+    """
+    for name in names:
+        registrations: Registrations | None = scheduler.plugins.get(NAME)
+        if registrations is None or name not in registrations.clients:
+            end_inheritance(scheduler, name)
+            continue
+        if had_rule:
+            registrations.with_rule.add(name)
+        registrations.remove(name, client)
+
+
+def has_rule(scheduler: Any, name: str) -> bool:
+    """Return whether a partition was made by a division of the pool, and is not dissolved."""
+    steward: Steward | None = scheduler.plugins.get(STEWARD)
+    return steward is not None and name in steward.rules
+
+
+def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
+    """Return why a task could never run in a partition, or "".
+
+    Without any members the task waits: the only member may be starting again.
+    """
+    if has_worker_for(scheduler, name, slots):
+        return ""
+    members = [worker for worker in workers_declaring(scheduler, name) if worker.resources[name]]
+    if has_or_had_rule and not members and not has_rule(scheduler, name):
         return f"Partition {name!r} was dissolved: divide the pool again, or use another partition."
-    if members.max_slots and slots > members.max_slots:
-        return (
-            f"A task asks for {slots} slots of one worker, and workers of partition {name!r} have "
-            f"{members.max_slots:g} at most: ask for fewer, or give them more, by slots={slots} in "
-            f'its rule or by --resources "{name}={slots}".'
-        )
-    return ""
+    steward: Steward | None = scheduler.plugins.get(STEWARD)
+    seats = steward.members(name) if steward is not None else []
+    max_slots = max(
+        slots_of_new_worker(scheduler, name),
+        *(worker.resources[name] for worker in members),
+        *(seat.slots for seat in seats),  # also of members that are starting
+        0,
+    )
+    if not max_slots or slots <= max_slots:
+        return ""
+    return (
+        f"A task asks for {slots:g} slots of one worker, and workers of partition {name!r} have "
+        f"{max_slots:g} at most: ask for fewer, or give them more, by slots={slots:g} in "
+        f'its rule or by --resources "{name}={slots:g}".'
+    )
 
 
-def addresses_of(client: Client, name: str, workers: Sequence[str]) -> list[str]:
+def addresses_of(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
     """Return the present addresses of members, given by names or addresses.
 
-    An address without any worker is returned as given.
+    An address without any worker is returned as given: the worker may have just left.
 
     Raises
     ------
     PoolError
         If a worker does not belong to the partition.
     """
-    members = membership(client, name)
-    if set(workers) - members.names.keys():  # a member may have another address than before
-        members = membership(client, name, fresh=True)
+    members = {
+        worker.address: str(worker.name)
+        for worker in workers_declaring(scheduler, name)
+        if worker.resources[name]
+    }
     addresses: list[str] = []
-    for worker in workers:
-        matches = [
-            address
-            for address, member_name in members.names.items()
-            if worker in (address, member_name)
-        ]
-        if not matches and ("://" not in worker or worker in members.nonmembers):
-            present = ", ".join(sorted(members.names.values())[:9]) or "none at the moment"
+    for worker in map(str, workers):
+        matches = [address for address, member in members.items() if worker in (address, member)]
+        if not matches and ("://" not in worker or worker in scheduler.workers):
+            present = ", ".join(sorted(members.values())[:9]) or "none at the moment"
             raise PoolError(
                 f"Worker {worker!r} does not belong to partition {name!r}: give names or "
                 f"addresses of its members ({present})."
             )
         addresses += matches or [worker]
     return addresses
-
-
-async def _look(name: str, client_id: str, in_task: bool, dask_scheduler: Any = None) -> Membership:
-    """Return the members of a partition, and begin inheritance for a client; on the scheduler."""
-    steward: Steward | None = dask_scheduler.plugins.get(STEWARD)
-    has_rule = steward is not None and name in steward.rules
-    workers = dask_scheduler.workers
-    members = {
-        address: str(worker.name)
-        for address, worker in workers.items()
-        if worker.resources.get(name)
-    }
-    slots = [workers[address].resources[name] for address in members]
-    slots.append(slots_of_new_worker(dask_scheduler, name))
-    if steward is not None:
-        slots += [seat.slots for seat in steward.members(name)]
-    # The last request of a client that was killed may come after it has left.
-    if not has_rule and client_id in dask_scheduler.clients:
-        # A worker's client closes only with the worker, so that it must not prolong an inheritance
-        # that other clients have begun.
-        if not (in_task and is_inherited(dask_scheduler, name)):
-            begin_inheritance([name], dask_scheduler, client_id)
-        await workers_informed()
-    nonmembers = frozenset(workers.keys() - members.keys())
-    return Membership(members, max(slots, default=0), has_rule, nonmembers)

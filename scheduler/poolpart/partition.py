@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from typing import Any, Self
@@ -13,17 +13,18 @@ from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
-from .division import ask, dissolve, grow, shrink
+from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
 from .for_each import ItemTasks
 from .internals.names import MAP, require
 from .mapping import Results, Stage
-from .membership import addresses_of, check_slots, forget_memberships
+from .membership import MemberName, register
 from .notebook import table_of_partitions
 from .pipe import Pipe
 from .rules import check_count
 from .stats import PartitionStats, stats_of
 from .task_context import own_client
+from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, on_scheduler
 
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
@@ -63,10 +64,10 @@ class Partition:
         self.name = name
         self.note = note
         self._client = client
-        self._by_rule = by_rule
+        self.by_rule = by_rule
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Partition, (self.name, None, self.note, self._by_rule)
+        return Partition, (self.name, None, self.note, self.by_rule)
 
     @property
     def client(self) -> Client:
@@ -142,31 +143,39 @@ class Partition:
             Slots of one worker that it takes while it runs. In a task of a partition they are
             lent to others while it waits for other tasks.
         workers
-            Name or address of the member to run on, or a list of them. Names become the present
-            addresses: if these workers leave, or are started again, the task waits for ever.
+            Name or address of the member to run on, or a list of them. Names become the addresses
+            that the members have when the task arrives: if these workers leave, or are started
+            again, the task waits for ever.
 
         Returns
         -------
         Future
+            Its `result` raises PoolError if the partition was dissolved, none of its workers has
+            so many slots, or a worker belongs to another partition. Without any workers the task
+            waits for one.
 
         Raises
         ------
         ValueError
             If `slots` is below 1.
         PoolError
-            If the partition was dissolved, none of its workers has so many slots, a worker belongs
-            to another, or the function is a coroutine function. Without any workers the task waits
-            for one. The client asks at most once a second, of names each time, and not within an
-            event loop.
+            If the function is a coroutine function, or an option cannot be given; also, for the
+            first task of a client, what `result` would raise. The first task waits for an answer
+            of the scheduler, unless the client is asynchronous; later tasks do not.
         """
-        _refuse_coroutine(self.name, function)
+        _check_function(self.name, function)
+        _refuse_options("submit", kwargs, **_OF_TASKS)
         asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
         resources = self._taking(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
-            workers = names = [str(name) for name in several]  # LocalCluster's are numbers
-            if asks:
-                workers = addresses_of(self.client, self.name, names)
+            if not isinstance(several, Iterable):
+                raise PoolError(
+                    f"The workers of a task are {workers!r}: give the name or address of a member "
+                    f"of partition {self.name!r}, or a list of these."
+                )
+            # LocalCluster's are numbers.
+            workers = [MemberName(name) if asks else str(name) for name in several]
         return self.client.submit(
             function,
             *args,
@@ -184,7 +193,7 @@ class Partition:
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
         if asks:
-            self._by_rule = check_slots(self.client, self.name, slots, self._by_rule)
+            self.by_rule = register(self.client, self.name, slots, self.by_rule)
         return {self.name: slots}
 
     def map(
@@ -199,6 +208,7 @@ class Partition:
         retries: int = 0,
         slots: int = 1,
         return_exceptions: bool = False,
+        empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> Results:
         """Call a function for each item; returns an iterator of the results.
@@ -233,6 +243,9 @@ class Partition:
         return_exceptions
             Errors that `function` raises are results, in their places. A map over this map gets
             them as arguments. An item that kills its workers still ends the map.
+        empty_s
+            Seconds for which the map waits if the partition has no workers and none is starting,
+            waiting in a queue, or added by `adapt`; `math.inf` for ever.
         kwargs
             Keyword arguments of each call. Bind those that have the name of an option with
             `functools.partial`; scatter large ones, and give the futures.
@@ -241,21 +254,22 @@ class Partition:
         -------
         Results
             An iterator. It raises an error of `function` after the results before it; a note
-            names the item. It raises PoolError if the partition is dissolved meanwhile, and
-            CancelledError after `Client.restart`. To stop early, close or delete the iterator:
-            waiting tasks are cancelled. ``len`` is the number of items if each iterable has one, so
-            that progress bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts
-            those read. ``client.gather`` of it is an iterator of the same results.
+            names the item. It raises PoolError if the partition is dissolved meanwhile or has no
+            workers for `empty_s`, and CancelledError after `Client.restart`. To stop early, close
+            or delete the iterator: waiting tasks are cancelled. ``len`` is the number of items if
+            each iterable has one, so that progress bars such as ``tqdm(partition.map(…))`` work,
+            and `Results.done` counts those read. ``client.gather`` of it is an iterator of the
+            same results.
 
         Raises
         ------
         ValueError
-            If the window, the chunk or `slots` is below 1, or `retries` below 0.
+            If the window, the chunk or `slots` is below 1, or `retries` or `empty_s` below 0.
         PoolError
             If the partition was dissolved, or the function is a coroutine function.
         """
         require(MAP)
-        _refuse_coroutine(self.name, function)
+        _check_function(self.name, function)
         self._taking(slots)
         stage = Stage(
             self.client,
@@ -269,7 +283,8 @@ class Partition:
             slots=slots,
             return_exceptions=return_exceptions,
             keywords=kwargs,
-            by_rule=self._by_rule,
+            by_rule=self.by_rule,
+            empty_s=empty_s,
         )
         return Results(stage, iterables)
 
@@ -283,6 +298,7 @@ class Partition:
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
+        empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> int:
         """Call a function for each item that comes through a pipe, in a task each.
@@ -301,6 +317,8 @@ class Partition:
             meanwhile.
         priority, retries, slots
             Of each task, as in `submit`.
+        empty_s
+            Seconds for which tasks wait for a partition without workers, as in `map`.
         kwargs
             Keyword arguments of each call. Bind those that have the name of an option with
             `functools.partial`.
@@ -314,6 +332,9 @@ class Partition:
         ------
         PipeFailed
             If the pipe was failed or deleted. Tasks that have not started are cancelled.
+        PoolError
+            If the partition is dissolved meanwhile, or has no workers for `empty_s` while tasks
+            wait. The pipe fails with it.
         Exception
             What the function raises first; a note names the item. The pipe fails with it, so that
             producers end, and tasks that have not started are cancelled.
@@ -324,8 +345,10 @@ class Partition:
         36
         """
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
+        _check_function(self.name, function)
+        _refuse_options("for_each", kwargs, **_OF_TASKS)
         self._taking(slots)
-        tasks = ItemTasks(self, pipe, function, window, options)
+        tasks = ItemTasks(self, pipe, function, window, options, empty_s)
         tasks.run()
         return tasks.count
 
@@ -356,6 +379,7 @@ class Partition:
         >>> total.result()                                               # doctest: +SKIP
         1000000000.0
         """
+        _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
@@ -373,8 +397,9 @@ class Partition:
         Raises
         ------
         PoolError
-            If the partition has no workers.
+            If the partition has no workers, or `workers` is given.
         """
+        _refuse_options("scatter", options, workers="the data is put on members of the partition")
         addresses = [worker.address for worker in self.workers]
         if not addresses:  # to Dask that would be any worker
             raise PoolError(f"Partition {self.name!r} has no workers to keep data.")
@@ -510,16 +535,33 @@ class Partition:
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""
-        ask(self.client, dissolve, names=[self.name], timeout_s=timeout_s)
-        forget_memberships()
+        ask_to_dissolve(self.client, [self.name], timeout_s)
 
 
-def _refuse_coroutine(name: str, function: Callable[..., Any]) -> None:
-    """Raise if a function would run in the event loop of a worker.
+_SLOTS_INSTEAD = "slots=2 takes two slots of the partition"
+_BOUND = "; bind an argument of the function that has this name by functools.partial"
+# {option of Dask that `submit` sets: what to give instead}
+_OF_TASKS = {
+    "resources": _SLOTS_INSTEAD + _BOUND,
+    "pure": "each call runs by itself, unless calls have the same key" + _BOUND,
+}
+
+
+def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> None:
+    """Raise PoolError if options of Dask were given that the partition sets itself."""
+    for option, advice in instead.items():
+        if option in options:
+            raise PoolError(f"Partition.{method} sets {option} itself: {advice}.")
+
+
+def _check_function(name: str, function: Callable[..., Any]) -> None:
+    """Raise if a function would run in the event loop of a worker, or cannot be called.
 
     Nobody knows there which task submits something, so that the tasks which a coroutine submits
     would leave the partition; and a coroutine cannot lend its slot while it waits for them.
     """
+    if not callable(function):
+        raise PoolError(f"A task of partition {name!r} needs a function, not {function!r}.")
     if inspect.iscoroutinefunction(function):
         raise PoolError(
             f"Partition {name!r} takes plain functions, and {funcname(function)} is a coroutine "

@@ -25,6 +25,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import suppress
 from itertools import islice
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from distributed import Client, Future
 from distributed.protocol.pickle import dumps
@@ -34,7 +35,16 @@ from .internals.client import ask
 from .internals.names import PIPES, require
 from .internals.queues import Packed, unpack
 from .internals.worker import task_of_thread
-from .pipe_states import CHANGE, PUT, TAKE, Replies, Reply, delete_pipes, open_pipe
+from .pipe_states import (
+    CHANGE,
+    PUT,
+    TAKE,
+    Replies,
+    Reply,
+    answer_pipes,
+    delete_pipes,
+    open_pipe,
+)
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
@@ -369,11 +379,13 @@ class Pipe:
         """Number of items that this object has taken and not returned."""
         return len(self._buffer)
 
-    def take_beside(self, futures: Sequence[Future], limit: int) -> tuple[list[Any], bool]:
+    def take_beside(
+        self, futures: Sequence[Future], limit: int, seconds: float
+    ) -> tuple[list[Any], bool]:
         """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
 
-        For `Partition.for_each`, which waits beside its running tasks. With a limit of 0, the call
-        waits for the end of the pipe or of a task. Raises `PipeFailed`.
+        For `Partition.for_each`, which waits beside its running tasks, for `seconds` at most. With
+        a limit of 0, the call waits for the end of the pipe or of a task. Raises `PipeFailed`.
 
         Returns
         -------
@@ -390,7 +402,8 @@ class Pipe:
         closed = False
         if not (limit and self._buffer):
             keys = [future.key for future in futures]
-            reply = self._fill_buffer(math.inf, is_settled, keys=keys, limit=limit)
+            deadline = time.monotonic() + seconds
+            reply = self._fill_buffer(deadline, is_settled, keys=keys, limit=limit)
             closed = reply["closed"]
         return self._unpack(self._remove(limit)), closed
 
@@ -525,15 +538,29 @@ def take_news(
     return {name: [unpack(client, item) for item in items] for name, items in answers.items()}
 
 
+# {client: connection by which the client has asked its scheduler to answer requests}
+_connections: WeakKeyDictionary[Client, Any] = WeakKeyDictionary()
+
+
+def _let_answer(client: Client) -> None:
+    """Have the scheduler answer requests, whether it has pipes or not; asks once a connection."""
+    connection = client.scheduler_comm
+    if connection is None or _connections.get(client) is not connection:
+        on_scheduler(client, answer_pipes)
+        _connections[client] = connection
+    else:
+        check_client(client)
+
+
 def _ask(client: Client, question: str, **arguments: Any) -> Replies:
     """Send a single request to the scheduler; return {pipe: reply} of the pipes that exist.
 
     `question` is CHANGE, PUT or TAKE: the name of a handler that `pipe_states.Pipes` adds to the
     scheduler. `arguments` are those of the handler.
     """
-    check_client(client)
-    replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
-    return replies or {}  # a scheduler without pipes has no such handler
+    _let_answer(client)
+    replies: Replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
+    return replies
 
 
 def _ask_until(
@@ -566,7 +593,7 @@ def _ask_until(
     async def request() -> Replies:
         seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
         options = {"asker": client.id, "seconds": seconds, **arguments}
-        replies: Replies = await ask(client, None, question, **options) or {}
+        replies: Replies = await ask(client, None, question, **options)
         on_replies(replies)
         return replies
 
@@ -582,7 +609,7 @@ def _ask_until(
             # it hears that a task has ended.
             await asyncio.sleep(_AGAIN_S)
 
-    check_client(client)
+    _let_answer(client)
     try:
         return client.sync(repeat_request)
     except BaseException:

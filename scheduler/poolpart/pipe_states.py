@@ -177,6 +177,20 @@ async def open_pipe(
     return True
 
 
+def no_pipes(**_: Any) -> Replies:
+    """Answer a request of a client while the scheduler has no pipes."""
+    return {}
+
+
+def answer_pipes(dask_scheduler: Any = None) -> None:
+    """Answer requests from now on, also without any pipes. Runs on the scheduler.
+
+    Dask would log a traceback for a request that it does not know, besides the client's error.
+    """
+    for question in (CHANGE, PUT, TAKE):
+        handlers_of(dask_scheduler).setdefault(question, no_pipes)
+
+
 def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
     """Delete pipes, as far as they exist. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
@@ -184,7 +198,7 @@ def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
 
 
 class Pipes(SchedulerPlugin):
-    """The pipes of a scheduler; exists, and answers requests, as long as there are any pipes."""
+    """The pipes of a scheduler; exists as long as there are any pipes."""
 
     name = NAME
 
@@ -216,8 +230,8 @@ class Pipes(SchedulerPlugin):
         if not self.states:
             self.scheduler.remove_plugin(NAME)
             self._end_interception()
-            for question in (CHANGE, PUT, TAKE):
-                del handlers_of(self.scheduler)[question]
+            # Clients that have used pipes may ask again.
+            handlers_of(self.scheduler).update(dict.fromkeys((CHANGE, PUT, TAKE), no_pipes))
 
     def _check(self, name: str, value: Any) -> None:
         """Check a value to which a client sets a Variable."""

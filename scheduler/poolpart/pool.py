@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any, Self
 
@@ -12,9 +12,8 @@ from distributed import Client
 
 from .adapting import adaptive_names
 from .dashboard_page import leave_page, partitions_page
-from .division import ask, declare, dissolve
+from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
-from .membership import forget_memberships
 from .notebook import table_of_partitions
 from .partition import Partition
 from .pipe_states import names_of_pipes
@@ -176,8 +175,7 @@ class Pool:
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             if self._partition_names:  # by now `dissolve` may have undone them
-                ask(self.client, dissolve, names=self._partition_names, timeout_s=30.0)
-                forget_memberships()
+                ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
@@ -275,6 +273,12 @@ class Pool:
         )
         selectors: list[Rule] = [rule(n, **common) for n, rule in numbers if n is not None]
         if workers is not None:
+            if isinstance(workers, str) or not isinstance(workers, Iterable):
+                raise PoolError(
+                    f"The workers of partition {name!r} are {workers!r}: give a list of names or "
+                    f"addresses, such as [{str(workers)!r}], or a number by n_workers."
+                )
+            workers = list(workers)
             selectors.append(named(*workers, **common))
         if len(selectors) != 1:
             raise PoolError(
@@ -337,9 +341,8 @@ class Pool:
         PoolError
             If their tasks have not ended; then everything stays.
         """
-        names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
+        names = ask_to_dissolve(self.client, None, timeout_s)
         self._partition_names.clear()
-        forget_memberships()
         return names
 
     def _divide(
@@ -349,6 +352,11 @@ class Pool:
 
         Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
         """
+        if not isinstance(rules, Mapping):
+            raise PoolError(
+                f"The rules are {rules!r}: give them by partition, such as "
+                '{"IO": n_workers(2), "OTHER": rest()}.'
+            )
         for name, rule in rules.items():
             check_name(name)
             if not isinstance(rule, Rule):
@@ -361,14 +369,14 @@ class Pool:
             declare,
             rules=dict(rules),
             initial_rules=dict(initial_rules),
-            pool={worker.name: worker.gpus for worker in self.workers},
+            pool={worker.name: worker for worker in self.workers},
             known_partitions=set(self.partitions()),
+            own_partitions=set(self._partition_names),
         )
         parts = {name: Partition(name, self.client, note, True) for name, note in notes.items()}
         for part in parts.values():
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
-        forget_memberships()
         self._partition_names += parts
         remainder = Pool(self.client, remaining_workers)
         remainder._partition_names = self._partition_names

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral
-from typing import Any
+from typing import Any, NamedTuple
 
 from .errors import PoolError
 from .workers import WorkerInfo
@@ -134,6 +134,11 @@ class Named(Rule):
         """Choose the named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
+    def missing(self, members: Sequence[WorkerInfo]) -> list[str]:
+        """Return the names that none of the members has."""
+        present = {name for worker in members for name in (worker.name, worker.address)}
+        return [name for name in self.names if name not in present]
+
 
 @dataclass(frozen=True)
 class rest(Rule):  # noqa: N801
@@ -146,8 +151,21 @@ class rest(Rule):  # noqa: N801
         return list(free)
 
 
-def named(*names: str, **common: Any) -> Named:
-    """Return a rule that takes the workers of these names or addresses, also if they join later."""
+def named(*names: str | int, **common: Any) -> Named:
+    """Return a rule that takes the workers of these names or addresses, also if they join later.
+
+    Raises
+    ------
+    PoolError
+        If there are no names, or a name is a list or the like.
+    """
+    wrong = [name for name in names if isinstance(name, bool) or not isinstance(name, str | int)]
+    if wrong or not names:
+        value = repr(wrong[0]) if wrong else "nothing"
+        raise PoolError(
+            f"The rule named() got {value}; give names or addresses of workers, each as an "
+            'argument, such as named("0", "1").'
+        )
     return Named(tuple(map(str, names)), **common)
 
 
@@ -170,10 +188,48 @@ def divide(
     Raises
     ------
     PoolError
-        If a partition would have fewer workers than its minimum.
+        If a partition would have fewer workers than its minimum, or two rules take the rest.
     """
+    takers_of_rest = [name for name, rule in rules.items() if isinstance(rule, rest)]
+    if len(takers_of_rest) > 1:
+        first, second, *_ = takers_of_rest
+        raise PoolError(
+            f"Partitions {first!r} and {second!r} both have the rule rest(), and {first!r} takes "
+            f"all workers: give {second!r} another rule, such as n_workers(2), before {first!r}."
+        )
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
+    for name, (rule, free, workers) in _choices(rules, pool).items():
+        chosen[name] = workers
+        if len(workers) < rule.minimum:
+            advice = _advice(rule, free, pool)
+            raise PoolError(
+                f"Partition {name!r} would have {len(workers)} of the {rule.minimum} workers "
+                f"that it needs: {advice}"
+            )
+        if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
+            notes[name] = NO_GPU
+        if isinstance(rule, n_workers) and len(workers) < rule.workers:
+            notes[name] = (
+                f"has {len(workers)} of the {rule.workers} workers that it asks for; later "
+                "workers join it"
+            )
+        if isinstance(rule, Named) and (missing := rule.missing(workers)):
+            notes[name] = f"lacks {', '.join(map(repr, missing))}, for which its rule asks"
+    return chosen, notes
+
+
+class _Choice(NamedTuple):
+    """What a rule chooses."""
+
+    rule: Rule
+    free: list[WorkerInfo]  # workers that the rule may take
+    workers: list[WorkerInfo]  # those that it takes
+
+
+def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str, _Choice]:
+    """Return the choice of each rule, by partition, even of fewer workers than its minimum."""
+    choices: dict[str, _Choice] = {}
     chosen_addresses: set[str] = set()  # not names, which may repeat
     named_by_rules = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
@@ -182,31 +238,49 @@ def divide(
         if not isinstance(rule, Named):
             free = [w for w in free if not named_by_rules & {w.name, w.address}]
         free = [*declaring, *free]
-        chosen[name] = rule.choose(free)
-        chosen_addresses |= {worker.address for worker in chosen[name]}
-        if len(chosen[name]) < rule.minimum:
-            advice = _advice(rule, free, pool)
-            raise PoolError(
-                f"Partition {name!r} would have {len(chosen[name])} of the {rule.minimum} workers "
-                f"that it needs: {advice} Workers that declare another resource are not taken."
-            )
-        if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
-            notes[name] = NO_GPU
-        if isinstance(rule, n_workers) and len(chosen[name]) < rule.workers:
-            notes[name] = (
-                f"has {len(chosen[name])} of the {rule.workers} workers that it asks for; later "
-                "workers join it"
-            )
-    return chosen, notes
+        choices[name] = _Choice(rule, free, rule.choose(free))
+        chosen_addresses |= {worker.address for worker in choices[name].workers}
+    return choices
+
+
+def shortfalls(
+    rules: Mapping[str, Rule], pool: Sequence[WorkerInfo], pool_as_seen: Sequence[WorkerInfo]
+) -> dict[str, str]:
+    """Return a note for each partition that gets fewer workers than the client could expect.
+
+    Parameters
+    ----------
+    rules
+        Rules by which the workers are chosen, by partition.
+    pool, pool_as_seen
+        The workers with the resources that they declare now, and with those that the client saw.
+    """
+    now = _choices(rules, pool)
+    expected = _choices(rules, pool_as_seen)
+    return {
+        name: f"has {len(now[name].workers)} of the {len(choice.workers)} workers that its rule "
+        "would have taken when this pool was made: other partitions have taken workers since"
+        for name, choice in expected.items()
+        if len(now[name].workers) < len(choice.workers)
+    }
 
 
 def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) -> str:
     """Return advice about a rule that has too few workers."""
+    elsewhere = [worker for worker in pool if worker.partitions and worker not in free]
+    advice = ""
+    if elsewhere:
+        resources = sorted({resource for worker in elsewhere for resource in worker.partitions})
+        advice = (
+            f" {len(elsewhere)} declare the resource{'s' if len(resources) > 1 else ''} "
+            f"{', '.join(resources[:9])} already, and a worker belongs to one partition."
+        )
     if not isinstance(rule, Named):
-        return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first."
+        return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first.{advice}"
     present = ", ".join(repr(worker.name) for worker in pool[:9])
     ending = ", …." if len(pool) > 9 else "."
-    return f"it asks for {', '.join(map(repr, rule.names))}, and there are {present}{ending}"
+    names = ", ".join(map(repr, rule.names))
+    return f"it asks for {names}, and there are {present}{ending}{advice}"
 
 
 def partition_for(
@@ -237,6 +311,6 @@ def check_name(partition: object) -> None:
 
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
-    """Raise a PoolError unless a count is a whole number of at least `least`."""
+    """Raise a PoolError unless a count is a whole number of at least `minimum`."""
     if not isinstance(count, Integral) or count < minimum:
         raise PoolError(f"{name} is {count!r}; give a whole number, {minimum} or more.")

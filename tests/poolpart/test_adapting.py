@@ -169,6 +169,19 @@ def test_a_job_in_the_queue_is_cancelled_when_its_work_is_gone(queue, wait_until
         wait_until(lambda: not client.cluster.worker_spec)
 
 
+@pytest.mark.parametrize("kind", [{"adapt": [0, 1]}, {}])
+def test_a_map_waits_for_workers_that_are_queued_or_can_be(queue, wait_until, kind):
+    queue.held = True
+    with cluster_of({"GPU": kind}) as client:
+        gpu = Partition("GPU", client)
+        scheduler = client.cluster.scheduler
+        wait_until(lambda: poolpart.adapting.expects_workers(scheduler, "GPU"))
+        results = gpu.map(twice, [1, 2], empty_s=0.0)
+        wait_until(lambda: queue.waiting)
+        client.sync(queue.release)
+        assert list(results) == [2, 4]
+
+
 def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_until):
     queue.held = True
     with cluster_of({"GPU": adaptive(0, 1)}) as client:

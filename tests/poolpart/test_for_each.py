@@ -6,9 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Client, Event, Queue
-from tests.poolpart.helpers import LONG_S, wait_for, worker_name
+from tests.poolpart.helpers import LONG_S, join, leave, wait_for, worker_name
 
-from poolpart import Pipe, PipeClosed, PipeFailed
+from poolpart import Partition, Pipe, PipeClosed, PipeFailed, PoolError
+from poolpart.membership import prospects
 
 
 @pytest.fixture
@@ -39,6 +40,39 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     pipe.close()
     assert a.for_each(pipe, abs) == 0
     assert repr(a) == "<Partition 'A'>"
+
+
+def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
+    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.05)
+    client = start({"a": {"resources": {"A": 1}}, "b": {}})
+    leave(client, "a")
+    pipe = Pipe("of-nobody", 3, client).create()
+    pipe.put(-1)
+    message = "Partition 'A' has no workers: for_each on it has waited for 0.2 s"
+    with pytest.raises(PoolError, match=message):
+        Partition("A", client).for_each(pipe, abs, empty_s=0.2)
+    with pytest.raises(PipeFailed, match=message):
+        pipe.put(-2)
+
+
+def test_of_a_partition_that_is_empty_for_a_while(start, monkeypatch, pool, wait_until):
+    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.0)
+    looks = []
+
+    def look(*args):
+        looks.append(args)
+        return prospects(*args)
+
+    monkeypatch.setattr("poolpart.for_each.prospects", look)
+    client = start({"b": {}})
+    pipe = Pipe("of-nobody", 3, client).create()
+    # Nothing waits for a worker before the first item.
+    count = pool.submit(Partition("A", client).for_each, pipe, abs, empty_s=0.0)
+    wait_until(lambda: len(looks) > 3)
+    join(client, "a", resources={"A": 1})
+    pipe.put_many([-1, -2])
+    pipe.close()
+    assert count.result(LONG_S) == 2
 
 
 def test_producers_wait_when_tasks_are_slow(client, b, make_pipe, pool, wait_until):

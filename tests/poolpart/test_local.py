@@ -166,7 +166,8 @@ def test_processes_of_the_user_are_started_as_ever(processes, monkeypatch):
         assert data["name"] == name and data.keys() & {"init_main_from_name", "init_main_from_path"}
 
 
-def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_worker_that_is_slow_to_come_back_is_not_given_up(restart):
     """Dask's SpecCluster closes the nanny of a worker that is not back after this time."""
     with (
         dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}),
@@ -176,7 +177,10 @@ def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
         partition = Pool.from_client(client).partitions()["A"]
         address = partition.workers[0].address
         pid = client.run(os.getpid, workers=[address])[address]
-        os.kill(pid, signal.SIGKILL)
+        if restart:
+            client.restart()
+        else:
+            os.kill(pid, signal.SIGKILL)
         assert partition.submit(os.getpid).result(timeout=120) != pid
         assert "A-0" in cluster.workers
 

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 import os
 import signal
 import threading
@@ -12,9 +13,9 @@ from types import SimpleNamespace
 
 import pytest
 from distributed import CancelledError, Client, Event, as_completed, get_worker
-from tests.poolpart.helpers import twice, wait_for
+from tests.poolpart.helpers import LONG_S, join, kill, leave, twice, wait_for
 
-from poolpart import Partition, Pool, PoolError, rest
+from poolpart import Partition, Pool, PoolError, n_workers, named, rest
 
 
 def add(x, y):
@@ -256,6 +257,12 @@ def test_stopping_lets_go_of_tasks_that_have_not_started(b, client, gate, stop, 
     wait_until(lambda: task_count(client) == 0)
 
 
+@pytest.mark.parametrize("value", [-1, None, True, "5 min", float("nan")])
+def test_a_longest_wait_that_cannot_be(a, value):
+    with pytest.raises(ValueError, match=f"empty_s is {value!r}; give seconds, such as 300"):
+        a.map(twice, [1], empty_s=value)
+
+
 @pytest.mark.parametrize(("option", "least"), [("window", 1), ("chunk", 1), ("retries", 0)])
 @pytest.mark.parametrize("value", [-1, 1.5])
 def test_options_are_checked_at_once(a, option, least, value):
@@ -305,11 +312,57 @@ def test_a_restart_of_the_cluster_ends_it(own_nannies):
     assert not hasattr(caught.value, "__notes__")  # no item has killed a worker
 
 
-def test_a_partition_without_workers_is_told_of(client, caplog):
+@pytest.mark.parametrize(
+    ("empty_s", "limit"),
+    [(math.inf, ""), (1.5, ", for 1.5 s at most"), (300.0, ", for 300 s at most")],
+)
+def test_a_partition_without_workers_is_told_of(client, caplog, empty_s, limit):
     with caplog.at_level(logging.WARNING, "poolpart"):
-        results = Partition("nobody", client).map(twice, range(10))
-    assert "Partition 'nobody' has no workers: a map on it waits." in caplog.text
+        results = Partition("nobody", client).map(twice, range(10), empty_s=empty_s)
+    assert f"Partition 'nobody' has no workers: a map on it waits{limit}." in caplog.text
     results.close()
+
+
+WAITED = (
+    r"Partition '{}' has no workers: a map on it has waited for {:g} s, and no worker is "
+    r'starting\. Start workers with --resources "{}=1", move some by Partition\.grow, or give a '
+    r"longer empty_s\."
+)
+
+
+@pytest.mark.parametrize("by_rule", [False, True])
+def test_a_map_whose_only_worker_left_for_good_ends(start, monkeypatch, by_rule):
+    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    client = start({"a": {} if by_rule else {"resources": {"A": 1}}, "b": {"resources": {"B": 1}}})
+    if by_rule:
+        Pool.from_client(client).divide({"A": named("a")})
+    results = Partition("A", client).map(twice, itertools.count(), chunk=1, empty_s=0.2)
+    assert next(results) == 0
+    leave(client, "a")
+    with pytest.raises(PoolError, match=WAITED.format("A", 0.2, "A")):
+        list(results)
+    assert next(results, "ended") == "ended"
+    # The stage without workers counts.
+    inner = Partition("A", client).map(twice, [1], empty_s=0.1)
+    with pytest.raises(PoolError, match=WAITED.format("A", 0.1, "A")):
+        list(Partition("B", client).map(twice, inner))
+
+
+def test_a_map_waits_again_as_long_after_a_worker_has_come(start, monkeypatch, wait_until):
+    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    client = start({"b": {}})
+    results = Partition("A", client).map(twice, [1, 2], chunk=1, empty_s=LONG_S)
+    join(client, "a", resources={"A": 1})
+    assert list(results) == [2, 4]
+
+
+def test_a_map_waits_while_the_nanny_starts_the_only_worker(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    part = Pool.from_client(nannies).divide({"A": n_workers(1)})["A"]
+    results = part.map(slowly, range(9), chunk=1, window=2, empty_s=0.0)
+    assert next(results) == 0
+    kill(nannies, part.workers[0].name)
+    assert list(results) == [*range(1, 9)]
 
 
 # -- maps of maps ----------------------------------------------------------------------

@@ -1,10 +1,12 @@
 """What is submitted where it cannot run is an error; what only has to wait, waits."""
 
+import asyncio
 import pickle
+import threading
 
 import dask
 import pytest
-from distributed import Client
+from distributed import Client, get_client
 from tests.poolpart.helpers import LONG_S, addresses, join, kill, leave, twice, worker_name
 
 from poolpart import Partition, Pool, PoolError, n_workers, named, rest
@@ -43,27 +45,44 @@ def test_a_partition_that_was_dissolved(start):
 
 
 def test_by_another_client(start, monkeypatch):
-    monkeypatch.setattr("poolpart.membership.KEEP_S", 0.0)
+    """A client that submits without a request gets the error from its tasks."""
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
     assert part.submit(worker_name).result(LONG_S) == "a"
+    # Clients of this process would know, and those of another process do not.
+    monkeypatch.setattr("poolpart.division.forget_registrations", lambda: None)
     with Client(client.cluster) as other:
         Pool(other, []).dissolve()
-    with pytest.raises(PoolError, match="was dissolved"):
-        part.submit(worker_name)
+    dissolved = "Partition 'A' was dissolved: divide the pool"
+    with pytest.raises(PoolError, match=dissolved):
+        part.submit(worker_name).result(LONG_S)
+    with part, pytest.raises(PoolError, match=dissolved):
+        dask.delayed(worker_name)().compute()
+    with pytest.raises(PoolError, match=dissolved):
+        part.compute(dask.delayed(twice)(dask.delayed(worker_name)()), sync=True)
+    # What asks for the resource without poolpart is left alone.
+    with Client(client.cluster) as stranger:
+        future = stranger.submit(worker_name, resources={"A": 1})
+        join(client, "b", resources={"A": 1})
+        assert future.result(LONG_S) == "b"
+    assert part.submit(worker_name).result(LONG_S) == "b"
 
 
 def test_more_slots_than_any_worker_has(start):
     client = start({"a": {"nthreads": 2}, "b": {"nthreads": 3}, "c": {"resources": {"C": 1}}})
     part, _ = Pool.from_client(client).partition("A", workers=["a", "b"])
     message = "A task asks for 4 slots of one worker, and workers of partition 'A' have 3 at most"
-    for submit in (part.submit, lambda f, slots: part.map(f, [1], slots=slots)):
+    for submit in (
+        part.submit,  # asks at first
+        lambda f, slots: part.submit(f, slots=3) and part.submit(f, slots=slots).result(LONG_S),
+        lambda f, slots: part.map(f, [1], slots=slots),
+    ):
         with pytest.raises(PoolError, match=f"{message}.* by slots=4 in its rule"):
             submit(worker_name, slots=4)
     with pytest.raises(PoolError, match=r'have 1 at most: ask for fewer.*--resources "C=2"'):
         Partition("C", client).compute(dask.delayed(1), slots=2)
     assert part.submit(worker_name, slots=3).result(LONG_S) == "b"
-    join(client, "d", nthreads=1, resources={"A": 5})  # what was known is not long believed
+    join(client, "d", nthreads=1, resources={"A": 5})
     assert part.submit(worker_name, slots=5).result(LONG_S) == "d"
 
 
@@ -94,7 +113,7 @@ def test_workers_by_name_address_or_both(start):
         assert {part.submit(worker_name, workers=workers).result(LONG_S) for _ in range(8)} <= names
     for stranger in ("stranger", "nobody", there["stranger"]):
         with pytest.raises(PoolError, match=r"does not belong to partition 'A': .* \(a, b, c\)"):
-            part.submit(worker_name, workers=["a", stranger])
+            part.submit(worker_name, workers=["a", stranger]).result(LONG_S)
     join(client, "d", resources={"A": 1})
     assert part.submit(worker_name, workers="d").result(LONG_S) == "d"
 
@@ -110,21 +129,62 @@ def test_an_address_that_has_just_left_is_no_error(start, wait_until):
     assert future.status == "pending"
 
 
-def test_many_tasks_take_few_requests(start, monkeypatch):
+def test_many_tasks_take_one_request(start, monkeypatch):
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
     [address] = [worker.address for worker in part.workers]
-    asked = []
+    requests = []
     ask = Client.run_on_scheduler
 
     def count(*args, **kwargs):
-        asked.append(args)
+        requests.append(args)
         return ask(*args, **kwargs)
 
     monkeypatch.setattr(Client, "run_on_scheduler", count)
-    monkeypatch.setattr("poolpart.membership.KEEP_S", LONG_S)
-    client.gather([part.submit(worker_name, workers=address) for _ in range(50)])
-    assert len(asked) == 1
+    names = ["a", address, None]
+    tasks = [part.submit(worker_name, workers=name) for name in names for _ in range(9)]
+    assert client.gather(tasks) == ["a"] * 27
+    assert len(requests) == 1
+
+
+def test_submitting_does_not_wait_for_a_scheduler_that_is_busy(start, monkeypatch):
+    """The scheduler answers once the tasks have been submitted."""
+    client = start({"a": {}})
+    part = Pool.from_client(client).divide({"A": rest()})["A"]
+    assert part.submit(worker_name).result(LONG_S) == "a"
+    submitted = threading.Event()
+    handlers = client.cluster.scheduler.handlers
+    answer = handlers["run_function"]
+
+    async def answer_late(comm, *args, **kwargs):
+        while not submitted.is_set():
+            await asyncio.sleep(0.001)
+        reply = answer(comm, *args, **kwargs)
+        return await reply if asyncio.iscoroutine(reply) else reply
+
+    monkeypatch.setitem(handlers, "run_function", answer_late)
+    futures = [part.submit(worker_name, workers="a") for _ in range(3)]
+    submitted.set()
+    assert client.gather(futures) == ["a"] * 3
+
+
+def test_a_client_that_connects_again_registers_again(start, wait_until, monkeypatch):
+    """The scheduler forgets a client whose connection breaks."""
+    client = start({"a": {"resources": {"A": 1}}})
+    part = Partition("A", client)
+    assert part.submit(nested).result(LONG_S) == ["a"] * 9
+    connection = client.scheduler_comm
+    client.loop.add_callback(connection.comm.abort)
+    wait_until(lambda: client.scheduler_comm not in (None, connection))
+    assert part.submit(nested).result(LONG_S) == ["a"] * 9
+    with pytest.raises(PoolError, match="have 1 at most"):
+        part.submit(worker_name, slots=2).result(LONG_S)
+
+
+def nested():
+    """Names of the workers of tasks that this task submits."""
+    client = get_client()
+    return client.gather([client.submit(worker_name, n, pure=False) for n in range(9)])
 
 
 async def submit_in_the_loop(part):

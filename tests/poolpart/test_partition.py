@@ -160,3 +160,22 @@ def test_data_is_put_on_its_workers(a, client):
     assert set(client.who_has(a.scatter(3, broadcast=True)).popitem()[1]) == address
     with pytest.raises(PoolError, match="Partition 'C' has no workers to keep data"):
         Partition("C", client).scatter(1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda a: a.submit(abs, 1, resources={"A": 2}), "submit sets resources itself: slots=2"),
+        (lambda a: a.submit(abs, 1, pure=True), "submit sets pure itself: each call runs by"),
+        (lambda a: a.for_each(None, abs, resources={}), "for_each sets resources itself: slots=2"),
+        (lambda a: a.compute([], resources={"A": 2}), "compute sets resources itself: slots=2"),
+        (lambda a: a.scatter([1], workers=["x"]), "scatter sets workers itself: the data"),
+        (lambda a: a.submit(abs, 1, workers=1.5), "workers of a task are 1.5: give the name"),
+        (lambda a: a.submit(3), "partition 'A' needs a function, not 3"),
+        (lambda a: a.map(3, [1]), "partition 'A' needs a function, not 3"),
+        (lambda a: a.for_each(None, 3), "partition 'A' needs a function, not 3"),
+    ],
+)
+def test_what_cannot_be_given(a, call, message):
+    with pytest.raises(PoolError, match=message):
+        call(a)

@@ -1,6 +1,7 @@
 """Pipes between threads of one process: order, bound, end, failure, deletion."""
 
 import itertools
+import logging
 import signal
 import threading
 import time
@@ -17,7 +18,7 @@ from tests.poolpart.helpers import LONG_S
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart import pipe as pipe_module
 from poolpart.pipe import take_news
-from poolpart.pipe_states import PipeState, pipes_of
+from poolpart.pipe_states import PipeState, no_pipes, pipes_of
 
 
 def other_end(pipe):
@@ -28,7 +29,8 @@ def other_end(pipe):
 def known(client):
     """What the scheduler knows of pipes, and can be asked."""
     scheduler = client.cluster.scheduler
-    return set(pipes_of(scheduler)), set(scheduler.plugins), set(scheduler.handlers)
+    handlers = {name for name, answer in scheduler.handlers.items() if answer is not no_pipes}
+    return set(pipes_of(scheduler)), set(scheduler.plugins), handlers
 
 
 def consume(pipe):
@@ -200,7 +202,7 @@ USES = {
 
 @pytest.mark.parametrize("others", [True, False])
 def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe, others):
-    """Without others, the scheduler does not know the requests either, as after a restart."""
+    """Without others, the scheduler answers requests of pipes no more."""
     if others:
         make_pipe(client)
     before = known(client)
@@ -213,6 +215,27 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
             with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
                 use(end)
     assert known(client) == before
+
+
+def use_in_task(name, use):
+    with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+        USES[use](Pipe(name))
+
+
+def test_a_pipe_that_was_never_created_is_an_error_of_its_user_only(start, caplog):
+    """Not of the scheduler, whose log had a traceback for each request."""
+    client = start({"a": {}})
+    caplog.set_level(logging.WARNING)  # a cluster that is started silences it
+    for use in USES.values():
+        with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+            use(Pipe("never-created", client=client))
+    assert take_news(client, 0.0, ["never-created"]) == {}
+    with Client(client.cluster) as other:
+        other.gather([other.submit(use_in_task, "never-created", use) for use in USES])
+    with Pipe("made", client=client) as pipe:
+        pipe.put(1)
+    client.submit(use_in_task, "made", "iterate").result(LONG_S)
+    assert not caplog.records
 
 
 def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):

@@ -61,6 +61,43 @@ def test_workers_by_name_and_by_address(start):
     assert rest.names == ["a"]
 
 
+@pytest.mark.parametrize(("workers", "shown"), [(3, "'3'"), ("a", "'a'")])
+def test_workers_that_are_no_list(start, workers, shown):
+    message = rf"workers of partition 'P' are {workers!r}: give a list .*, such as \[{shown}\]"
+    with pytest.raises(PoolError, match=message):
+        Pool.from_client(start(PLAIN)).partition("P", workers=workers)
+
+
+def test_rules_without_names_of_partitions(start):
+    with pytest.raises(PoolError, match=r"The rules are .*: give them by partition"):
+        Pool.from_client(start(PLAIN)).divide([rest()])
+
+
+def test_rules_for_a_partition_that_workers_were_started_with(start):
+    client = start({"a": {"resources": {"CPU": 1}}, "b": {"resources": {"CPU": 1}}, "c": {}})
+    pool = Pool.from_client(client)
+    message = (
+        r"Workers were started with the resource 'CPU', and the rule does not take all of them "
+        r"\([ab] would be left\): use Pool.partitions\(\)\['CPU'\] as it is, or give a rule"
+    )
+    with pytest.raises(PoolError, match=message):
+        pool.divide({"CPU": n_workers(1), "OTHER": rest()})
+    message = "0 of 3 are left for it. Start more, or list it first. 2 declare the resource CPU"
+    with pytest.raises(PoolError, match=message):
+        pool.divide({"ALL": n_workers(1), "OTHER": n_workers(1)})
+    parts = pool.divide({"CPU": n_workers(2), "OTHER": rest()})
+    assert [[w.name for w in part.workers] for part in parts.values()] == [["a", "b"], ["c"]]
+
+
+def test_rules_for_workers_that_were_started_with_two_resources(start):
+    pool = Pool.from_client(start({"a": {"resources": {"CPU": 1, "MEM": 5}}}))
+    with pytest.raises(PoolError, match="1 declare the resources CPU, MEM already"):
+        pool.divide({"CPU": n_workers(1)})
+    message = r'resources CPU, MEM, and a worker belongs to one .*--resources "CPU=1" alone'
+    with pytest.raises(PoolError, match=message):
+        pool.divide({"CPU": rest()})
+
+
 def test_workers_that_local_cluster_numbers():
     with (
         LocalCluster(
@@ -98,7 +135,7 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     _, rest = pool.partition("Q", n_workers=1)
     assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
     assert len(rest) == 2  # P's, which this pool still counts as its own
-    with pytest.raises(PoolError, match="another resource are not taken"):
+    with pytest.raises(PoolError, match="3 declare the resources P, Q already"):
         pool.partition("R", workers=rest.names)
 
 

@@ -55,6 +55,26 @@ def test_fewer_than_the_minimum():
         divide({"P": rest(minimum=3)}, pool)
 
 
+def test_two_rules_for_the_rest():
+    with pytest.raises(PoolError, match=r"'P' and 'Q' both have the rule rest\(\).*before 'P'"):
+        divide({"P": rest(), "Q": rest()}, [worker("a")])
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [((), "got nothing"), ((["a", "b"],), r"got \['a', 'b'\]"), ((True,), "got True")],
+)
+def test_what_names_no_workers(names, message):
+    with pytest.raises(PoolError, match=f"{message}; give names or addresses of workers, each as"):
+        named(*names)
+
+
+def test_workers_that_a_rule_names_and_that_are_not_there():
+    rules = {"P": named("a", "tcp://b", 3)}
+    _, notes = divide(rules, [worker("a"), worker("b")])
+    assert notes == {"P": "lacks '3', for which its rule asks"}
+
+
 @pytest.mark.parametrize("number", [{"workers": 1.5}, {"workers": 1, "slots": 0}])
 def test_a_number_that_cannot_be_is_refused_by_name(number):
     with pytest.raises(

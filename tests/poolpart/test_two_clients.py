@@ -1,13 +1,15 @@
 """Two clients that divide, move and undo at the same moment: one does, the other is told."""
 
+import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 from distributed import Client
 from tests.poolpart.helpers import LONG_S, declared
 
-from poolpart import Partition, Pool, PoolError, pool
+from poolpart import Partition, Pool, PoolError, n_workers, named, per_host, pool, rest
 
 
 @pytest.fixture
@@ -42,6 +44,41 @@ def both(monkeypatch):
         return outcomes
 
     return call
+
+
+@pytest.mark.parametrize(
+    ("rule", "note"),
+    [
+        (n_workers(3), "has 1 of the 3 workers that it asks for"),
+        (rest(), "has 1 of the 4 workers that its rule would have taken when this pool was made"),
+        (per_host(3), "has 1 of the 3 workers that its rule would have taken when this pool"),
+        (named("a", "b", "d"), "lacks 'a', 'b', for which its rule asks"),
+    ],
+)
+def test_the_second_of_two_is_told_what_it_lacks(two, caplog, rule, note):
+    first, second = map(Pool.from_client, two)
+    first.divide({"P": named("a", "b", "c")})
+    with caplog.at_level(logging.WARNING, "poolpart"):
+        part = second.divide({"Q": rule})["Q"]
+    assert len(part) == 1
+    assert note in part.note
+    assert f"Partition 'Q': {note}" in caplog.text
+    with pytest.raises(PoolError, match="'Q' would have 1 of the 2 workers that it needs"):
+        second.divide({"Q": replace(rule, minimum=2)})
+
+
+def test_a_pool_that_has_made_a_partition_does_not_miss_its_workers(two):
+    pool = Pool.from_client(two[0])
+    pool.divide({"P": n_workers(3)})
+    assert pool.divide({"Q": rest()})["Q"].note == ""
+
+
+def test_a_second_rest_is_told_who_gets_later_workers(two):
+    first, second = map(Pool.from_client, two)
+    first.divide({"P": named("a"), "Q": rest()})
+    note = "workers that join later go to partition 'Q', which has the rest already"
+    assert second.divide({"R": rest()})["R"].note.endswith(note)
+    assert first.divide({"Q": rest()})["Q"].note == ""
 
 
 def told(outcomes):

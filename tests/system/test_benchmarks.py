@@ -5,7 +5,7 @@ import re
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import control, decoders, effects, formats, gpu, model, scale
+from benchmarks import control, decoders, effects, formats, gpu, model, scale, submitting
 from distributed import Client
 from docs.pictures import adapting as adapting_picture
 from docs.pictures.effects import __main__ as pictures
@@ -44,6 +44,16 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     assert rate == pytest.approx(200, rel=0.05) and by == "casting" and shards == 1
     assert picture.stat().st_size > 10_000
     assert "by the model" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["declared", "divided"])
+def test_submitting(tmp_path, capsys, kind):
+    path = tmp_path / "figures.json"
+    options = ["--tasks", "40", "--pairs", "1", "--delay", "0.01", "--kind", kind]
+    figures = submitting.main([*options, "--json", str(path)])
+    assert json.loads(path.read_text()) == figures
+    assert figures["Partition.submit sending"] > 0
+    assert "ratio: " in capsys.readouterr().out
 
 
 def test_adapting(tmp_path, capsys):

@@ -26,7 +26,8 @@ class _Method:
     """Replacement of a method: the original, with rules before, after and in place of a call.
 
     A rule that raises is skipped, and the log says so once: other users of the cluster get what
-    Dask does without it. An error of the method itself reaches its caller unchanged.
+    Dask does without it. An error of the method itself reaches its caller unchanged, and so does a
+    PoolError of a rule before the call: the rule refuses the call.
     """
 
     def __init__(self, original: Callable[..., Any]) -> None:
@@ -41,6 +42,8 @@ class _Method:
         for rule_before in self.rules_before:
             try:
                 kwargs = rule_before(kwargs)
+            except PoolError:
+                raise
             except Exception:
                 self._log_failure(rule_before)
         for rule_instead in self.rules_instead:
@@ -153,6 +156,19 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
         "_create_taskstate_from_graph",
         add_annotations,
         *("submitting_task", "annotations_by_type", "global_annotations", "dsk"),
+    )
+
+
+def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> None:
+    """Call `check` with the arguments of each graph that arrives; its PoolError refuses the graph.
+
+    The client then gets the error from each of the graph's futures.
+    """
+    rules.call_before(
+        scheduler,
+        "_create_taskstate_from_graph",
+        check,
+        *("client", "annotations_by_type", "global_annotations"),
     )
 
 

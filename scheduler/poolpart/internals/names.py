@@ -23,6 +23,7 @@ from .queues import PRIVATE_NAMES as PIPE_NAMES
 TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed; see `make compat`
 
 NESTED = "keeping nested tasks in their partition"
+REFUSING = "refusing tasks that could never run"
 FENCES = "exclusive partitions"
 DIVIDING = "dividing a pool"
 CHOOSING = "choosing workers in constant time"
@@ -98,6 +99,20 @@ PRIVATE_NAMES = (
             "test_lending.py::test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time",
             "test_lending.py::test_a_tree_of_waiting_tasks_on_two_slots_ends",
             "test_lending.py::test_a_worker_without_this_package_ignores_the_plugin",
+        ),
+    ),
+    PrivateNames(
+        REFUSING,
+        (
+            f"{_SCHEDULER}._create_taskstate_from_graph"
+            "(client, annotations_by_type, global_annotations)",
+            f"{_SCHEDULER}.resources",
+        ),
+        "an error in place of a task that waits for ever, without a request for each task",
+        (
+            "test_membership.py::test_by_another_client",
+            "test_membership.py::test_more_slots_than_any_worker_has",
+            "test_membership.py::test_workers_by_name_address_or_both",
         ),
     ),
     PrivateNames(

@@ -22,6 +22,11 @@ def workers_declaring(scheduler: Any, name: str) -> list[Any]:
     return [scheduler.workers[address] for address in scheduler.resources.get(name, ())]
 
 
+def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
+    """Return whether a worker declares so many slots of a resource; usually the first does."""
+    return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
+
+
 def number_declaring(scheduler: Any, name: str) -> int:
     """Return the number of workers that declare a resource."""
     return len(scheduler.resources.get(name, ()))

@@ -1,0 +1,65 @@
+"""How long tasks wait for a partition that has lost all its workers."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+
+from .errors import PoolError
+from .membership import Prospects
+
+logger = logging.getLogger(__name__)
+
+WAIT_S = 300.0  # a machine may be restarted, or replaced, in this time
+
+
+class WorkerWait:
+    """Wait of a map, or the like, for the workers of a partition.
+
+    Parameters
+    ----------
+    partition
+        Name of the partition.
+    waiting
+        What waits, for messages, such as "a map".
+    seconds
+        Longest wait while no worker is there, and none is expected; `math.inf` for ever.
+    """
+
+    def __init__(self, partition: str, waiting: str, seconds: float) -> None:
+        self._partition = partition
+        self._waiting = waiting
+        self._seconds = seconds
+        self._since: float | None = None  # time.monotonic()
+
+    def check(self, prospects: Prospects) -> None:
+        """Note the present state of the partition; warn at the beginning of a wait.
+
+        Raises
+        ------
+        PoolError
+            If the tasks could never run, or the wait has been too long.
+        """
+        if prospects.objection:
+            raise PoolError(prospects.objection)
+        if prospects.has_workers:
+            self._since = None
+            return
+        sentence = f"Partition {self._partition!r} has no workers: {self._waiting} on it"
+        if self._since is None:
+            self._since = time.monotonic()
+            limit = "" if math.isinf(self._seconds) else f", for {self._seconds:g} s at most"
+            logger.warning("%s waits%s.", sentence, limit)
+        if time.monotonic() - self._since >= self._seconds:
+            raise PoolError(
+                f"{sentence} has waited for {self._seconds:g} s, and no worker is starting. Start "
+                f'workers with --resources "{self._partition}=1", move some by Partition.grow, or '
+                "give a longer empty_s."
+            )
+
+
+def check_wait(seconds: object) -> None:
+    """Raise ValueError unless a value is a number of seconds for `WorkerWait`."""
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
+        raise ValueError(f"empty_s is {seconds!r}; give seconds, such as {WAIT_S:g}.")
