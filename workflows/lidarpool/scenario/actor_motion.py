@@ -67,7 +67,7 @@ from .sections import (
 _READING_OPTIONS = {
     "format", "time_unit", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s",
 }  # fmt: skip
-_ROBOT_FIELDS = {"file", "opacity"}  # fields of a mesh file that apply to robots
+_ROBOT_FIELDS = {"file", "opacity", "assets"}  # fields of a mesh file that apply to robots
 
 
 class MountSection(Section, InstrumentPose):
@@ -347,7 +347,9 @@ class ActorSection(DeformingSection):
         if self.robot and (self.animation or self.wheels):
             raise ValueError("a robot has joints: leave out animation and wheels.")
         if self.robot and self.robot.model_fields_set - _ROBOT_FIELDS:
-            raise ValueError("a robot is in metres and in its own axes: give just its file.")
+            raise ValueError(
+                "a robot is in metres and in its own axes: give just its file, opacity and assets."
+            )
         return self
 
     @property
