@@ -49,7 +49,7 @@ compat:  ## the tests with the oldest and the newest versions allowed, on three 
 
 chaos: dev  ## 200 faults at every point of a survey, and damage of files; SEED=n plays them again
 	$(BIN)/python -m tests.chaos --faults 200 $(if $(SEED),--seed $(SEED))
-	$(BIN)/python -m tests.chaos.damage --count 3 --seconds 30 $(if $(SEED),--seed $(SEED))
+	$(BIN)/python -m tests.chaos.damage --count 3 --seconds 60 $(if $(SEED),--seed $(SEED))
 	$(BIN)/python -m tests.chaos.local_runs --faults 24 $(if $(SEED),--seed $(SEED))
 
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/

@@ -24,6 +24,8 @@ try:
     from numba.core.runtime.nrt import rtsys
     from numba.core.types.misc import unliteral
     from numba.types import ExternalFunction
+
+    from .loop_files import LoopFiles, remove_unfinished, tell_not_kept
 except ImportError:
     njit = None
 
@@ -79,6 +81,7 @@ def _stamp(path: Path) -> tuple[int, ...]:
 _WAIT_S = 60.0  # in all, for processes that compile: a process may have been stopped
 _STEP_S = 0.02
 _held = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
+_locked = [""]  # folder whose lock this process has
 _patience = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vain
 
 
@@ -99,6 +102,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
                 while _patience[0] > 0:
                     try:
                         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        _locked[0] = folder
                         break
                     except BlockingIOError:
                         time.sleep(_STEP_S)
@@ -112,6 +116,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
             _held[0] -= 1
             (gc.enable if collects else gc.disable)()
             if file is not None:
+                _locked[0] = ""
                 with suppress(OSError):
                     fcntl.flock(file, fcntl.LOCK_UN)  # also of a child that was forked meanwhile
                 file.close()
@@ -123,8 +128,10 @@ def _cached(dispatcher: Any, function: Any) -> Any:
         return dispatcher
     dispatcher.enable_caching()
     cache = dispatcher._cache
-    cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename))
+    stamp = _stamp(Path(function.__code__.co_filename))
+    cache._cache_file = LoopFiles(cache._cache_path, cache._impl.filename_base, stamp)
     cache.load_overload = partial(_load_compiled, cache)
+    cache.save_overload = partial(_save_compiled, cache)
     compile_now = dispatcher.compile
     folder = cache._cache_path
 
@@ -137,15 +144,23 @@ def _cached(dispatcher: Any, function: Any) -> Any:
 
 
 def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
-    """Return compiled code from the cache on disk, or None if the cache lacks it.
+    """Return compiled code from the cache on disk, or None without whole files of the code.
 
     `FunctionCache.load_overload` first imports all that numba needs to compile, among it
     `scipy.linalg`: more than the half of what loading all loops takes. numba imports the same when
     it compiles.
     """
     rtsys.initialize(target_context)  # compiled code may allocate memory
-    with cache._guard_against_spurious_io_errors():
-        return cache._load_overload(signature, target_context)
+    return cache._load_overload(signature, target_context)
+
+
+def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
+    """Keep compiled code on disk, if the disk has room and the folder can be written."""
+    remove_unfinished(cache._cache_path, is_locked=_locked[0] == cache._cache_path)
+    try:
+        cache._save_overload(signature, code)
+    except OSError as error:
+        tell_not_kept(cache._cache_path, error)
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:

@@ -1,8 +1,10 @@
 """Damage files of results and runs, and read them: `python -m tests.chaos.damage`.
 
-Each file of a result, a data set, its shards and a stored run gets flipped bits and is cut, one
-damage at a time. All readers of the file must then give what they gave before, or end with an error
-of a line or two; for files with checksums what they give must be the same. A seed repeats it.
+Each file of a result, a data set, its shards and a stored run gets flipped bits, is cut, or grows
+beyond all measure, one damage at a time; and so does each file of `inputs`: recordings (.mcap,
+.pcap), traces of OSI, surveys of HELIOS++ and compiled loops. All readers of the file must then
+give what they gave before, or end with an error of a line or two; for files with checksums what
+they give must be the same. A seed repeats it.
 """
 
 from __future__ import annotations
@@ -19,14 +21,17 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
+from itertools import chain, zip_longest
 from pathlib import Path
 
 import numpy as np
 from distributed import Client
+from tests.chaos.inputs import write_inputs
+from tests.chaos.target import Reader, Target
 from tests.clusters import thread_cluster
 
 import lidarpool
@@ -56,10 +61,16 @@ splits: {train: 0.5, val: 0.5}
 """
 SLOTS = ({"GPU": 1}, {"LIDAR": 5}, {"OTHER": 1})
 CUTS = 0.25  # share of the damages that cut a file
+GROWTHS = 0.25  # share of the damages that make a part of a file large
+# What takes the place of some bytes: numbers and lengths of binary files and of text, and depths.
+LARGE = (
+    *(number.to_bytes(4, "little") for number in (2**31 - 1, 2**32 - 1)),
+    *(number.to_bytes(8, "little") for number in (2**63 - 1, 2**64 - 1)),
+    b"1" * 200_000, b"9" * 5_000, b"1e308", b"[" * 100_000, b"<a>" * 100_000, b"a" * 2_000_000,
+    b"nan", b"-1",
+)  # fmt: skip
 LINES_MOST = 3  # of an error, with its advice
 SLOWEST_S = 60.0  # for a reader
-
-Reader = Callable[[Path], str]  # reads what is in a folder; returns a digest of what it read
 
 
 @dataclass
@@ -171,10 +182,14 @@ RESULT_READERS = {
 
 
 def damaged(data: bytes, chance: random.Random) -> bytes:
-    """Flip a bit of a file's content, or cut it."""
+    """Flip a bit of a file's content, cut it, or make a part of it large."""
     at = chance.randrange(len(data))
-    if chance.random() < CUTS:
+    kind = chance.random()
+    if kind < CUTS:
         return data[:at]
+    if kind < CUTS + GROWTHS:
+        large = chance.choice(LARGE)
+        return data[:at] + large + data[at + min(len(large), 8) :]
     return data[:at] + bytes([data[at] ^ 1 << chance.randrange(8)]) + data[at + 1 :]
 
 
@@ -236,17 +251,8 @@ def attack(
             outcome.faults.append(f"{name} of {file}: {end}\n{words}")
 
 
-@dataclass
-class Target:
-    """A folder, who reads it, and which of its files are damaged."""
-
-    whole: Path
-    readers: dict[str, Reader]
-    chosen: Callable[[Path], bool] = lambda file: True
-
-
 def targets(folder: Path, client: Client) -> list[Target]:
-    """Make a result, a data set, shards of both, and an unfinished run."""
+    """Make a result, a data set, shards of both, a stored run, and inputs."""
     (folder / "base.yaml").write_text(BASE)
     (folder / "c.yaml").write_text(CAMPAIGN)
     wholes = {name: folder / name / "whole" for name in ("result", "set", "shards", "runs", "run")}
@@ -280,8 +286,10 @@ def targets(folder: Path, client: Client) -> list[Target]:
         Target(wholes["runs"], {"merge of runs": merged}),
         Target(wholes["set"], {"sweeps": read_sweeps}, lambda f: is_kept(f) and f.suffix != ".ply"),
         Target(wholes["set"], {"resume": resumed.campaign}, is_kept),
-        Target(wholes["run"], {"resume of a run": resumed.survey}),
+        Target(wholes["run"], {"resume of a run": resumed.survey}, lambda f: f.suffix == ".db"),
+        Target(wholes["run"], {"resume of a run": resumed.survey}, lambda f: f.suffix != ".db"),
         Target(wholes["result"], RESULT_READERS),
+        *write_inputs(folder, client),
     ]
 
 
@@ -294,16 +302,21 @@ def fuzz(count: int, seed: int, seconds: float = float("inf"), tell: bool = Fals
         thread_cluster(*SLOTS) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
-        rounds = [
-            (target, name, reader, file)
-            for target in targets(Path(folder), client)
-            for name, reader in target.readers.items()
-            for file in files_of(target.whole)
-            if target.chosen(file)
-        ]
-        chance.shuffle(rounds)
+        rounds_of_targets = []
+        for target in targets(Path(folder), client):
+            rounds = [
+                (target, name, reader, file)
+                for name, reader in target.readers.items()
+                for file in files_of(target.whole)
+                if target.chosen(file)
+            ]
+            chance.shuffle(rounds)
+            rounds_of_targets.append(rounds)
+        chance.shuffle(rounds_of_targets)
+        # In turn, so that a short time reaches a file of each target.
+        turns = chain.from_iterable(zip_longest(*rounds_of_targets))
         started = time.monotonic()
-        for target, name, reader, file in rounds:
+        for target, name, reader, file in filter(None, turns):
             if time.monotonic() - started > seconds:
                 break
             before = len(outcome.faults)

@@ -18,6 +18,7 @@ from tests.chaos.damage import (
     read_verified,
     shown,
 )
+from tests.chaos.inputs import helios_target, loops_target
 from tests.drives import the_scene, the_sweeps, write_set
 
 from lidarpool import LidarError
@@ -100,6 +101,20 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
         lost = set(map(str, found[3])) ^ set(map(str, expected[3]))
         assert found == expected or not copy.stat().st_size, lost
     assert refused > 15
+
+
+@pytest.mark.parametrize("make", [helios_target, loops_target])
+def test_inputs_are_read_right_or_refused(tmp_path, make):
+    target = make(tmp_path)
+    (reader,) = target.readers.values()
+    outcome = Outcome()
+    chance = random.Random(7)
+    files = [file for file in files_of(target.whole) if target.chosen(file)]
+    for file in files:
+        attack(target.whole, reader, file, DAMAGES, chance, outcome, str(make))
+    assert not outcome.faults, "\n".join(outcome.faults)
+    assert outcome.ends["right"]
+    assert len(files) == (5 if make is helios_target else 2)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base import allowance
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.rig import Rig
@@ -347,6 +348,35 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
 def test_unusable_data_is_refused(tmp_path, text, told):
     with pytest.raises(LidarError, match=rf"fcd\.xml is not usable as floating .*{told}"):
         build(scenario(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "limit_bytes", "told"),
+    [
+        (
+            '<vehicle id="' + "1" * 20_000_000 + '"/>',
+            2**25,
+            "it has a tag or remark of more than 16.00 MiB",
+        ),
+        (
+            "".join(f"<vehicle id='{i}' x='0' y='0' angle='0'/>" for i in range(2_000)),
+            3 * 2**19,
+            "of at most 1.50 MiB: simulate a shorter time, or fewer vehicles.",
+        ),
+        ("<x/>" * 1_000_000, 2**20, "of at most 1.00 MiB: unpack it with gunzip first."),
+    ],
+)
+def test_packed_data_that_unpacks_to_far_more_is_refused(
+    tmp_path, monkeypatch, vehicles, limit_bytes, told
+):
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", limit_bytes)
+    monkeypatch.setattr(allowance, "UNPACKED_TIMES", 1)
+    text = f'<fcd-export><timestep time="0">{vehicles}</timestep></fcd-export>'
+    (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(text.encode()))
+    with pytest.raises(LidarError) as raised:
+        build(scenario(tmp_path, traffic={"file": "fcd.xml.gz"}))
+    message = str(raised.value)
+    assert "fcd.xml.gz" in message and told in message and "\n" not in message
 
 
 def test_attributes_that_sumo_defines_or_the_user_ignores(tmp_path):

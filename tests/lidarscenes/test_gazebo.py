@@ -227,6 +227,52 @@ def test_models_are_looked_for_in_variables_and_downloads(tmp_path, monkeypatch)
     assert load(tmp_path / "worlds", text, assets=tmp_path / "b")[2] == []
 
 
+def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
+    """Otherwise a world that was downloaded could read any folder above, by its name."""
+    deep = tmp_path / "downloads" / "city"
+    add_model(tmp_path, "tree")
+    write(tmp_path / "private" / "model.sdf", sdf(model("p", link())))
+    write(tmp_path / "private" / "house.dae", DAE)
+    write(tmp_path / "letters" / "a.txt", "private")
+    text = world(include("model://tree"), include("model://letters"))
+    objects, _, notes = load(deep, text)
+    assert list(objects) == ["tree/link"]
+    assert notes[0].endswith("lacks 1 model, which is left out: letters")
+
+    mesh = model("m", link(inside=shape("<mesh><uri>{}</uri></mesh>")))
+    for part in (
+        include("model://private"),
+        mesh.format("model://private/house.dae"),
+        mesh.format("package://private/house.dae"),
+        mesh.format("private/house.dae"),
+    ):
+        with pytest.raises(LidarError) as caught:
+            load(deep, world(part))
+        assert (
+            f"is in {tmp_path / 'private'}, which has no model.config: name the folder that "
+            "contains it as assets."
+        ) in str(caught.value)
+        assert load(deep, world(part), assets=tmp_path)[0]
+    write(tmp_path / "private" / "package.xml", "<package/>")
+    assert load(deep, world(mesh.format("package://private/house.dae")))[0]
+    with pytest.raises(LidarError, match="as assets"):
+        load(deep, world(mesh.format("model://private/house.dae")))
+
+
+def test_beside_a_folder_of_worlds_models_have_a_configuration_or_are_of_a_package(tmp_path):
+    """The folder above `worlds` may be anything, such as the home of a user."""
+    write(tmp_path / "private" / "house.dae", DAE)
+    write(tmp_path / "worlds" / "own" / "house.dae", DAE)
+    mesh = model("m", link(inside=shape("<mesh><uri>{}</uri></mesh>")))
+    for uri in ("../private/house.dae", "private/house.dae", "model://own/house.dae"):
+        assert load(tmp_path / "worlds", world(mesh.format(uri)))[0]
+    text = world(mesh.format("model://private/house.dae"))
+    with pytest.raises(LidarError, match=r"which has no model\.config: name the folder"):
+        load(tmp_path / "worlds", text)
+    write(tmp_path / "package.xml", "<package/>")
+    assert load(tmp_path / "worlds", text)[0]
+
+
 def test_missing_things_are_named_and_the_rest_is_there(tmp_path):
     parts = [
         include("model://crate"),

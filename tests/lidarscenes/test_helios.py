@@ -547,6 +547,24 @@ def test_points_become_surfels_a_cell_of_voxel_size(survey, tmp_path, separator,
     assert faces / 2 == pytest.approx(16 * 12 + 16 * 12, rel=0.2)  # surfels of cells
 
 
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("1 2 nan", "has points that are not finite, or more than 100,000 km away"),
+        ("1e300 2 3", "has points that are not finite, or more than 100,000 km away"),
+        ("// x y z", "has no points"),
+    ],
+)
+def test_files_without_usable_points_are_refused(survey, tmp_path, rows, message):
+    part = """<part><filter type="xyzloader"><param key="filepath" value="parts/scan.txt"/></filter>
+</part></scene>"""
+    inside = legs('pulseFreq_hz="1000"', platform='onGround="true"')
+    path = survey(LASER, inside, GROUND.replace("</scene>", part), parts={"scan.txt": rows})
+    with pytest.raises(LidarError, match=message) as caught:
+        import_checked(path, tmp_path / "out")
+    assert "scan.txt" in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_rasters_of_heights_are_scene_files(imported, tmp_path):
     rasterio = pytest.importorskip("rasterio")
     (tmp_path / "helios" / "parts").mkdir(parents=True)

@@ -185,17 +185,27 @@ DAE = """<COLLADA version="1.4.1"><asset><unit meter="0.01"/><up_axis>Y_UP</up_a
 <instance_visual_scene url="#w"/></scene></COLLADA>"""
 
 
-def test_mesh_files_of_packages(tmp_path):
-    package = tmp_path / "ws" / "my_robot"
-    for file in (package / "meshes" / "leg.dae", tmp_path / "ws" / "other" / "leg.dae"):
-        file.parent.mkdir(parents=True)
-        file.write_text(DAE)
-    (tmp_path / "secret.dae").write_text(DAE)
-    (package / "package.xml").write_text("<package><name>robot_description</name></package>")
+def leg_of(folder, name, **options):
+    """Return the robot of a file in a folder, whose only link has a mesh."""
+    return robot_of(folder, link("leg", visual(f'<mesh filename="{name}"/>')), **options)
 
-    def read(name):
-        return robot_of(package / "urdf", link("leg", visual(f'<mesh filename="{name}"/>')))
 
+@pytest.fixture
+def packages(tmp_path):
+    """Return a folder of two packages with a mesh each, beside a folder that is no package."""
+    folder = tmp_path / "ws"
+    for file in ("my_robot/meshes/leg.dae", "other/leg.dae", "private/leg.dae", "../secret.dae"):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(DAE)
+    (folder / "my_robot/package.xml").write_text(
+        "<package><name>robot_description</name></package>"
+    )
+    (folder / "other/package.xml").write_text("<package/>")
+    return folder
+
+
+def test_mesh_files_of_packages(tmp_path, packages):
+    package = packages / "my_robot"
     for name in (
         "../meshes/leg.dae",
         "package://my_robot/meshes/leg.dae",
@@ -204,27 +214,63 @@ def test_mesh_files_of_packages(tmp_path):
         f"file://{package}/meshes/leg.dae",
     ):
         # In metres by its unit; with the axes of the file, as RViz takes it.
-        assert read(name).meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
+        robot = leg_of(package / "urdf", name)
+        assert robot.meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
+    outside = f"is outside the package, {package}: name a folder that contains it as assets"
+    missing = "with a package.xml: name the folder '{}', or one that contains it, as assets"
     for name, words in (
-        ("../../../secret.dae", "outside the package"),
-        ("package://my_robot/../../secret.dae", "outside the package"),
-        (f"file://{tmp_path}/secret.dae", "outside the package"),
+        ("../../../secret.dae", outside),
+        ("package://my_robot/../../secret.dae", outside),
+        (f"file://{tmp_path}/secret.dae", outside),
         ("package://../secret.dae", "names no package: write package://NAME/FILE, or the path of"),
         ("package:///leg.dae", "from the folder 'urdf' of the .urdf"),
         ("package://", "from the folder 'urdf' of the .urdf"),
-        ("model:///other/meshes/leg.dae", "put the .urdf into the folder 'other' of that package"),
+        ("model:///other/meshes/leg.dae", "and name the folder 'other', or one that contains it"),
         ("package:///other//leg.dae", "names no package: write package://other/leg.dae, and"),
-        ("package://unknown/leg.dae", "put the .urdf into the folder 'unknown'"),
+        ("package://unknown/leg.dae", missing.format("unknown")),
+        ("package://private/leg.dae", missing.format("private")),  # no package
         ("../meshes/arm.dae", "does not exist"),
         ("http://example.org/leg.dae", "must be a file's name"),
     ):
-        with pytest.raises(LidarError, match=words) as caught:
-            read(name)
+        with pytest.raises(LidarError) as caught:
+            leg_of(package / "urdf", name)
+        assert words in str(caught.value), name
         assert "link 'leg'" in str(caught.value) and len(str(caught.value).splitlines()) == 1
-    (package / "package.xml").unlink()  # now the folder above the file's counts
-    assert read("../meshes/leg.dae").meshes
-    with pytest.raises(LidarError, match="outside the package"):
-        read("../../other/leg.dae")
+
+
+def test_without_a_package_mesh_files_are_in_the_folder_of_the_robot_or_in_assets(packages):
+    folder = packages / "private"
+    for name in ("leg.dae", "package://private/leg.dae"):
+        assert leg_of(folder, name).meshes
+    urdf = folder / "urdf"
+    for name in ("../leg.dae", "../../my_robot/meshes/leg.dae", f"file://{folder}/leg.dae"):
+        with pytest.raises(LidarError) as caught:
+            leg_of(urdf, name)
+        assert f"is outside the folder of the .urdf, {urdf}: name a folder that contains" in str(
+            caught.value
+        )
+        assert leg_of(urdf, name, assets=packages).meshes
+    for assets in (folder, packages):  # the package, and a folder of packages
+        assert leg_of(urdf, "package://private/leg.dae", assets=assets).meshes
+    assert leg_of(urdf, "../leg.dae", assets=folder).meshes
+    with pytest.raises(LidarError, match=r"outside the folder of the \.urdf"):
+        leg_of(urdf, "../../../secret.dae", assets=packages)
+
+
+def test_a_scenario_names_the_assets_of_a_robot(tmp_path, packages):
+    leg_of(packages / "private/urdf", "../leg.dae", assets=packages)
+    file = {"file": "ws/private/urdf/robot.urdf"}
+    poses = [[0, 0, 1]]
+    for entry in ({"files": [file]}, {"files": [file | {"assets": "ws/private"}]}):
+        scenario = Scenario.from_data({"scene": entry, "poses": poses}, folder=tmp_path)
+        if "assets" in entry["files"][0]:
+            assert build(scenario).scene.names == ("r/leg",)
+        else:
+            with pytest.raises(LidarError, match="as assets"):
+                build(scenario)
+    actor = {"name": "R", "file": file | {"assets": "ws"}, "at": [3, 0, 0]}
+    scenario = Scenario.from_data({"actors": [actor], "poses": poses}, folder=tmp_path)
+    assert len(build(scenario).scene.actors) == 1
 
 
 HINGE = joint("j", "revolute", "a", "b")

@@ -1,6 +1,8 @@
 """Loops are compiled once, and again when a file that they depend on has changed."""
 
+import importlib.util
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +69,111 @@ def test_processes_that_start_together_compile_once(package):
     """The others wait, and load what the first has kept."""
     started = [start(package) for _ in range(4)]
     assert sorted(map(printed, started)) == [["3.0", "0"]] * 3 + [["3.0", "1"]]
+
+
+def function_in(folder, monkeypatch, result="x - 2.0"):
+    """Return a function of a new file, which has no compiled code yet."""
+    path = folder / "less.py"
+    path.write_text(f"def less(x):\n    return {result}\n")
+    spec = importlib.util.spec_from_file_location("less", path)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "less", module)  # compiled code imports its module
+    spec.loader.exec_module(module)
+    return module.less
+
+
+@pytest.fixture
+def function(package, monkeypatch):
+    return function_in(package, monkeypatch)
+
+
+def compilations(function):
+    """Compile a function, or load its code; return how often numba compiled."""
+    loop = compiled.compiled("f8(f8)")(function)
+    assert loop(3.0) == 1.0
+    return sum(loop.stats.cache_misses.values())
+
+
+def file_of(package, kind):
+    (file,) = (package / "__pycache__").glob(f"less.less-*.{kind}")
+    return file
+
+
+class Trap:
+    """What somebody else may write into a file: unpickling it is an error."""
+
+    def __reduce__(self):
+        return pytest.fail, ("was unpickled",)
+
+
+def cut(content):
+    return content[: len(content) // 2]
+
+
+def emptied(content):
+    return b""
+
+
+def flipped(content):
+    at = len(content) // 2
+    return content[:at] + bytes([content[at] ^ 4]) + content[at + 1 :]
+
+
+def replaced(content):
+    return pickle.dumps(Trap())
+
+
+@pytest.mark.parametrize("damage", [cut, emptied, flipped, replaced])
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_a_damaged_loop_is_compiled_again_with_a_note(package, function, caplog, kind, damage):
+    assert compilations(function) == 1
+    file = file_of(package, kind)
+    file.write_bytes(damage(file.read_bytes()))
+    assert not caplog.messages
+    assert compilations(function) == 1
+    assert caplog.messages == [
+        f"Compiled loops in {file.parent} are damaged and are compiled again. The first is "
+        f"{file.name}."
+    ]
+    assert compilations(function) == 0  # what was compiled is kept
+
+
+def test_what_a_killed_process_was_writing_is_removed(package, function):
+    """A process that compiles removes it; files of others in that folder stay."""
+    cache = package / "__pycache__"
+    cache.mkdir(exist_ok=True)
+    unfinished = [cache / "more.more-5.py311.nbi.tmp.0123", cache / "less.1.nbc.tmp.4567"]
+    other = cache / "more.cpython-311.pyc.1234"
+    for path in (*unfinished, other):
+        path.write_bytes(b"begun")
+    assert compilations(function) == 1
+    assert not any(path.exists() for path in unfinished) and other.exists()
+
+
+def test_code_of_an_earlier_version_of_a_loop_is_not_loaded(
+    tmp_path, package, function, monkeypatch
+):
+    """A process that is killed between index and code of a changed loop leaves both versions.
+
+    The index of numba itself would lead to the code of the earlier version.
+    """
+    assert compilations(function) == 1
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    assert compilations(function_in(earlier, monkeypatch, "2.0 * x - 5.0")) == 1
+    file_of(package, "nbc").write_bytes(file_of(earlier, "nbc").read_bytes())
+    assert compilations(function) == 1
+
+
+def test_a_loop_that_cannot_be_kept_runs_with_a_note(package, function, caplog):
+    """As on a full disk: a folder stands where the file of the code belongs."""
+    assert compilations(function) == 1
+    file = file_of(package, "nbc")
+    file.unlink()
+    file.mkdir()
+    assert compilations(function) == 1
+    assert f"cannot be kept in {file.parent}, so each process compiles them for" in caplog.text
+    assert not [*file.parent.glob("*.tmp.*")]
 
 
 def test_an_inner_function_is_compiled_once_for_all_whole_numbers():

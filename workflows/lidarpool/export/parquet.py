@@ -14,11 +14,13 @@ import pyarrow as pa
 import pyarrow.dataset
 import pyarrow.parquet as pq
 
+from lidarsim.base.allowance import Allowance
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.table import AXES, TABLE
 from lidarsim.sweeps.sweeps import Sweeps
 
 from . import pieces, reading
+from .parquet_groups import group_allowance, number_columns, read_group
 from .pieces import Entry
 
 _GROUP_ROWS = 65_536
@@ -93,12 +95,17 @@ class Reader(reading.Reader):
             f"{folder}/{self.files(0)[0]}", format="parquet", filesystem=system
         )
 
-    def _group(self, fragment: Any) -> Any:
+    @cached_property
+    def _size(self) -> int:
+        """Size of the files of the partition, bytes."""
+        table = self._table
+        return sum(info.size for info in table.filesystem.get_file_info(table.files))
+
+    def _group(self, fragment: Any, allowance: Allowance) -> pa.Table:
         """Read a group of rows, cached because neighbouring sweeps share groups."""
         key = fragment.path, fragment.row_groups[0].id
         if key not in self._held:
-            # Threads of their own would be many beside those of the workers that load data.
-            rows = fragment.to_table(use_threads=False)
+            rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)
             self._held = dict([*self._held.items()][-1:]) | {key: rows}
         return self._held[key]
 
@@ -108,8 +115,11 @@ class Reader(reading.Reader):
         scan = pyarrow.dataset.field("scan")
         in_range = (scan >= first) & (scan < stop)
         files = self._table.get_fragments(in_range)
+        allowance = group_allowance(self._size)
         groups = [
-            self._group(group) for file in files for group in file.split_by_row_group(in_range)
+            self._group(group, allowance)
+            for file in files
+            for group in file.split_by_row_group(in_range)
         ]
         rows = pa.concat_tables(groups or [self._table.schema.empty_table()])
         begin, end = np.searchsorted(rows["scan"].to_numpy(), (first, stop))

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarsim.base.allowance import Allowance
 from lidarsim.base.archives import open_archive, read_npy
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import LidarError
@@ -38,6 +39,7 @@ Columns = Mapping[str, AnyArray]
 Read = tuple[AnyArray, Columns, Floats | None]
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]  # of KITTI
+_THIN = "thin it first"
 _E57_COLUMNS = {
     "colorRed": "red",
     "colorGreen": "green",
@@ -61,11 +63,16 @@ class SweepFiles(NamedTuple):
 def open_e57(path: Path, name: str) -> SweepFiles:
     """Open the scans of an E57, each in the axes of its scanner, with its pose."""
     need("pye57", "e57", f"{name} is read")
-    input_size(path)
+    size = input_size(path)
     file = import_module("pye57").E57(str(path))
+    # A column of equal values takes no bytes, whatever the number of points.
+    total = Allowance(size, _THIN, in_parts=True)
+    for number in range(file.scan_count):
+        total.take(_bytes_of_scan(file.get_header(number)))
 
     def read(number: int) -> tuple[AnyArray, Columns, Floats]:
         header = file.get_header(number)
+        Allowance(size, _THIN).take(_bytes_of_scan(header))
         data = file.read_scan_raw(number, ignore_unsupported_fields=True)
         if "cartesianX" in data:
             points = np.stack([data.pop(f"cartesian{axis}") for axis in "XYZ"], axis=1)
@@ -89,6 +96,11 @@ def open_e57(path: Path, name: str) -> SweepFiles:
     return SweepFiles(file.scan_count, read, notes=tuple(check_metric_format(system, positions)))
 
 
+def _bytes_of_scan(header: Any) -> int:
+    """Return the memory of the columns of a scan of an E57, of 8 bytes a number."""
+    return 8 * int(header.point_count) * len(header.point_fields)
+
+
 def _from_spherical(data: dict[str, AnyArray]) -> Floats:
     """Return positions (n, 3) of the spherical coordinates of an E57, which are taken out."""
     ranges, azimuth, elevation = (
@@ -101,21 +113,48 @@ def _from_spherical(data: dict[str, AnyArray]) -> Floats:
 
 
 def open_parquet(path: Path, name: str) -> SweepFiles:
-    """Open the points of a .parquet file, or a folder of them, in their groups of rows."""
+    """Open the points of a .parquet file, or a folder of them, in their groups of rows.
+
+    Only columns of numbers are read: the memory of others is not known before.
+    """
     need("pyarrow", "parquet", f"{name} is read")
+    from ..export.parquet_groups import (  # imports pyarrow
+        check_groups,
+        group_allowance,
+        number_columns,
+        read_group,
+    )
+
+    if path.is_file():
+        input_size(path)
     dataset = import_module("pyarrow.dataset").dataset(str(path), format="parquet")
-    groups = [group for file in dataset.get_fragments() for group in file.split_by_row_group()]
-    count = dataset.count_rows()
+    groups = []
+    files = []  # of each group: names of columns of numbers, and size in bytes
+    unread = set[str]()  # names of columns
+    for file in dataset.get_fragments():
+        columns = number_columns(file.physical_schema)
+        unread |= set(file.physical_schema.names) - set(columns)
+        size = input_size(file.path)
+        of_file = file.split_by_row_group()
+        check_groups(of_file, columns, size)
+        groups += of_file
+        files += len(of_file) * [(columns, size)]
+    if axes := sorted(unread.intersection("xyz")):
+        raise ValueError(f"its {', '.join(axes)} are no numbers")
     names = {column.in_files: column.name for column in TABLE.values()}
 
     def read(number: int) -> Read:
-        rows = groups[number].to_table()
+        number_names, size = files[number]
+        rows = read_group(groups[number], number_names, group_allowance(size))
         columns = {
             names.get(column, column): rows[column].to_numpy() for column in rows.column_names
         }
         return _positions(columns), columns, None
 
-    return SweepFiles(len(groups), read, point_count=count)
+    notes = []
+    if unread:
+        notes.append(f"has columns that are no numbers: {', '.join(sorted(unread))}")
+    return SweepFiles(len(groups), read, point_count=dataset.count_rows(), notes=tuple(notes))
 
 
 def open_kitti(folder: Path) -> dict[str, SweepFiles]:

@@ -7,9 +7,10 @@ import math
 import re
 import zlib
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Protocol
@@ -19,6 +20,7 @@ import numpy as np
 from pydantic import BeforeValidator, Strict, model_validator
 
 from lidarscenes.files.formats import ROBOTS
+from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import (
     Several,
@@ -31,10 +33,10 @@ from lidarsim.base.declared import (
     one_of,
 )
 from lidarsim.base.errors import LidarError, message_of, prefixed
-from lidarsim.base.input_files import open_input
+from lidarsim.base.input_files import input_size, open_input
 from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
 from lidarsim.base.words import did_you_mean, plural, printable
-from lidarsim.base.xmlfile import refuse_entity
+from lidarsim.base.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
@@ -67,7 +69,7 @@ from .sections import (
 _READING_OPTIONS = {
     "format", "time_unit", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s",
 }  # fmt: skip
-_ROBOT_FIELDS = {"file", "opacity"}  # fields of a mesh file that apply to robots
+_ROBOT_FIELDS = {"file", "opacity", "assets"}  # fields of a mesh file that apply to robots
 
 
 class MountSection(Section, InstrumentPose):
@@ -347,7 +349,9 @@ class ActorSection(DeformingSection):
         if self.robot and (self.animation or self.wheels):
             raise ValueError("a robot has joints: leave out animation and wheels.")
         if self.robot and self.robot.model_fields_set - _ROBOT_FIELDS:
-            raise ValueError("a robot is in metres and in its own axes: give just its file.")
+            raise ValueError(
+                "a robot is in metres and in its own axes: give just its file, opacity and assets."
+            )
         return self
 
     @property
@@ -381,7 +385,6 @@ class ActorSection(DeformingSection):
 
 HOST = "host"  # identity of the host vehicle of OSI, beside its number
 MAX_ACTORS = 10_000
-_PIECE_BYTES = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
 # Attributes that SUMO's documentation of --fcd-output defines, and that are not used here.
@@ -391,6 +394,9 @@ _UNUSED = frozenset((
     "odometer", "pos", "posLat", "queue", "segment", "signals", "speed", "speedFactor", "speedLat",
     "stopDelay", "tag", "timeLoss", "vehicle", "waiting",
 ))  # fmt: skip
+_ROW_BYTES = 8 * (1 + len(_ROW))  # of a time and its row
+_ELEMENT_BYTES = 100  # of an element of a packed file: a short element takes as long as these
+_TRAVELLER_BYTES = 1000  # of a vehicle or person without its rows
 _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
@@ -581,7 +587,13 @@ class _PassageCollector:
     Rows before the first time are dropped, but for the last.
     """
 
-    def __init__(self, section: TrafficSection, first_s: float, choice: TravellerChoice) -> None:
+    def __init__(
+        self,
+        section: TrafficSection,
+        first_s: float,
+        choice: TravellerChoice,
+        allowance: Allowance,
+    ) -> None:
         self.passages: list[Passage] = []
         self.left_out: set[str] = set()  # identities that are not in `choice`
         # {(tag, identity): (last step, passage)}
@@ -593,8 +605,25 @@ class _PassageCollector:
         self._clock = TrafficClock(section.time_unit)
         self._ignore = section.ignore
         self._choice = choice
+        self._allowance = allowance
         self._known_attributes = set(_KNOWN)
         self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
+
+    def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
+        """Collect from tags with attributes until a time; ValueError if they are not valid.
+
+        The first time step after the last time is needed as well.
+        """
+        for tag, attributes in elements:
+            if tag == "timestep":
+                previous_s = self.time_s
+                self.begin_step(attributes["time"])
+                if previous_s > last_s:
+                    break
+            elif tag in _MOVING and self.step >= 0:
+                self.add(tag, attributes)
+        if self.step < 0:
+            raise ValueError("it has no time steps")
 
     def begin_step(self, text: str) -> None:
         """Begin a time step; ValueError if its time is not after the last time step's."""
@@ -621,11 +650,15 @@ class _PassageCollector:
         elif xy == self._vehicle_xy:  # SUMO writes the riders of a vehicle after the vehicle
             return
         if not self._choice.has(attributes["id"]):
+            if attributes["id"] not in self.left_out:
+                self._allowance.take(_TRAVELLER_BYTES)
             self.left_out.add(attributes["id"])
             return
         passage = self._passage(tag, attributes)
         if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
             del passage.times_s[:], passage.rows[:]
+        else:
+            self._allowance.take(_ROW_BYTES)
         identity = attributes["id"]
         named = f"{tag} {identity!r}"
         row = [_number(named, key, attributes[key]) for key in _ROW[:3]]
@@ -641,6 +674,7 @@ class _PassageCollector:
         last_step, passage = self.travellers.get(traveller, (-2, None))
         # SUMO omits vehicles while they are teleported.
         if passage is None or last_step < self.step - 1:
+            self._allowance.take(_TRAVELLER_BYTES + len(attributes["id"]))
             passage = Passage(attributes["id"], attributes.get("type") or tag)
             self.passages.append(passage)
         self.travellers[traveller] = self.step, passage
@@ -664,25 +698,20 @@ def read_fcd(
 ) -> TrafficContent:
     """Read the vehicles and persons between two times, with the time steps before and after.
 
-    The file may be of any length: only these rows stay in memory.
+    The file may be of any length: only these rows stay in memory, for which the size of the file is
+    an `Allowance`.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, is no floating car data, or has unknown attributes.
+        If the file cannot be read, is no floating car data, has unknown attributes, or unpacks to
+        far more than its size.
     """
-    collector = _PassageCollector(section, first_s, choice)
     try:
-        for tag, attributes in _elements(path):
-            if tag == "timestep":
-                previous_s = collector.time_s
-                collector.begin_step(attributes["time"])
-                if previous_s > last_s:  # the first time step after the last time is needed as well
-                    break
-            elif tag in _MOVING and collector.step >= 0:
-                collector.add(tag, attributes)
-        if collector.step < 0:
-            raise ValueError("it has no time steps")
+        allowance = Allowance(input_size(path), "simulate a shorter time, or fewer vehicles")
+        collector = _PassageCollector(section, first_s, choice, allowance)
+        with prefixed(path):
+            collector.collect(_elements(path), last_s)
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
@@ -708,19 +737,23 @@ def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
 
 
 def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield tags and attributes of the elements of an XML file, which is read in pieces."""
+    """Yield tags and attributes of the elements of an XML file, which is read in pieces.
+
+    LidarError is raised for a .gz that unpacks to far more than its size.
+    """
     elements: list[tuple[str, Mapping[str, str]]] = []
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = lambda tag, attributes: elements.append((tag, attributes))
+    is_packed = path.suffix.lower() == ".gz"
+    allowance = Allowance(input_size(path), "unpack it with gunzip first", in_parts=True)
     with open_input(path) as file:
-        is_packed = path.suffix.lower() == ".gz"
         content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
-        while piece := content.read(_PIECE_BYTES):
-            parser.Parse(piece)
+        for _ in parse_pieces(parser, iter(partial(content.read, PIECE_BYTES), b"")):
+            if is_packed:
+                allowance.take(PIECE_BYTES + _ELEMENT_BYTES * len(elements))
             yield from elements
             elements.clear()
-    parser.Parse(b"", True)
 
 
 def carrier_of(

@@ -16,6 +16,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import plural
+from lidarsim.columns.mcap_chunks import check_chunks
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Track
 from lidarsim.sensor.trajectory import quaternions_of, rotations_of
@@ -203,6 +204,8 @@ def _ground_truths(path: Path) -> Iterator[Any]:
         if not input_size(path):
             raise LidarError("it is empty.")
         is_mcap = path.suffix.lower() == ".mcap"
+        if is_mcap:
+            check_chunks(path)
         kind = None if is_mcap else _message_type(osi, path)
         messages = osi.read(str(path), return_ground_truth=True, osi_message_type=kind)
         try:

@@ -59,7 +59,7 @@ _READING_FIELDS = {
     "exclude",
 }
 # Fields of a mesh file's entry that are allowed if the file is a robot.
-_ROBOT_FIELDS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
+_ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}
 
 
 @dataclass
@@ -229,11 +229,20 @@ class Shapes:
             colours = self.scenario.coloured
             name_materials = self.scenario.names_materials
             robot = load_robot(
-                path, opacity=entry.opacity, colours=colours, materials=name_materials, tell=tell
+                path,
+                opacity=entry.opacity,
+                colours=colours,
+                materials=name_materials,
+                assets=self._assets_of(entry),
+                tell=tell,
             )
             self._robots[entry] = robot
             self.findings.sources[entry.file] = robot.summary
         return self._robots[entry]
+
+    def _assets_of(self, entry: MeshFile) -> Path | None:
+        """Return the further folder of a file's entry, or None."""
+        return None if entry.assets is None else self.scenario.path(entry.assets)
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
         """Read the objects of a file in world coordinates; LidarError if the file cannot be used.
@@ -254,7 +263,7 @@ class Shapes:
             colours=scenario.coloured,
             materials=scenario.names_materials,
             epsg=scenario.cloud.epsg,
-            assets=None if entry.assets is None else scenario.path(entry.assets),
+            assets=self._assets_of(entry),
             animation=animation,
             tell=findings.notes.append,
             axes=findings.remarks.append,

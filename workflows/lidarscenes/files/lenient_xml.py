@@ -46,6 +46,7 @@ class _Parser:
     def __init__(self, text: str) -> None:
         self._text = text
         self._open: list[Element] = []  # elements that have not ended
+        self._texts: list[list[str]] = []  # pieces of text of each of these
         self._root: Element | None = None
         self._count = 0
 
@@ -117,6 +118,7 @@ class _Parser:
             self._root = element
         if not tag["empty"]:
             self._open.append(element)
+            self._texts.append([])
             if len(self._open) > _MAX_DEPTH:
                 raise ValueError(f"its elements are nested deeper than {_MAX_DEPTH}")
 
@@ -126,13 +128,13 @@ class _Parser:
             raise ValueError(
                 f"line {self._line(start)} has an end </{name[:40]}> without its start"
             )
-        self._open.pop()
+        element = self._open.pop()
+        element.text = "".join(self._texts.pop()) or None
 
     def _add_text(self, text: str, *, is_literal: bool = False) -> None:
         """Add text to the innermost element."""
         if self._open and not text.isspace() and text:
-            element = self._open[-1]
-            element.text = (element.text or "") + (text if is_literal else self._resolved(text))
+            self._texts[-1].append(text if is_literal else self._resolved(text))
 
     def _resolved(self, text: str) -> str:
         """Return text with its references to characters resolved."""

@@ -26,7 +26,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import CutShortError, message_of
 from lidarsim.base.words import plural
-from lidarsim.base.xmlfile import AT_END, refuse_entity
+from lidarsim.base.xmlfile import AT_END, PIECE_BYTES, parse_pieces, refuse_entity
 from lidarsim.scene.colours import GREY, Colours
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.scene_graph import (
@@ -51,8 +51,9 @@ _UNITS_M = {
 # Required extensions that do not change shapes, or that are supported here.
 _SUPPORTED = re.compile(r"/(material|production|securecontent)/")
 
-_PIECE_BYTES = 1 << 20
-_OBJECT_BYTES = 1000  # of an object or its placement, which a few letters make
+# What a few letters make.
+_OBJECT_BYTES = 1000  # of an object, its placement, or a group of colours
+_COLOUR_BYTES = 100  # of a colour or material in a group
 
 _COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
 
@@ -169,7 +170,7 @@ class _Package:
             raise MeshFileError("is packed by a method other than Deflate: export it again")
         self._allowance.take(entry.file_size)
         with self._archive.open(entry) as file:
-            while piece := file.read(_PIECE_BYTES):
+            while piece := file.read(PIECE_BYTES):
                 yield piece
 
     def object(self, key: _Key) -> _MeshObject:
@@ -217,9 +218,8 @@ class _Model:
         parser.StartElementHandler = self._begin
         parser.EntityDeclHandler = refuse_entity
         try:
-            for piece in text:
-                parser.Parse(piece)
-            parser.Parse(b"", True)
+            for _ in parse_pieces(parser, text):
+                pass
         except expat.ExpatError as error:
             if error.code not in AT_END:
                 raise
@@ -247,11 +247,13 @@ class _Model:
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
         """Begin a group of colours or materials."""
+        self._allowance.take(_OBJECT_BYTES)
         self._group = self._groups.setdefault(attributes["id"], [])
         self._names_of_group = self._names.setdefault(attributes["id"], [])
 
     def _add_colour(self, attributes: dict[str, str]) -> None:
         """Add a colour and its name to the group."""
+        self._allowance.take(_COLOUR_BYTES)
         colour = attributes.get("displaycolor", attributes.get("color", ""))
         match = _COLOUR.fullmatch(colour)
         self._group.append(bytes.fromhex(match[1]) if match else GREY.tobytes())

@@ -28,13 +28,27 @@ CACHE_VARIABLES = ("GZ_FUEL_CACHE_PATH", "IGN_FUEL_CACHE_PATH")
 CACHES = ("~/.gz/fuel", "~/.ignition/fuel")
 _MODELS = "~/.gazebo/models"  # of Gazebo classic
 _MAX_FOLDERS_UP = 5  # folders above a world in which models are looked for
+_PACKAGE = "package.xml"  # in the folder of a package of ROS
 _CONFIGS = ("model.config", "manifest.xml")
+_MODEL = "model.sdf"  # of models without a configuration
 _WORLD_FOLDERS = ("worlds", "world")
 _SDF_VERSION = (1, 12)  # the newest that is known
 
 
 class MissingFileError(Exception):
     """A file or model that no folder has; its text is the name to report."""
+
+
+class Candidate(NamedTuple):
+    """A path that a URI may mean, and the folder that must contain the path.
+
+    A folder that may not be read has nothing that marks the folder as a model or package, and is
+    found only because the folder is near the world.
+    """
+
+    path: Path
+    root: Path
+    is_allowed: bool = True
 
 
 class Source(NamedTuple):
@@ -54,9 +68,13 @@ class Resources:
         The world, and its folder: with a package.xml at most five folders above that one, else the
         folder above a folder `worlds`.
     folders
-        Folders in which models are looked for by name, in order.
+        Folders in which models are looked for by name, in order. In those above the world, only
+        folders with a model.config are models, and for ``package://`` those with a package.xml.
     trusted
         Resolved folders whose files may be read from anywhere.
+    unmarked
+        Resolved folders in which any folder is a model: those that the user names, the world's
+        folder, and the world's package if it has a package.xml.
     caches
         Folders of downloads from Fuel.
     """
@@ -64,6 +82,7 @@ class Resources:
     world: Source
     folders: tuple[Path, ...]
     trusted: tuple[Path, ...]
+    unmarked: tuple[Path, ...]
     caches: tuple[Path, ...]
 
     @classmethod
@@ -72,13 +91,20 @@ class Resources:
         folder = path.parent.resolve()
         above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
         default = folder.parent if folder.name.lower() in _WORLD_FOLDERS else folder
-        root = next((f for f in above if (f / "package.xml").is_file()), default)
+        root = next((f for f in above if (f / _PACKAGE).is_file()), default)
         named = [*assets, *_folders_of(FOLDER_VARIABLES), *_existing([_MODELS])]
         nearby = [f / name for f in above for name in ("", "models")]
         folders = dict.fromkeys([*named, *(f for f in nearby if f.is_dir())])
         caches = [*_folders_of(CACHE_VARIABLES), *_existing(CACHES)]
-        trusted = [f.resolve() for f in [root, *named, *caches]]
-        return cls(Source(path, root), tuple(folders), tuple(trusted), tuple(caches))
+        chosen = [f.resolve() for f in [*named, *caches]]
+        own = root if (root / _PACKAGE).is_file() else folder
+        return cls(
+            world=Source(path, root),
+            folders=tuple(folders),
+            trusted=(root.resolve(), *chosen),
+            unmarked=(own, *chosen),
+            caches=tuple(caches),
+        )
 
     def model(self, uri: str, source: Source) -> Source:
         """Return the file of SDFormat of a model, the newest that its model.config names.
@@ -106,11 +132,16 @@ class Resources:
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
         """Yield the existing paths that a URI may name; LidarError if a path must not be read."""
-        for path, root in self._candidates(uri, source):
+        refused: Path | None = None
+        for path, root, is_allowed in self._candidates(uri, source):
             try:
                 if not path.exists():
                     continue
                 resolved = path.resolve()
+                if not is_allowed:
+                    is_file = path.is_file() or (path / _MODEL).is_file()
+                    refused = root if is_file and refused is None else refused
+                    continue
             except (OSError, ValueError, RuntimeError):
                 continue  # no file can have this name
             roots = (root, *self.trusted)
@@ -120,37 +151,51 @@ class Resources:
                     "folder as assets."
                 )
             yield Source(path, next(f for f in roots if resolved.is_relative_to(f)))
+        if refused is not None:
+            raise LidarError(
+                f"{printable(uri)!r} is in {refused}, which has no {_CONFIGS[0]}: name the folder "
+                "that contains it as assets."
+            )
 
-    def _candidates(self, uri: str, source: Source) -> Iterator[tuple[Path, Path]]:
-        """Yield the paths that a URI may mean, and the folder that must contain each."""
+    def _candidates(self, uri: str, source: Source) -> Iterator[Candidate]:
+        """Yield the paths that a URI may mean."""
         name = unquote(uri.strip())
         scheme, mark, location = name.partition("://")
         if mark and scheme in ("http", "https"):
             yield from self._downloads(uri)
         elif mark and scheme in ("model", "package"):
-            yield from self._in_folders(location)
+            yield from self._in_folders(location, scheme)
         elif not mark or scheme == "file":
             location = location if mark else name.removeprefix("file:")
-            yield source.path.parent / location, source.root
+            yield Candidate(source.path.parent / location, source.root)
             if not location.startswith("/"):
                 yield from self._in_folders(location)
         else:
             raise MissingFileError(printable(uri))
 
-    def _in_folders(self, location: str) -> Iterator[tuple[Path, Path]]:
+    def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
         """Yield the paths NAME/FILE in all folders."""
         name, _, file = location.lstrip("/").partition("/")
         file = file.lstrip("/")  # which would else be a path of its own
         if name in ("", ".", ".."):
             return
+        marks = (_CONFIGS[0], _PACKAGE) if scheme == "package" else _CONFIGS[:1]
+        # A path below the world's folder may be written without a scheme as well.
+        unmarked = self.unmarked if scheme else self.trusted
         for folder in self.folders:
-            model = folder / name
-            if model.is_dir():
-                yield model / file, _resolved(model)
+            if (folder / name).is_dir():
+                model = folder / name
             elif folder.name == name:  # of the package or model itself
-                yield folder / file, _resolved(folder)
+                model = folder
+            else:
+                continue
+            root = _resolved(model)
+            is_allowed = any(root.is_relative_to(f) for f in unmarked) or any(
+                (model / mark).is_file() for mark in marks
+            )
+            yield Candidate(model / file, root, is_allowed)
 
-    def _downloads(self, uri: str) -> Iterator[tuple[Path, Path]]:
+    def _downloads(self, uri: str) -> Iterator[Candidate]:
         """Yield the paths of a model of Fuel, or of its file: in the caches, then by its name."""
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
@@ -166,8 +211,8 @@ class Resources:
                 for model in folders:
                     versions = sorted(_existing_folders(model, "*"), key=lambda f: natural(f.name))
                     chosen = [f for f in versions if f.name == version] or versions[-1:]
-                    yield from ((folder / file, _resolved(folder)) for folder in chosen)
-        yield from self._in_folders(f"{name}/{file}")
+                    yield from (Candidate(folder / file, _resolved(folder)) for folder in chosen)
+        yield from self._in_folders(f"{name}/{file}", "model")
 
 
 def short_name(uri: str) -> str:
@@ -220,8 +265,8 @@ def _newest_file(folder: Path) -> Path:
                 file = folder / files[version]
                 if version <= _SDF_VERSION and file.parent == folder and file.is_file():
                     return file
-    if (folder / "model.sdf").is_file():
-        return folder / "model.sdf"
+    if (folder / _MODEL).is_file():
+        return folder / _MODEL
     raise MissingFileError(printable(folder.name))
 
 

@@ -21,7 +21,7 @@ from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.scene.scene_instances import MAX_COORDINATE_M, SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
@@ -349,10 +349,17 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
     """
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
+    if not any(line.partition("//")[0].strip() for line in lines):
+        raise LidarError(f"{path} has no points.")
     try:
         points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
     except ValueError as error:
         raise LidarError(f"{path} has rows that are no points: {error}.") from error
+    if not (np.abs(points) <= MAX_COORDINATE_M).all():  # NaN is not either
+        raise LidarError(
+            f"{path} has points that are not finite, or more than {MAX_COORDINATE_M / 1000:,.0f} "
+            "km away: leave them out."
+        )
     return points, number(settings, "voxelSize", 1.0) or 1.0
 
 

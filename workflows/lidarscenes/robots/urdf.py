@@ -50,15 +50,17 @@ def load_robot(
     opacity: OpacityMode = "mask",
     colours: bool = False,
     materials: bool = False,
+    assets: str | Path | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Robot:
     """Read a robot from a URDF file, with the visual meshes of its links.
 
     Mesh files are read from the robot's package only: the folder with a package.xml, at most five
-    above the file, or, without a package.xml, the parent of the file's folder. A name that begins
-    with package://NAME is looked for in folders called NAME, or whose package.xml has that name,
-    beside the file and at most five folders above. As in RViz, a mesh keeps the axes of its file,
-    even if the file states an up-axis, and a .dae its unit.
+    above the file, or, without a package.xml, the file's own folder; and from `assets`. A name that
+    begins with package://NAME is looked for in `assets`, and in folders with a package.xml that are
+    called NAME, or whose package.xml has that name, beside the file and at most five folders above.
+    As in RViz, a mesh keeps the axes of its file, even if the file states an up-axis, and a .dae
+    its unit.
 
     Parameters
     ----------
@@ -69,6 +71,9 @@ def load_robot(
     colours, materials
         Whether colours and names of materials are read. A material of the URDF applies to shapes,
         and to meshes without colours, or without materials.
+    assets
+        A further folder from which mesh files, and the files that these name, may be read: a
+        package, or a folder of packages.
     tell
         Called with a line on content that is left out.
 
@@ -85,7 +90,8 @@ def load_robot(
         joints = _joints(root, links, lambda line: tell(f"{path}: {line}"))
         order = _in_order(list(links), joints)
         _check_mimics(joints)
-        reader = _LinkMeshes(path, root, size, opacity, colours, materials, tell)
+        folders = () if assets is None else (Path(assets).resolve(),)
+        reader = _LinkMeshes(path, root, size, opacity, colours, materials, folders, tell)
         meshes = {}
         for link in order:
             with prefixed(f"link {link!r}"):
@@ -260,6 +266,7 @@ class _LinkMeshes:
     opacity: OpacityMode
     colours: bool
     materials: bool
+    assets: tuple[Path, ...]  # resolved folders, from which all files may be read
     tell: Callable[[str], None]
     _files: dict[Path, list[SceneMesh]] = field(default_factory=dict)
     _collide: list[str] = field(default_factory=list)  # links with collision shapes only
@@ -271,8 +278,7 @@ class _LinkMeshes:
         self._shared = {entry.get("name", ""): entry.find("color") for entry in materials}
         folder = self.path.parent.resolve()
         self._folders_above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
-        packages = (above for above in self._folders_above if (above / "package.xml").is_file())
-        self._package = next(packages, folder.parent)
+        self._package = next(filter(_is_package, self._folders_above), folder)
 
     def meshes_of(self, link: str, element: Element) -> Iterator[SceneMesh]:
         """Yield the meshes of a link, in the link's frame."""
@@ -352,10 +358,12 @@ class _LinkMeshes:
     def _meshes(self, name: str) -> list[SceneMesh]:
         """Return the meshes of a file, in the axes of the file."""
         path, package = self._find(name)
-        if not path.resolve().is_relative_to(package):
+        resolved = path.resolve()
+        if not any(resolved.is_relative_to(folder) for folder in (package, *self.assets)):
+            kind = "package" if _is_package(package) else "folder of the .urdf"
             raise LidarError(
-                f"its mesh {name[:200]!r} is outside the package, {package}: put the .urdf into "
-                "the folder of its package, or above it."
+                f"its mesh {name[:200]!r} is outside the {kind}, {package}: name a folder that "
+                "contains it as assets."
             )
         if path not in self._files:
             # Like RViz, which lets assimp ignore Collada's up_axis
@@ -367,6 +375,7 @@ class _LinkMeshes:
                 opacity=self.opacity,
                 colours=self.colours,
                 materials=self.materials,
+                assets=self.assets,
                 tell=self.tell,
             )
             self._allowance.add_file(path)
@@ -389,14 +398,17 @@ class _LinkMeshes:
         package, _, file = location.partition("/")
         if package in _NO_FOLDERS:
             raise LidarError(self._without_package(name, scheme, location))
-        for folder in self._folders_above:
-            if folder.name == package or _package_name(folder) == package:
+        for folder in (*self.assets, *self._folders_above):
+            is_allowed = folder in (*self.assets, self._package)
+            if (is_allowed or _is_package(folder)) and package in (folder.name, _name_of(folder)):
                 return folder / file, folder
-            if (folder / package).is_dir():
-                return folder / package / file, (folder / package).resolve()
+            inner = folder / package
+            if inner.is_dir() and (folder in self.assets or _is_package(inner)):
+                return inner / file, inner.resolve()
         raise LidarError(
-            f"its mesh {name[:200]!r} is of a package that is not there: put the .urdf into the "
-            f"folder {package[:80]!r} of that package, or beside it."
+            f"its mesh {name[:200]!r} is of a package that is not beside the .urdf nor above it, "
+            f"with a package.xml: name the folder {package[:80]!r}, or one that contains it, as "
+            "assets."
         )
 
     def _without_package(self, name: str, scheme: str, location: str) -> str:
@@ -410,12 +422,17 @@ class _LinkMeshes:
                 f"{folder[:80]!r} of the .urdf."
             )
         return (
-            f"{start} {scheme}://{'/'.join(parts)[:200]}, and put the .urdf into the folder "
-            f"{parts[0][:80]!r} of that package, or beside it."
+            f"{start} {scheme}://{'/'.join(parts)[:200]}, and name the folder {parts[0][:80]!r}, "
+            "or one that contains it, as assets, unless it is a package beside the .urdf or above."
         )
 
 
-def _package_name(folder: Path) -> str:
+def _is_package(folder: Path) -> bool:
+    """Return whether a folder is that of a package of ROS."""
+    return (folder / "package.xml").is_file()
+
+
+def _name_of(folder: Path) -> str:
     """Return the name in the package.xml of a folder; empty without a readable package.xml."""
     file = folder / "package.xml"
     try:

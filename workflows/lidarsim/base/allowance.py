@@ -29,6 +29,8 @@ class Allowance:
         Size of the file, bytes.
     advice
         Advice to the user if the content is larger, at the end of the error.
+    in_parts
+        Whether the content is never in memory as a whole: the memory does not limit it.
 
     Examples
     --------
@@ -38,8 +40,9 @@ class Allowance:
 2.70 GiB or more, of at most 256.00 MiB: export it again.
     """
 
-    def __init__(self, size: int, advice: str) -> None:
+    def __init__(self, size: int, advice: str, *, in_parts: bool = False) -> None:
         self.used_bytes = 0
+        self._in_parts = in_parts
         self._size = size
         self._advice = advice
         self._files: set[Path] = set()
@@ -47,7 +50,8 @@ class Allowance:
     @property
     def limit(self) -> int:
         """Limit, bytes."""
-        return min(max(UNPACKED_TIMES * self._size, MIN_LIMIT_BYTES), memory_share())
+        limit = max(UNPACKED_TIMES * self._size, MIN_LIMIT_BYTES)
+        return limit if self._in_parts else min(limit, memory_share())
 
     def grow(self, size: int) -> None:
         """Add the size of further data of the file, bytes."""

@@ -10,14 +10,27 @@ from .words import printable
 MAX_MISTAKES = 20
 _UNFORESEEN = (IndexError, TypeError, AttributeError, ArithmeticError, AssertionError)
 _MAX_REASON = 400  # letters: libraries may quote a whole file
+_MAX_LETTERS = 2000  # of a line of a message, of which the start names the file
+_END_LETTERS = 500  # of a line that is cut in its middle: what was expected, and advice
 
 
 class LidarError(Exception):
     """An error that the user can correct: bad input, a missing partition, a full disk.
 
     The message says in one or two lines what was given, what was expected and what to do. The
-    command prints the message without a traceback and exits with code 2.
+    command prints the message without a traceback and exits with code 2. A line is cut in its
+    middle if it quotes a file at length.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__("\n".join(map(_cut, str(message).split("\n"))))
+
+
+def _cut(line: str) -> str:
+    """Return a line without its middle if the line is too long to be read."""
+    if len(line) <= _MAX_LETTERS:
+        return line
+    return f"{line[: _MAX_LETTERS - _END_LETTERS]} … {line[-_END_LETTERS:]}"
 
 
 class CutShortError(ValueError):

@@ -42,13 +42,15 @@ _UNIT_SPELLINGS = {
 _UNITS = {word: unit for unit, words in _UNIT_SPELLINGS.items() for word in (unit, *words)}
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
 # A name of a header that spaces separate, with its unit: q_w []
-_WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
+_WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\[(\])]*[\])])?")
+_IN_BRACKETS = re.compile(r"[\[(][^\[(\])]*[\])]")
 _SEPARATORS = ",;\t"
 _HEADER_MARK = re.compile(r"^[#%\s]*(?:HEADER:)?")  # before a header in a remark
 _BETWEEN = re.compile(r"[\s_\-./:]+")  # words of a name
 _SUFFIX = re.compile(r"(.+?)[\s_\-./:]+([^\s_\-./:]+)")
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")  # between the words of timeStamp
 _SHOWN = 40  # columns that a message names
+_MAX_NAME = 200  # letters of a name with its unit; to split longer text takes time
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,8 @@ class ColumnName(NamedTuple):
 def column_name(cell: str) -> ColumnName:
     """Split a name in a header into its words and its unit."""
     text = cell.strip()
+    if len(text) > _MAX_NAME:
+        return ColumnName(text, text, None)
     if (bracketed := _BRACKETS.fullmatch(text)) is not None:
         stem = bracketed[1]
         unit = bracketed[2].lower()
@@ -207,16 +211,22 @@ def _is_finite(cell: str) -> bool:
 
 def _separator_of(line: str) -> str | None:
     """Return the most frequent of comma, semicolon and tab outside brackets; None for spaces."""
-    outside = re.sub(r"[\[(][^\])]*[\])]", "", line)
+    outside = _IN_BRACKETS.sub("", line)
     separator = max(_SEPARATORS, key=outside.count)
     return separator if separator in outside else None
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a line without quotes."""
+    """Return the cells of a line without quotes; ValueError for a cell that is too long."""
     if separator is None:
         return [word.strip('"') for word in _WORD.findall(line)]
-    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+    try:
+        (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+    except csv.Error as error:
+        reason = str(error)
+        if len(line) > csv.field_size_limit():
+            reason = f"a cell has more than {csv.field_size_limit():,} letters"
+        raise ValueError(f"one of its lines is not of a table: {reason}") from error
     return [cell.strip().strip('"') for cell in cells]
 
 
@@ -380,7 +390,7 @@ class _ColumnReader:
                 quantity, unit = match
                 self._add(quantity, index, self._unit(quantity, cell, unit, units))
             elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
-                raise ValueError(f"its column {cell!r} {reason}")
+                raise ValueError(f"its column {printable(cell)!r} {reason}")
             elif not any(fnmatchcase(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
         if unknown:
@@ -402,7 +412,8 @@ class _ColumnReader:
             if unit not in quantity.units:
                 units_read = " or ".join(name or "none" for name in quantity.units)
                 raise ValueError(
-                    f"its column {cell!r} has the unit {unit!r}: give it in {units_read}"
+                    f"its column {printable(cell)!r} has the unit {printable(unit)!r}: give it in "
+                    f"{units_read}"
                 )
             return unit
         if (implied := units.get(quantity.name)) is not None:
@@ -410,7 +421,7 @@ class _ColumnReader:
         if quantity.bare is None:
             first, *other_units = quantity.units
             stem = quantity.name.removesuffix(f"_{first}")
-            choice = f", or give columns: {{{quantity.name}: {cell}}}" * self.can_choose
+            choice = f", or give columns: {{{quantity.name}: {printable(cell)}}}" * self.can_choose
             unit_option = ", or give time_unit" * (quantity.units is SECONDS)
             names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
             raise ValueError(
@@ -425,10 +436,10 @@ class _ColumnReader:
             earlier_cell = self.cells[earlier[0]]
             cell = self.cells[index]
             if earlier_cell == cell:
-                raise ValueError(f"it has the column {earlier_cell!r} twice")
+                raise ValueError(f"it has the column {printable(cell)!r} twice")
             raise ValueError(
-                f"its columns {earlier_cell!r} and {cell!r} are both {quantity.name}: give ignore: "
-                f"[{cell}] to leave one out"
+                f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} are both "
+                f"{quantity.name}: give ignore: [{printable(cell)}] to leave one out"
             )
         self.assigned[quantity.name] = index, unit
 
@@ -443,7 +454,7 @@ class _ColumnReader:
                 stem = name.removesuffix(f"_{unit}")
                 names = " or ".join(f"{stem}_{unit_name}" for unit_name in quantity.units)
                 raise ValueError(
-                    f"its column {self.cells[index]!r} has no unit, and values up to "
+                    f"its column {printable(self.cells[index])!r} has no unit, and values up to "
                     f"{largest:.3g} may have any: call it {names}"
                 )
         assert unit is not None  # set above
@@ -502,8 +513,9 @@ def _numbers(
                 if not _is_finite(cells[index]):
                     alternative = "" if name in required_names else ", or ignore the column"
                     raise ValueError(
-                        f"its column {header.cells[index]!r} has {cells[index]!r} in line "
-                        f"{number}: give a number in every line{alternative}"
+                        f"its column {printable(header.cells[index])!r} has "
+                        f"{printable(cells[index])!r} in line {number}: give a number in every line"
+                        f"{alternative}"
                     ) from error
         raise
     return np.asarray(values, np.float64)

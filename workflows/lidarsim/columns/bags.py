@@ -15,6 +15,7 @@ from ..base.errors import CutShortError, LidarError
 from ..base.extras import need, reading
 from ..base.input_files import input_size
 from ..base.words import distinct, printable
+from .mcap_chunks import check_chunks, check_packed
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -64,6 +65,10 @@ def open_bag(path: Path, name: str) -> Reader:
         for file in path.iterdir() if path.is_dir() else [path]:
             if not file.is_dir():
                 input_size(file)
+                if file.suffix.lower() == ".mcap":
+                    check_chunks(file)
+                elif file.suffix.lower() == ".zstd":
+                    check_packed(file)
         try:
             bag = Reader(path)
             bag.open()
@@ -155,8 +160,8 @@ def livox_columns(data: bytes) -> dict[str, AnyArray]:
     start = 4 + header_size + 20  # time, number of points, identifier, length of the points
     count = number(start - 4)
     row = LIVOX_POINT.newbyteorder(order)
-    content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
     if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):
         raise CutShortError(f"{count:,} points announced, and there are fewer")
+    content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
     rows = np.frombuffer(content, row)
     return {name: rows[name] for name in row.names or ()}

@@ -1,0 +1,156 @@
+"""Files that runs read, to be damaged: recordings, traces of OSI, HELIOS++, and compiled loops."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from click.testing import CliRunner
+from distributed import Client
+from tests.chaos.target import Target
+from tests.shapes import block
+
+from lidarpool import (
+    Actor,
+    LidarError,
+    Result,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+    save_cloud,
+    simulate,
+)
+from lidarpool.cli.scenario_commands import import_
+from lidarpool.playback.recording import Recording
+from lidarpool.recordings.recordings import open_sensors
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from raybeam.compiled import compiled
+
+RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}
+TRACES = {"osi": "trace_gt.osi", "osi_mcap": "trace.mcap"}  # {format: file}
+TRAFFIC = """
+sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
+poses: [[0, 0, 1]]
+steps: 25
+"""
+SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
+HELIOS = {
+    "parts/ground.obj": f"mtllib ground.mtl\nusemtl soil\n{SQUARE}",
+    "parts/ground.mtl": "newmtl soil\nhelios_isGround true\nhelios_reflectance 0.3\n",
+    "parts/points.xyz": "".join(f"{x} {y} {x / 9}\n" for x in range(9) for y in range(9)),
+    "devices.xml": """<document>
+<scanner id="s" name="S" optics="oscillating" scanAngleMax_deg="60" scanFreqMin_Hz="1"
+ scanFreqMax_Hz="200" pulseFreqs_Hz="1000"/>
+<platform id="plane" type="linearpath"><scannerMount z="0.5"/></platform></document>""",
+    "fly.xml": """<document>
+<survey name="fly" scene="fly.xml#field" platform="devices.xml#plane" scanner="devices.xml#s">
+<leg><platformSettings x="0" y="0" z="50" movePerSec_m="10"/>
+<scannerSettings pulseFreq_hz="1000" scanAngle_deg="30" scanFreq_hz="30"/></leg>
+<leg><platformSettings x="3" y="4" z="50"/></leg></survey>
+<scene id="field"><part>
+<filter type="objloader"><param type="string" key="filepath" value="parts/ground.obj"/></filter>
+<filter type="scale"><param type="double" key="scale" value="100"/></filter></part>
+<part><filter type="xyzloader"><param type="string" key="filepath" value="parts/points.xyz"/>
+<param type="double" key="voxelSize" value="1"/></filter></part></scene></document>""",
+}
+LOOP = "def twice(x):\n    return 2.0 * x\n"
+
+
+def write_inputs(folder: Path, client: Client) -> list[Target]:
+    """Write inputs into folders."""
+    result = drive(client)
+    recordings = folder / "recordings" / "whole"
+    recordings.mkdir(parents=True)
+    for name, path in RECORDINGS.items():
+        save_cloud(result.cloud, recordings / path, format=name)
+    traces = folder / "traces" / "whole"
+    traces.mkdir(parents=True)
+    for name, file in TRACES.items():
+        save_cloud(result.cloud, traces / file, format=name)
+        (traces / f"{name}.yaml").write_text(f"{TRAFFIC}traffic: {{file: {file}}}\n")
+    return [
+        Target(recordings, {"recordings": read_recordings}, lambda file: file.suffix == ".mcap"),
+        Target(recordings, {"recordings": read_recordings}, lambda file: file.suffix == ".pcap"),
+        Target(traces, {"traces": read_traces}, lambda file: file.suffix != ".yaml"),
+        helios_target(folder),
+        loops_target(folder),
+    ]
+
+
+def helios_target(folder: Path) -> Target:
+    """Write a survey of HELIOS++ into a folder."""
+    helios = folder / "helios" / "whole"
+    for name, text in HELIOS.items():
+        path = helios / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return Target(helios, {"HELIOS++": import_helios})
+
+
+def loops_target(folder: Path) -> Target:
+    """Compile a loop, whose code numba keeps in a folder."""
+    loops = folder / "loops" / "whole"
+    loops.mkdir(parents=True)
+    (loops / "twice.py").write_text(LOOP)
+    run_loop(loops)
+    return Target(loops, {"loops": run_loop}, lambda file: file.suffix in (".nbc", ".nbi"))
+
+
+def drive(client: Client) -> Result:
+    """Run a revolution of a VLP-16, past which a car drives."""
+    scene = Scene.from_meshes([block("room", (10, 8, 6))])
+    car = Actor(block("car", (1, 1, 1)), Track([0, 9], [[2, 0, 0], [3, 0, 0]]))
+    columns = ["ray", "range", "reflectivity", "time", "intensity"]
+    survey = Survey(load_sensor("vlp16"), [(0, 0, 0)], 36, columns=columns, keep_every=1)
+    return simulate(scene.with_actors((car,)), survey, client=client, backend="numpy")
+
+
+def read_recordings(place: Path) -> str:
+    """Read sweeps of each recording, and the datagrams of packets."""
+    for path in sorted(place.rglob("*.*cap")):
+        if path.suffix == ".pcap":
+            list(Recording(path).batches(100_000_000))
+        for recording in open_sensors(path).values():
+            for number in range(min(2, recording.count)):
+                recording.read_points(number)
+            if recording.times is not None:
+                list(recording.times())
+    return ""  # they have no checksums of all
+
+
+def read_traces(place: Path) -> str:
+    """Build scenarios with the traffic of each trace."""
+    for path in sorted(place.glob("*.yaml")):
+        build(Scenario.load(path))
+    return ""
+
+
+def import_helios(place: Path) -> str:
+    """Import a survey of HELIOS++, as the command does."""
+    outcome = CliRunner().invoke(import_, [str(place / "fly.xml"), "-o", str(place / "out")])
+    if isinstance(outcome.exception, Exception):
+        raise outcome.exception
+    if outcome.exit_code:
+        raise LidarError(outcome.output.strip())
+    return ""
+
+
+def run_loop(place: Path) -> str:
+    """Run a loop that numba compiled, or compiles again."""
+    loop = compiled("f8(f8)")(module_of(place / "twice.py").twice)
+    return str(loop(21.0))
+
+
+def module_of(path: Path) -> ModuleType:
+    """Import a file, each time anew."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module  # compiled code imports its module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,156 @@
+"""Chunks of MCAP files, and packed bags: what they unpack to is known before they are unpacked.
+
+After the specifications of MCAP (https://mcap.dev/spec) and of Zstandard (RFC 8878). LZ4, the other
+compression, unpacks to at most 255 times its size.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from struct import Struct
+
+from ..base.allowance import Allowance
+from ..base.input_files import input_size, open_input
+
+_MAGIC_BYTES = 8
+_CHUNK = 0x06
+_CHUNK_INDEX = 0x08
+_RECORD = Struct("<BQ")  # kind, and length of the content
+_LENGTH_BYTES = 8  # of the length of the packed messages
+_CHUNK_HEAD = Struct("<QQQII")  # first and last time, unpacked size, checksum, length of a name
+# First and last time, start and length of the chunk, length of offsets of messages.
+_INDEX_HEAD = Struct("<QQQQI")
+_NAME_LENGTH = Struct("<I")
+_SIZES = Struct("<QQ")  # packed and unpacked
+_ZSTD = b"zstd"
+_ADVICE = "record it with smaller chunks, or without compression"
+
+_FRAME = 0xFD2FB528
+_SKIPPABLE_FRAMES = range(0x184D2A50, 0x184D2A60)
+_BLOCK_HEADER_BYTES = 3
+_BLOCK_BYTES = 128 << 10  # of a compressed block, unpacked, at most
+_RAW = 0
+_REPEATED = 1
+
+
+def check_chunks(path: Path) -> None:
+    """Check that the chunks of an MCAP file unpack to no more than its size allows.
+
+    Chunks that are cut short, and what is no MCAP, are left to the library that reads the file.
+
+    Raises
+    ------
+    LidarError
+        If a chunk alone takes more memory than the file allows, or all chunks together unpack to
+        far more than the file has bytes.
+    OSError
+        If the file cannot be read.
+    """
+    size = input_size(path)
+    if size < _MAGIC_BYTES:
+        return
+    # Of the chunks, and of those that the index names.
+    totals = {kind: Allowance(size, _ADVICE, in_parts=True) for kind in (_CHUNK, _CHUNK_INDEX)}
+    # Only the headers of chunks and blocks are touched: a bag may have any length.
+    with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        for kind, unpacked_bytes in _unpacked_sizes(data):
+            Allowance(size, _ADVICE).take(unpacked_bytes)
+            totals[kind].take(unpacked_bytes)
+
+
+def check_packed(path: Path) -> None:
+    """Check that a file packed by Zstandard unpacks to no more than its size allows, on the disk.
+
+    LidarError and OSError are as for `check_chunks`.
+    """
+    size = input_size(path)
+    if not size:
+        return
+    with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        unpacked_bytes = max_unpacked_bytes(data, 0, size)
+    Allowance(size, _ADVICE, in_parts=True).take(unpacked_bytes)
+
+
+def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
+    """Yield the kind of each record of a chunk, and the bytes to which the chunk may unpack.
+
+    Libraries find chunks by their records, or by the records of an index, which may differ.
+    """
+    position = _MAGIC_BYTES
+    while position + _RECORD.size <= len(data):
+        kind, length = _RECORD.unpack_from(data, position)
+        start = position + _RECORD.size
+        position = start + length
+        if position > len(data):
+            return
+        try:
+            if kind == _CHUNK:
+                yield kind, _chunk_bytes(data, start, position)
+            elif kind == _CHUNK_INDEX:
+                yield kind, _indexed_bytes(data, start)
+        except struct.error:  # a record that is too short
+            continue
+
+
+def _chunk_bytes(data: mmap, start: int, stop: int) -> int:
+    """Return the number of bytes to which the chunk of a record may unpack."""
+    *_, stated_bytes, _, name_length = _CHUNK_HEAD.unpack_from(data, start)
+    name_start = start + _CHUNK_HEAD.size
+    packed_start = name_start + name_length + _LENGTH_BYTES
+    if data[name_start : name_start + name_length] != _ZSTD:
+        return int(stated_bytes)
+    return max(stated_bytes, max_unpacked_bytes(data, packed_start, stop))
+
+
+def _indexed_bytes(data: mmap, start: int) -> int:
+    """Return the number of bytes to which the chunk of a record of the index may unpack."""
+    *_, chunk_start, _, offsets_length = _INDEX_HEAD.unpack_from(data, start)
+    name_start = start + _INDEX_HEAD.size + offsets_length + _LENGTH_BYTES
+    (name_length,) = _NAME_LENGTH.unpack_from(data, name_start)
+    name_start += _NAME_LENGTH.size
+    packed_length, stated_bytes = _SIZES.unpack_from(data, name_start + name_length)
+    if data[name_start : name_start + name_length] != _ZSTD:
+        return int(stated_bytes)
+    packed_start = chunk_start + _RECORD.size + _CHUNK_HEAD.size + name_length + _LENGTH_BYTES
+    packed_stop = min(packed_start + packed_length, len(data))
+    return max(stated_bytes, max_unpacked_bytes(data, packed_start, packed_stop))
+
+
+def max_unpacked_bytes(data: bytes | mmap, start: int, stop: int) -> int:
+    """Return the maximum number of bytes to which frames of Zstandard unpack.
+
+    The frames are the bytes of `data` from `start` to `stop`.
+    """
+    total = 0
+    position = start
+
+    def number(length: int) -> int:
+        """Return the number of some bytes at the position."""
+        return int.from_bytes(data[position : min(position + length, stop)], "little")
+
+    while position + 8 <= stop:
+        magic = number(4)
+        if magic in _SKIPPABLE_FRAMES:
+            position += 4
+            position += 4 + number(4)
+            continue
+        if magic != _FRAME:
+            break
+        descriptor = data[position + 4]
+        is_single = descriptor >> 5 & 1
+        dictionary_bytes = (0, 1, 2, 4)[descriptor & 3]
+        size_bytes = (is_single, 2, 4, 8)[descriptor >> 6]
+        position += 5 + (1 - is_single) + dictionary_bytes + size_bytes
+        is_last = False
+        while not is_last and position + _BLOCK_HEADER_BYTES <= stop:
+            header = number(_BLOCK_HEADER_BYTES)
+            is_last = bool(header & 1)
+            kind = header >> 1 & 3
+            size = header >> 3
+            total += size if kind in (_RAW, _REPEATED) else _BLOCK_BYTES
+            position += _BLOCK_HEADER_BYTES + (1 if kind == _REPEATED else size)
+        position += 4 * (descriptor >> 2 & 1)  # checksum
+    return total
