@@ -127,13 +127,20 @@ _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, sign
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _fork_server() -> None:
-    """Start the fork server as the product does, before a cluster of Dask's own starts another."""
+def _fork_server() -> Iterator[None]:
+    """Start the fork server as the product does, before a cluster of Dask's own starts another.
+
+    A command in this process does not end it: workers of the session's clusters would end with it.
+    """
     try:
-        from lidarpool.base.fork_server import start_fork_server
+        from lidarpool.base import fork_server
     except ImportError:
+        yield
         return
-    start_fork_server()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fork_server, "stop_fork_server", lambda: None)
+        fork_server.start_fork_server()
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

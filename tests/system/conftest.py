@@ -17,7 +17,6 @@ import pytest
 from distributed import Client, Worker, WorkerPlugin
 from tests.daemons import wait_until
 
-import lidarpool.base.fork_server
 import lidarpool.report.campaign_report
 import lidarpool.report.charts
 import lidarpool.report.result_pictures
@@ -211,12 +210,8 @@ class Outcome:
 
 
 @pytest.fixture(name="lidarpool")
-def run_lidarpool(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., Outcome]:
+def run_lidarpool(capfd: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
     """Run the command in this process."""
-    # The workers of `local_client` are forked from the same server, and end with it.
-    monkeypatch.setattr(lidarpool.base.fork_server, "stop_fork_server", lambda: None)
 
     def run(*arguments: object) -> Outcome:
         capfd.readouterr()
