@@ -45,7 +45,8 @@ class Partition:
     client
         Client of the cluster. By default, in a task, that of its worker.
     note
-        A remark for users, such as that there were no GPUs.
+        A remark for users, such as that there were no GPUs. The division that makes the
+        partition logs the note as a warning, once.
     by_rule
         Whether a division of the pool made it, so that it can be dissolved.
 
@@ -92,7 +93,7 @@ class Partition:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
+        return f"<Partition {self.name!r}>"  # without the note, which is logged when it is made
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""

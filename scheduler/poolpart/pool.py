@@ -244,7 +244,7 @@ class Pool:
             Name of the partition and of the resource.
         max_workers_per_gpu
             At most so many workers for each GPU. If the pool has no GPU at all, the partition
-            takes so many CPU workers a host instead, and its `note` says so.
+            takes so many CPU workers a host instead. A warning says so, which `note` keeps.
         max_workers_per_host
             At most so many workers of each host.
         n_workers
