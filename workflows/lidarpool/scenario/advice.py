@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,11 @@ from lidarsim.columns.table import VELOCITY
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
 from lidarsim.sensor.materials import MaterialTable
-from lidarsim.sensor.models import STATED
 from lidarsim.sensor.trajectory import presence_ns
 
 from ..export.laser_scan import has_planar_sensors
 from .build import Built
 from .scenario import Scenario
-from .sections import SensorSection
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
 # seen from outside is rarely longer than a bus. glTF is in metres, and some exporters write
@@ -35,7 +33,7 @@ def advice(built: Built) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
     There are also notes on objects that were left out, files whose axes were guessed, poses that
-    were chosen, figures that data sheets lack, and settings without effect.
+    were chosen, and settings without effect.
     """
     notes = built.findings.notes
     remarks = built.findings.remarks
@@ -47,7 +45,6 @@ def advice(built: Built) -> list[str]:
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
     likely = filter(None, (_size_note(built, side), placed, _colour_note(built)))
-    unstated = dict.fromkeys(_unstated_figures(built))
     scanners = [
         "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
         "to 1"
@@ -57,7 +54,7 @@ def advice(built: Built) -> list[str]:
         "cloud.precision_m in a scenario"
     ] * (side < MIN_STEPS * step)
     settings = (*coarse, *scanners, *_without_effect(built.scenario))
-    lines = (*notes, *axes, *likely, *unstated, *settings, *_timing_notes(built))
+    lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
 
 
@@ -118,18 +115,6 @@ def _colour_note(built: Built) -> str:
         f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
         f"have no colours and are grey: {shown}"
     )
-
-
-def _unstated_figures(built: Built) -> Iterator[str]:
-    """Name the figures that neither the data sheets of sensors nor the scenario give."""
-    scenario = built.scenario
-    scenario_fields = built.scenario.noise.model_fields_set
-    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
-    for section, carried in zip(sections.values(), built.survey.carried, strict=True):
-        lacking = (name for name in STATED if not getattr(carried.noise, name, True))
-        if missing := [name for name in lacking if name not in scenario_fields]:
-            lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in missing)
-            yield f"{section.model} gives no {lacks}: they have no effect"
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:

@@ -269,7 +269,9 @@ class SensorModel(_ModelSection):
         min_range_m, max_range_m = self.range_m or (0.0, float("inf"))
         noise = performance.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
         subrays = 1 if self.optics.divergence_mrad is None else 7
-        missing = tuple(words for name, words in STATED.items() if not getattr(noise, name))
+        missing = tuple(
+            f"{words} (noise.{name})" for name, words in STATED.items() if not getattr(noise, name)
+        )
         return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
 
     def packet_settings(self, lasers: Ints) -> PacketSettings | None:
@@ -428,7 +430,7 @@ class Datasheet(NamedTuple):
 
     noise: Noise
     returns: Returns
-    missing: tuple[str, ...]  # figures that the sheet does not state, in words
+    missing: tuple[str, ...]  # figures that the sheet does not state, with the fields for them
 
 
 def shown_noise(noise: Noise) -> str:
