@@ -146,7 +146,7 @@ WRONG = {
     ],
     compare: [
         (3, "a.ply", "a is 3"),
-        ("a.ply", "b.ply", "a.ply does not exist, or is empty: give the folder of a result"),
+        ("a.ply", "b.ply", "a.ply does not exist: give the folder of a result"),
     ],
     load_robot: [(3, "path is 3"), (None, "None; it must")],
     Scene.load: [(3, "path is 3"), (None, "None; it must")],

@@ -442,7 +442,7 @@ WRONG = {
     "together": ({"sensors.roof.layers": {"integer": [8, 9]}}, "leave out layers"),
     "file": (
         {"scene.files.0.file": {"choice": ["hall.glb", "hut.glb"]}},
-        "hut.glb' does not exist",
+        "hut.glb does not exist",
     ),
     "descending": ({KM: {"uniform": [2, 1]}}, f"vary.{KM}.uniform is [2, 1]; it must be [least"),
     "two kinds": ({KM: {"uniform": [1, 2], "choice": [1]}}, "give one of uniform, log_uniform"),
@@ -478,7 +478,7 @@ def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
     vary = {"actors": {"sample": {"from": "cars.csv", "count": 1}}}
     with pytest.raises(LidarError) as raised:
         campaign(vary).check_files()
-    where = f"actors: {folder / 'cars.csv'}, line 4: {str(folder / 'van.obj')!r} does not exist"
+    where = f"actors: {folder / 'cars.csv'}, line 4: {folder / 'van.obj'} does not exist"
     assert where in str(raised.value)
 
 
@@ -489,7 +489,7 @@ def test_it_is_told_what_is_wrong(campaign, name):
         campaign(vary).check_files()
     told = str(raised.value)
     assert says in told
-    assert "campaign.yaml: vary" in told or name == "file"
+    assert "campaign.yaml: vary" in told
     assert len(told.splitlines()) <= 2 or name == "other rows"
 
 
@@ -533,7 +533,7 @@ def test_files_of_every_row_are_looked_for(campaign, folder):
     vary = {"actors": {"sample": {"from": "cars.csv", "count": [0, 2]}}}
     for i in range(4):
         (folder / f"{i}.csv").touch()
-    with pytest.raises(LidarError, match=r"4\.csv' does not exist"):
+    with pytest.raises(LidarError, match=r"base\.yaml: .*4\.csv does not exist"):
         campaign(vary).check_files()
     (folder / "4.csv").touch()
     campaign(vary).check_files()
@@ -574,7 +574,7 @@ def test_given_files_that_cannot_be_used(folder):
         "is a campaign",
     )
     assert len(lines) == 3 and all(map(str.__contains__, lines, says))
-    with pytest.raises(LidarError, match=r"none\.glb' does not exist"):
+    with pytest.raises(LidarError, match=r"none\.glb does not exist"):
         Campaign.of_scenarios([folder / "none.glb", folder / "base.yaml"]).check_files()
 
 

@@ -465,7 +465,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     header = laspy.LasHeader(point_format=6, version="1.4")
     laspy.LasData(header).write(tmp_path / "none.las")
     for path, says in (
-        ("nowhere.pcd", "does not exist, or is empty: give the folder of a result"),
+        ("nowhere.pcd", "does not exist: give the folder of a result"),
         ("notes.md", "is not read: give the folder of a result"),
         ("empty", "is not read"),
         ("none.las", "has no points: there is nothing to compare"),

@@ -287,6 +287,43 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     assert str(raised.value).count("does not exist") == 2
 
 
+@pytest.mark.parametrize(
+    ("text", "field", "file"),
+    [
+        ("scene: no.glb", "scene.files[0].file", "no.glb"),
+        ("actors: [{name: A, file: no.urdf, at: [1, 1, 0]}]", "actors[0].file.file", "no.urdf"),
+        (
+            "scene: {preset: seed, copies: [{name: T, box: [1, 1, 1], table: no.csv}]}",
+            "scene.copies[0].table.file",
+            "no.csv",
+        ),
+        ("trajectory: no.tum", "trajectory.file", "no.tum"),
+        ("traffic: {file: no.xml, vehicles: [{box: [1, 1, 1]}]}", "traffic.file", "no.xml"),
+        ("sensor: {calibration: no.json}", "sensor.calibration", "no.json"),
+        ("sensors: {roof: unit-17.yaml}", "sensors.roof.model", "unit-17.yaml"),
+    ],
+)
+def test_a_file_that_is_lost_is_told_with_scenario_and_field(scenario, tmp_path, text, field, file):
+    with pytest.raises(LidarError) as raised:
+        build(scenario(text))
+    (line,) = str(raised.value).splitlines()
+    assert line.endswith(
+        f"s.yaml: {field}: {tmp_path / file} does not exist: check the name and the folder."
+    )
+
+
+def test_a_file_that_is_lost_is_told_beside_other_faults_and_a_similar_name(scenario, tmp_path):
+    (tmp_path / "hall.glb").write_bytes(b"")
+    with pytest.raises(LidarError) as raised:
+        build(scenario("scene: [hal.glb, hall.glb]"))
+    lost, empty = str(raised.value).splitlines()
+    assert "scene.files[0].file: " in lost and lost.endswith(" Did you mean 'hall.glb'?")
+    assert "hall.glb is empty" in empty
+    with pytest.raises(LidarError) as raised:
+        build(Scenario.load(tmp_path / "no.obj"))
+    assert str(raised.value).startswith(f"{tmp_path / 'no.obj'} does not exist: ")
+
+
 def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario):
     read = scenario("cloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}")
     las, kitti = advice(build(read))

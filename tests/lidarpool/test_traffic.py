@@ -427,7 +427,7 @@ def test_what_is_wrong_with_traffic_is_told(tmp_path):
         build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
     with pytest.raises(LidarError, match="give either file or box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
-    with pytest.raises(LidarError, match=r"no\.xml' does not exist|no\.xml.*No such file"):
+    with pytest.raises(LidarError, match=r"traffic\.file: .*no\.xml does not exist"):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
     with pytest.raises(LidarError, match="surfaces names 'Street'"):
         build(scenario(tmp_path, traffic={"surfaces": "Street"}))

@@ -479,7 +479,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
     a.write_text(SQUARE), b.write_text("nothing")
     begun = lidarpool(*run)
-    assert begun.code == 2 and "c.obj' does not exist" in begun.err
+    assert begun.code == 2 and "c.obj does not exist" in begun.err
     assert not (files / "ds").exists()
     c.write_text(SQUARE)
     assert "1 job failed" in lidarpool(*run).err

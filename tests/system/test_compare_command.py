@@ -55,7 +55,7 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["clean", "nowhere"], "nowhere does not exist, or is empty: give the folder of a result"),
+        (["clean", "nowhere"], "nowhere does not exist: give the folder of a result"),
         (["clean", "clean.yaml"], "clean.yaml is not read: give the folder of a result"),
         (["clean", "clean", "--sweep", "3"], "there is no sweep 3: 3 pairs of sweeps, from 0"),
         (["clean", "clean", "--sensor-a", "roof"], "not 'roof'"),

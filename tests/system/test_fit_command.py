@@ -69,7 +69,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nowhere"], "nowhere does not exist, or is empty: give the folder of a result"),
+        (["nowhere"], "nowhere does not exist: give the folder of a result"),
         ([".", "--model", "no-such"], "There is no sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),

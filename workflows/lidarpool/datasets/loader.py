@@ -30,6 +30,7 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
 from ..export.boxes import Boxes
+from ..export.folder import refuse_missing
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..export.pieces import Entry
@@ -288,6 +289,7 @@ def sweeps(
 
 def read_index(storage: Storage) -> dict[str, Any]:
     """Read the index of a data set, with jobs by number; LidarError if the set is unfinished."""
+    refuse_missing(storage, "give the folder of a data set, the --out of a campaign.")
     try:
         head = unsealed(storage.read(INDEX_FILE))
         if head["version"] != VERSION:

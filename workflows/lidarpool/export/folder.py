@@ -67,12 +67,20 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
         os.close(lock)
 
 
+def refuse_missing(place: Path | Storage, advice: str) -> None:
+    """Raise LidarError with advice if a path, of a folder or file, does not exist."""
+    local = place if isinstance(place, Path) else Path(place.url) if place.is_local else None
+    if local is not None and not local.exists():
+        raise LidarError(f"{place} does not exist: {advice}")
+
+
 @contextmanager
 def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
     """Yield the folder of a result: for storage, a temporary copy of the files `names`.
 
-    LidarError if the storage cannot be read, or has no complete result.
+    LidarError if the folder does not exist, the storage cannot be read, or has no complete result.
     """
+    refuse_missing(output, "give the folder of a finished run (its --out).")
     with local_folder(output) as folder:
         if not isinstance(output, Storage):
             yield folder

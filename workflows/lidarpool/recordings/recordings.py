@@ -351,8 +351,10 @@ def _open_path(
     path: Path, name: str, sensor: str | None, intensity: str | None, unit: str | None
 ) -> Recording:
     """Open a file or folder; `unit` replaces the units that a file states."""
-    if not path.exists() or (path.is_file() and not path.stat().st_size):
-        raise LidarError(f"{name} does not exist, or is empty: give {KINDS}.")
+    if not path.exists():
+        raise LidarError(f"{name} does not exist: give {KINDS}.")
+    if path.is_file() and not path.stat().st_size:
+        raise LidarError(f"{name} is empty (0 bytes): give {KINDS}.")
     if path.is_dir():
         recording = _open_folder(path, name, sensor, intensity)
     else:

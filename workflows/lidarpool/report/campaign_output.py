@@ -22,7 +22,7 @@ from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
-from ..export.folder import LAST_FILE, result_folder
+from ..export.folder import LAST_FILE, refuse_missing, result_folder
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..run.run_result import CampaignRun
@@ -240,6 +240,7 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
     DamagedRecordError if the file is damaged or edited; LidarError if there is none.
     """
+    refuse_missing(storage, "give the folder of a data set, the --out of a campaign.")
     try:
         record = unsealed(storage.read(CAMPAIGN_FILE))
         for name, kind in _RECORDED.items():

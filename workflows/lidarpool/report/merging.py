@@ -26,7 +26,7 @@ from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_seconds import known_seconds, read_seconds
 from ..datasets.job_table import JobRow
-from ..export.folder import LAST_FILE, output_place, result_folder
+from ..export.folder import LAST_FILE, output_place, refuse_missing, result_folder
 from ..plan import Trial
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
@@ -186,6 +186,7 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
 
 def _read_part(storage: Storage) -> _Part:
     """Read a finished shard, or data set of several shards; LidarError if damaged or unfinished."""
+    refuse_missing(storage, "give the folder of a shard, the --out of lidarpool run --shard.")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
         run = storage.below(RUN_FOLDER)

@@ -191,6 +191,14 @@ def build(
     LidarError
         If a file cannot be read, or fields contradict each other or the scene.
     """
+    with scenario.naming_lost_files():
+        return _build(scenario, plans, cache, columns)
+
+
+def _build(
+    scenario: Scenario, plans: bool, cache: SceneCache | None, columns: Sequence[str]
+) -> Built:
+    """Build as `build`."""
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
     findings = static.findings.copy()
     scene = static.scene

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from lidarsim.base.declared import Seed
 from lidarsim.base.errors import LidarError, Mistakes
-from lidarsim.base.input_files import read_input_text
+from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.validation import checked, sentences
 from lidarsim.base.yamlfile import read_yaml
 
@@ -256,8 +256,7 @@ class CampaignSpec:
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
         mistakes.lines += [
-            f"{self.command}: {self._jobs.named_in(path)}{str(path)!r} does not exist: check the "
-            "name and the folder."
+            f"{self._jobs.named_in(path) or f'{self.command}: '}{not_found(path)}"
             for path in lost
         ]
         mistakes.tell()

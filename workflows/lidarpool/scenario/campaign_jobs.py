@@ -68,7 +68,7 @@ class JobSource:
         return None
 
     def named_in(self, file: Path) -> str:
-        """Return the table and line that name a file, to start a message; empty without table."""
+        """Return what names a file, to start a message, such as a scenario and its field."""
         return ""
 
     def job(
@@ -187,6 +187,10 @@ class ScenarioJobs(JobSource):
         """Return the name of a job: the name of its file without suffix."""
         return self._names[number]
 
+    def named_in(self, file: Path) -> str:
+        """Return the scenario and the field that name a file, to start a message."""
+        return next(filter(None, (Scenario.load(path).named_in(file) for path in self.paths)), "")
+
     def scenario(self, number: int) -> Scenario:
         """Read the scenario of a job."""
         return Scenario.load(self.paths[number])
@@ -261,13 +265,15 @@ class VariedJobs(JobSource):
         }
 
     def named_in(self, file: Path) -> str:
-        """Return the field, table and line that name a file, to start a message."""
+        """Return the field that names a file, also with table and line, to start a message."""
         tables = {path: text for base in self._bases for text, path in base.table_files.items()}
         for table, text in tables.items():
             for number, line in enumerate(read_text(table).splitlines(), 1):
                 if file.name in line and not line.lstrip().startswith("#"):
-                    return f"{text}: {table}, line {number}: "
-        return ""
+                    return f"{self._source}: {text}: {table}, line {number}: "
+        scenarios = [base.scenario for base in self._bases]
+        scenarios += [base.files[file] for base in self._bases if file in base.files]
+        return next(filter(None, (scenario.named_in(file) for scenario in scenarios)), "")
 
     def values(self, number: int) -> dict[str, Value]:
         """Return the values that a job has for the table of jobs."""
@@ -319,7 +325,7 @@ class _Base:
         self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
         self.table_files: dict[str, Path] = {}
-        self.files: set[Path] = set()  # that a job may read
+        self.files: dict[Path, Scenario] = {}  # {file that a job may read: a scenario with it}
         mistakes = Mistakes()
         for text, choice in vary.items():
             with mistakes.noted(), prefixed(label):
@@ -369,7 +375,7 @@ class _Base:
                 mistakes.lines += [f"{source}: {self._label}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
                 return
-            self.files.update(scenario.files)
+            self.files |= dict.fromkeys(scenario.files, scenario)
 
     def _trials(self, text: str) -> list[Any]:
         """Return values for a path that are valid if all jobs are; rows of a table in pieces."""

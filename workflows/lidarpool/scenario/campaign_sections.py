@@ -44,7 +44,7 @@ from lidarsim.base.declared import (
     short,
 )
 from lidarsim.base.errors import LidarError, Mistakes, message_of
-from lidarsim.base.input_files import read_input_text
+from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields, sections_in, sentences
@@ -534,7 +534,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         model = next(sections_in(entry), BaseModel)
         _check_columns(names, model)
     except FileNotFoundError as error:
-        raise LidarError(f"{path} does not exist: check the name and the folder.") from error
+        raise LidarError(not_found(path)) from error
     except (OSError, ValueError, csv.Error, LidarError) as error:
         raise LidarError(f"{path} is not a usable table: {message_of(error)}") from error
     adapter = TypeAdapter(entry)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -13,9 +14,11 @@ from pydantic import PrivateAttr
 
 from lidarsim.base.declared import Several, Text, about, by_text
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
+from lidarsim.base.input_files import not_found
 from lidarsim.base.validation import sentences
 from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLOURS
+from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.sensor import Fault, Material, Navigation
 from lidarsim.sensor.materials import ClassNames
 from lidarsim.sensor.models import plugin_model_file
@@ -25,6 +28,7 @@ from lidarsim.sensor.trajectory_files import files_of_trajectory
 from lidarsim.sensor.weather import Weather
 
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
+from .named_files import field_that_names
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -73,6 +77,11 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
         "output": {"write": options["format"]} if "format" in options else None,
     }
     return {name: value for name, value in data.items() if value is not None}
+
+
+def survey_of(mesh_file: Path) -> str:
+    """Return the name of the survey of a mesh file without a scenario, for messages."""
+    return f"survey of {mesh_file}"
 
 
 class Scenario(Section):
@@ -214,7 +223,7 @@ class Scenario(Section):
                 f"--{name.replace('_', '-')} is for a mesh file: in {path}"
                 f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
             )
-        return cls.from_data(data, source=f"{'survey of ' * mesh}{path}", folder=path.parent)
+        return cls.from_data(data, source=survey_of(path) if mesh else str(path), folder=path.parent)
 
     @classmethod
     def from_data(
@@ -261,7 +270,7 @@ class Scenario(Section):
             mistakes.lines.append(f"{self._source}: {reason}")
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
-                with mistakes.noted(), prefixed(self._source):
+                with mistakes.noted(), self.naming_lost_files(), prefixed(self._source):
                     mounted = section.mounted(self.path, CENTRE, self.noise, self.returns)
                     (mounted.returns or self.returns).divergence(mounted.sensor.optics)
         mistakes.tell()
@@ -338,6 +347,35 @@ class Scenario(Section):
             if trajectory and trajectory.file:
                 paths += files_of_trajectory(self.path(trajectory.file))
         return tuple(dict.fromkeys(paths))
+
+    def named_in(self, file: Path) -> str:
+        """Return the scenario and the field that name a file, to start a message.
+
+        Empty for the mesh file of a survey without a scenario, and if no field names the file.
+        """
+        field = field_that_names(self, lambda text: self.path(text) == file)
+        return f"{self._source}: {field}: " if field and self._source != survey_of(file) else ""
+
+    @contextmanager
+    def naming_lost_files(self) -> Iterator[None]:
+        """Name the files that do not exist, with their fields, in a LidarError of the body."""
+        try:
+            yield
+        except LidarError as error:
+            # `Path.exists` fails at names that no file can have.
+            lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
+            if not any(str(path) in str(error) for path in lost):  # there is another fault
+                raise
+            mistakes = Mistakes()
+            for path in lost:
+                likely = endings() if format_of(path) else ()
+                mistakes.lines.append(f"{self.named_in(path)}{not_found(path, likely)}")
+            mistakes.lines += [
+                line
+                for line in str(error).splitlines()
+                if not any(str(path) in line for path in lost)
+            ]
+            mistakes.tell()
 
     @property
     def placed(self) -> tuple[CopiesSection | ActorSection, ...]:

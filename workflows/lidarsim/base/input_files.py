@@ -8,11 +8,14 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Collection
+from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
 
 from .allowance import bytes_of, memory
 from .errors import LidarError
+from .words import did_you_mean
 
 # Opening a pipe waits for a writer, and opening a terminal may make it that of the process. Both
 # flags only matter if the path changes its kind between the check and the opening.
@@ -67,6 +70,20 @@ def open_input(path: str | Path) -> BufferedReader:
     except BaseException:
         os.close(handle)
         raise
+
+
+def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
+    """Return a sentence on a file that does not exist, with a similar name in its folder.
+
+    Similar names have one of the `endings`, by default the ending of the file.
+    """
+    file = Path(path)
+    names: list[str] = []
+    with suppress(OSError):
+        names = [entry.name for entry in file.parent.iterdir()]
+    likely = tuple(endings) or (file.suffix.lower(),)
+    hint = did_you_mean(file.name, [name for name in names if name.lower().endswith(likely)])
+    return f"{path} does not exist: check the name and the folder.{hint}"
 
 
 def _check_kind(path: str | Path, mode: int) -> None:

@@ -1019,6 +1019,8 @@ def open_result(path: Path, downloads: Downloads | None = None) -> View:
     A scene or sweeps that cannot be read are noted only. LidarError if there is no cloud, or a
     damaged cloud.
     """
+    if not path.exists():
+        raise LidarError(f"{path} does not exist: give the folder of a result, or a cloud.")
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
         return View(CloudFile(path), title=title, downloads=downloads)

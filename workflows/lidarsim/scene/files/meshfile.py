@@ -19,11 +19,11 @@ from ...base.arrays import Floats
 from ...base.elementary import cbrt
 from ...base.errors import CutShortError, LidarError, prefixed, unreadable
 from ...base.extras import install_command
-from ...base.input_files import open_input, read_input
+from ...base.input_files import not_found, open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
-from ...base.words import as_python, did_you_mean, listed, plural, printable
+from ...base.words import as_python, listed, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
 from ..actors import Actor, join_meshes
@@ -495,24 +495,13 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
         with prefixed(path):
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise LidarError(
-            f"{path} does not exist: check the name and the folder.{_similar_name(path)}"
-        ) from error
+        raise LidarError(not_found(path, endings())) from error
     except (OSError, ValueError) as error:  # a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise LidarError(f"{path} cannot be read: {reason}.") from error
     if not data:
         raise LidarError(f"{path} is empty (0 bytes): export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
-
-
-def _similar_name(path: Path) -> str:
-    """Return a question with the name of a similar mesh file in the folder, or empty."""
-    try:
-        names = [file.name for file in path.parent.iterdir()]
-    except OSError:
-        return ""
-    return did_you_mean(path.name, [name for name in names if name.lower().endswith(endings())])
 
 
 # {expression for the start of a file that is no mesh: advice}
