@@ -668,7 +668,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
         (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
-        ("'xyz' is not a format of clouds; these are: ply, las, ", "x", {"format": "xyz"}),
+        ("'xyz' is not a format of clouds. There are ply, las, ", "x", {"format": "xyz"}),
         ("layout is 'sick'; .* 'velodyne'", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),

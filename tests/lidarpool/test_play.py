@@ -104,7 +104,7 @@ def test_what_cannot_be_played_is_refused_in_a_line(tmp_path):
     lacks_cloud = pytest.raises(LidarError, match=r"holds no cloud\.ply: give a scenario")
     with lacks_cloud, open_source(tmp_path):
         pass
-    with pytest.raises(LidarError, match=r"'foxglov' is no bridge: use packets"):
+    with pytest.raises(LidarError, match=r"no bridge\. Did you mean 'foxglove'\? Use packets"):
         bridges.bridge_class("foxglov")
 
 

@@ -263,7 +263,7 @@ steps: 36
         (VLP16, ["--api", f"127.0.0.1:{'9' * 5000}"], "is no address: give HOST or HOST:PORT"),
         (VLP16, ["--to", "127.0.0.1:65535"], "would go to port 65536: give a port nearer"),
         (VLP16, ["--api", "203.0.113.1"], "cannot listen at 203.0.113.1:80"),
-        (VLP16, ["--as", "radar"], "'radar' is no bridge: use packets"),
+        (VLP16, ["--as", "radar"], "'radar' is no bridge. Use packets"),
         (
             "sensor: velodyne/hdl64e-s3\nposes: [[0, 0, 1]]\nsteps: 9\n",
             [],

@@ -84,7 +84,20 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
 @pytest.mark.parametrize(
     ("names", "values", "words"),
     [
-        ("roll,pitch,yaw", "0,0,40", "'roll' has no unit: call it roll_deg, in degrees"),
+        (
+            "roll,yaw",
+            "0,40",
+            r"'roll' and 'yaw' have no unit: call them roll_deg \(degrees\) and yaw_deg \(degrees\)"
+            r", or give columns: \{roll_deg: roll, yaw_deg: yaw\}",
+        ),
+        (
+            "stamp,yaw,speed,latitude,roll [mrad]",
+            "0,40,1,48,2",
+            r"'stamp' and 'yaw' have no unit: .* Its column 'latitude' is a geodetic .* Its column "
+            r"'roll \[mrad\]' has the unit 'mrad': .* Its column is not known: speed\. Rename it, "
+            r"or give ignore: \[speed\] to leave it out\. Known are ",
+        ),
+        ("yaw_dge,ptch_deg", "40,2", "mean 'yaw_deg' for yaw_dge, 'pitch_deg' for ptch_deg"),
         ("yaw", "40", r"give columns: \{yaw_deg: yaw\}; yaw_rad is read as well"),
         ("heading", "0.5", "'heading' has no unit, and values up to 0.5 may have any"),
         ("yaw [mrad]", "40", r"has the unit 'mrad': give it in deg or rad"),
@@ -97,7 +110,7 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
         ("pitch_deg,yaw", "3,40", "'yaw' has no unit"),
         ("qx,qy,qz,qw,yaw_deg", "0,0,0,1,40", "both a quaternion and yaw_deg"),
         ("qx,qy,qz,qw,q_w", "0,0,0,1,1", "'qw' and 'q_w' are both qw"),
-        ("qz,qw", "0,1", "no column 'qx'"),
+        ("qz,qw", "0,1", "no columns 'qx' and 'qy'; it has "),
         ("yaw_dge", "40", r"not known: yaw_dge\. Did you mean 'yaw_deg'\?"),
         ("speed", "40", r"not known: speed\. .*give ignore: \[speed\] to leave it out"),
         ("speed,course", "40,1", r"speed, course\. .*ignore: \[speed, course\] to leave them out"),
@@ -361,7 +374,10 @@ def test_other_files_are_named(tmp_path, content, words, name):
 def test_a_trj_of_helios_is_read_with_its_units(tmp_path):
     text = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n0,0,0,0.5,0,0,9\n1,0,0,0.5,5,0,9\n'
     (tmp_path / "a.trj").write_text(text)
-    with pytest.raises(LidarError, match=r"'t' has no unit.*lidarpool import` reads a \.trj"):
+    with pytest.raises(
+        LidarError,
+        match=r"'t', 'roll', .* have no unit.*lidarpool import` reads a \.trj",
+    ):
         load_trajectory(tmp_path / "a.trj")
     columns = {"time_s": "t", "yaw_rad": "yaw", "pitch_rad": "pitch", "roll_rad": "roll"}
     track = load_trajectory(tmp_path / "a.trj", columns=columns)

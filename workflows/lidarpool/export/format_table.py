@@ -331,8 +331,8 @@ def _row_of_plugin(name: str) -> FormatRow:
     if plugin is None:
         names = [*FORMATS, *plugins_of(GROUP)]
         raise LidarError(
-            f"{name!r} is not a format of clouds; these are: {', '.join(names)}."
-            f"{did_you_mean(name, names)}"
+            f"{name!r} is not a format of clouds.{did_you_mean(name, names)} There are "
+            f"{', '.join(names)}."
         )
     row = plugin.load(FormatRow)
     if row.data_set:

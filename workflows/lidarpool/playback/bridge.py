@@ -138,7 +138,7 @@ def bridge_class(name: str) -> type[Bridge]:
     """
     if name not in BRIDGES:
         names = ", ".join(BRIDGES)
-        raise LidarError(f"{name!r} is no bridge: use {names}.{did_you_mean(name, BRIDGES)}")
+        raise LidarError(f"{name!r} is no bridge.{did_you_mean(name, BRIDGES)} Use {names}.")
     entry = BRIDGES[name]
     module, _, attribute = entry.target.partition(":")
     try:

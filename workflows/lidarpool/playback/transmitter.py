@@ -127,8 +127,8 @@ def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[
         name, separator, address = text.rpartition("=")
         if separator and name not in names:
             raise LidarError(
-                f"{option} {text}: there is no sensor {name!r}; there are {', '.join(names)}."
-                f"{did_you_mean(name, names)}"
+                f"{option} {text}: there is no sensor {name!r}.{did_you_mean(name, names)} There "
+                f"are {', '.join(names)}."
             )
         parsed = Address.parse(address)
         for sensor in [name] if separator else names:

@@ -875,4 +875,7 @@ def _choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> s
         raise SeveralSensorsError(f"{listed}: {advice}.", available)
     if chosen is None:
         raise LidarError(f"{listed}: record one.")
-    raise LidarError(f"{listed}, not {chosen!r}." + did_you_mean(chosen, available))
+    raise LidarError(
+        f"{name} has no {kind} {chosen!r}.{did_you_mean(chosen, available)} It has "
+        f"{', '.join(available) or 'none'}."
+    )

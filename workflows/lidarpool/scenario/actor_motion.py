@@ -35,7 +35,7 @@ from lidarsim.base.declared import (
 from lidarsim.base.errors import LidarError, message_of, prefixed
 from lidarsim.base.input_files import input_size, open_input
 from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
-from lidarsim.base.words import did_you_mean, plural, printable
+from lidarsim.base.words import name_hint, plural, printable
 from lidarsim.base.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -781,9 +781,7 @@ def carrier_of(
         tracks += _tracks_of(passage, section, mesh, standing, 0.0)
     if not tracks:
         known = sorted(content.left_out)
-        hint = did_you_mean(entry.vehicle or "", known) or (
-            f" There are {', '.join(known[:5])}." if known else ""
-        )
+        hint = name_hint(entry.vehicle or "", known) if known else ""
         if entry.vehicle == HOST:
             hint = f" It may not name its host vehicle: give an identity.{hint}"
         raise LidarError(

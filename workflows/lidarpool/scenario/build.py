@@ -16,7 +16,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
-from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.words import name_hint, plural
 from lidarsim.scene.actors import Actor, check_spray
 from lidarsim.scene.files.coordinate_systems import target_problem
 from lidarsim.scene.files.mesh_formats import format_of
@@ -413,7 +413,7 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
         links = [link for _, robot in carriers for link in robot.links]
         raise LidarError(
             f"mount.link is {mount.link!r}, which {len(matching_carriers) or 'no'} robots on the "
-            f"carrier have; one must.{did_you_mean(mount.link, links)}"
+            f"carrier have; one must.{name_hint(mount.link, links)}"
         )
     ((entry, robot),) = matching_carriers
     with prefixed(f"actor {entry.name!r}"):
@@ -715,10 +715,9 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
             i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
         ]
         if not matches:
-            hint = did_you_mean(entry.object, scene.names)
             raise LidarError(
                 f"planning.obstacles names {entry.object!r}, but no object has that name."
-                + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
+                f"{name_hint(entry.object, scene.names)}"
             )
         discs |= {scene.names[i]: list(scene.footprints[i]) for i in matches}
     return np.array(list(discs.values()), dtype=np.float64).reshape(-1, 3), list(discs)

@@ -256,8 +256,7 @@ class CampaignSpec:
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
         mistakes.lines += [
-            f"{self._jobs.named_in(path) or f'{self.command}: '}{not_found(path)}"
-            for path in lost
+            f"{self._jobs.named_in(path) or f'{self.command}: '}{not_found(path)}" for path in lost
         ]
         mistakes.tell()
 

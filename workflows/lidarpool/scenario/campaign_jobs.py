@@ -396,11 +396,14 @@ class _Base:
             try:
                 self.changed({text: value}, "")
             except LidarError as error:
-                message = str(error).partition("\n")[0].removeprefix(": ")
-                allowed = message.partition("; ")[2] if message.startswith(f"{field} is ") else ""
+                in_a_line = str(error).replace("\n  ", " ")  # with a list that has own lines
+                message = in_a_line.partition("\n")[0].removeprefix(": ")
                 value_line = f"{text} can be {shown(value)}"
-                if allowed:
-                    yield f"{value_line}; {allowed}{choice.hint(allowed)}"
+                expected = message.removeprefix(f"{field} is {shown(value)}")
+                if expected.startswith("; "):
+                    yield f"{value_line}{expected}{choice.hint(expected[2:])}"
+                elif expected.startswith(". "):
+                    yield f"{value_line}{expected}"
                 else:
                     yield f"{value_line}: {message}"
 

@@ -48,7 +48,7 @@ from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields, sections_in, sentences
-from lidarsim.base.words import did_you_mean, printable
+from lidarsim.base.words import did_you_mean_each, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..datasets.job_table import Value
@@ -586,10 +586,11 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
     ]
     if unknown:
         verb = "columns are" if unknown[1:] else "column is"
+        pronoun = "them" if unknown[1:] else "it"
+        names = ", ".join(map(printable, unknown))
         raise ValueError(
-            f"its {verb} not known: {', '.join(map(printable, unknown))}."
-            f"{did_you_mean(unknown[0], fields)} Known are {', '.join(fields)}: rename it, or give "
-            f"ignore: [{printable(unknown[0])}] to leave it out"
+            f"its {verb} not known: {names}.{did_you_mean_each(unknown, fields)} Rename {pronoun}, "
+            f"or give ignore: [{names}] to leave {pronoun} out. Known are {', '.join(fields)}"
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.words import name_hint
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Track
@@ -52,10 +52,10 @@ class StandingSurfaces:
         rows = [rows_named(name, scene.names) for name in names]
         for name, matches in zip(names, rows, strict=True):
             if not len(matches):
-                hint = (
-                    did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
+                raise LidarError(
+                    f"surfaces names {name!r}, but no object has that name."
+                    f"{name_hint(name, scene.names)}"
                 )
-                raise LidarError(f"surfaces names {name!r}, but no object has that name.{hint}")
         matches = np.unique(np.concatenate(rows))
         selected = self if len(matches) == len(scene.names) else StandingSurfaces(scene, matches)
         if not len(selected._tops[0]):

@@ -223,7 +223,9 @@ class Scenario(Section):
                 f"--{name.replace('_', '-')} is for a mesh file: in {path}"
                 f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
             )
-        return cls.from_data(data, source=survey_of(path) if mesh else str(path), folder=path.parent)
+        return cls.from_data(
+            data, source=survey_of(path) if mesh else str(path), folder=path.parent
+        )
 
     @classmethod
     def from_data(

@@ -228,7 +228,10 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     used = [name for name in names if name]  # indices may leave columns out
     unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
-        fault = f"{unknown[0]!r} is not known" if unknown else "a name is there twice"
+        verb = "are" if unknown[1:] else "is"
+        fault = "a name is there twice"
+        if unknown:
+            fault = f"{', '.join(map(repr, unknown))} {verb} not known"
         raise LidarError(
             f"{description}, and {fault}: name those to read by their indices, such as tIndex and "
             "xIndex, in platformSettings."

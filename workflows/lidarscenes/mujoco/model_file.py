@@ -21,7 +21,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
-from lidarsim.base.words import did_you_mean, listed, printable
+from lidarsim.base.words import listed, name_hint, printable
 from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
 from lidarsim.mujoco.model_bodies import (
     Choice,
@@ -104,8 +104,8 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
             frame, arrays = next(frames)
     if frame["what"] == "keyframes":
         keyframe = str(options.model.keyframe)
-        hint = did_you_mean(keyframe, frame["names"]) or f" There are: {listed(frame['names'], 8)}."
-        raise LidarError(f"the model has no keyframe {keyframe!r}.{hint if frame['names'] else ''}")
+        hint = name_hint(keyframe, frame["names"])
+        raise LidarError(f"the model has no keyframe {keyframe!r}.{hint}")
     fields = dict(zip(frame.pop("names"), arrays, strict=True))
     if not options.colours:  # without the pixels of textures
         fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)

@@ -21,7 +21,7 @@ from lidarsim.base.textfile import read_text
 from lidarsim.base.time_units import TimeUnit
 from lidarsim.base.validation import as_array, checked
 from lidarsim.base.vectors import applied, matmul
-from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.words import name_hint, plural
 from lidarsim.scene.actors import AT_ZERO, Actor, join_meshes
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import rotation_about
@@ -147,7 +147,7 @@ class Robot:
             If the robot has no such link, or the joints cannot be used.
         """
         if link not in self.joints and link != self.links[0]:
-            raise LidarError(f"{self.name} has no link {link!r}.{did_you_mean(link, self.links)}")
+            raise LidarError(f"{self.name} has no link {link!r}.{name_hint(link, self.links)}")
         return self._path(link, trajectory, *self._values(joints, ignore, time_unit))
 
     @checked
@@ -284,8 +284,7 @@ class Robot:
         for name, value in table.items():
             if name not in self.moving:
                 raise LidarError(
-                    f"{self.name} has no joint {name!r} that moves."
-                    f"{did_you_mean(name, self.moving)}"
+                    f"{self.name} has no joint {name!r} that moves.{name_hint(name, self.moving)}"
                 )
             if value.shape != times.shape or not np.isfinite(value).all():
                 raise LidarError(

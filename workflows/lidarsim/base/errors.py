@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,16 +16,22 @@ _MAX_LETTERS = 2000  # of a line of a message, of which the start names the file
 _END_LETTERS = 500  # of a line that is cut in its middle: what was expected, and advice
 
 
+_LONG_LIST = re.compile(r"(?:[^\s,]+(?: \([^)]*\))?, ){15,}\S+")
+_MIN_LIST_LETTERS = 200  # of a list with lines of its own
+_WIDTH = 100  # letters of these lines, as of --help
+_INDENT = "  "
+
+
 class LidarError(Exception):
     """An error that the user can correct: bad input, a missing partition, a full disk.
 
     The message says in one or two lines what was given, what was expected and what to do. The
     command prints the message without a traceback and exits with code 2. A line is cut in its
-    middle if it quotes a file at length.
+    middle if it quotes a file at length. A long list of names has lines of its own.
     """
 
     def __init__(self, message: object = "") -> None:
-        super().__init__("\n".join(map(_cut, str(message).split("\n"))))
+        super().__init__("\n".join(map(_wrap_list, map(_cut, str(message).split("\n")))))
 
 
 def _cut(line: str) -> str:
@@ -31,6 +39,22 @@ def _cut(line: str) -> str:
     if len(line) <= _MAX_LETTERS:
         return line
     return f"{line[: _MAX_LETTERS - _END_LETTERS]} … {line[-_END_LETTERS:]}"
+
+
+def _wrap_list(line: str) -> str:
+    """Return a line with a long list, such as all columns, on indented lines of its own."""
+    names = _LONG_LIST.search(line)
+    if names is None or len(names[0]) < _MIN_LIST_LETTERS or line.startswith(_INDENT):
+        return line
+    wrapped = textwrap.fill(
+        line[names.start() :],
+        _WIDTH,
+        initial_indent=_INDENT,
+        subsequent_indent=_INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return f"{line[: names.start()].rstrip()}\n{wrapped}"
 
 
 class CutShortError(ValueError):

@@ -7,10 +7,12 @@ refused: a column that is silently left out may be the one that turns the sensor
 from __future__ import annotations
 
 import csv
+import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import reduce
 from itertools import islice
 from typing import NamedTuple, cast
 
@@ -18,7 +20,7 @@ import numpy as np
 
 from .arrays import Floats
 from .time_units import SECONDS, TimeUnit, seconds_of
-from .words import did_you_mean, printable
+from .words import did_you_mean_each, printable
 
 # {unit: number of these units in the first unit}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
@@ -142,15 +144,18 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
     ValueError for a pattern that matches no column.
     """
     indices = set[int]()
+    unmatched: list[str] = []
     for pattern in ignore:
         matches = {
             index for index, name in enumerate(names) if fnmatchcase(name.lower(), pattern.lower())
         }
-        if not matches:
-            raise ValueError(
-                f"ignore names {pattern!r}, which is no column; it has {_listed(names)}"
-            )
+        unmatched += [] if matches else [repr(pattern)]
         indices |= matches
+    if unmatched:
+        verb = "are no columns" if len(unmatched) > 1 else "is no column"
+        raise ValueError(
+            f"ignore names {_all_of(unmatched)}, which {verb}; it has {_listed(names)}"
+        )
     return indices
 
 
@@ -297,10 +302,17 @@ def read_table(
     reader.assign(formats, unused, refused or {}, bare or {})
     names = {name: number for name, (number, _) in reader.assigned.items()}
     required_names = required(dict.fromkeys(names, np.empty(0)))
-    if missing := next((name for name in required_names if name not in names), None):
-        raise ValueError(f"it has no column {missing!r}; it has {_listed(header.cells)}")
+    if missing := [repr(name) for name in required_names if name not in names]:
+        columns_word = "columns" if len(missing) > 1 else "column"
+        raise ValueError(
+            f"it has no {columns_word} {_all_of(missing)}; it has {_listed(header.cells)}"
+        )
     values = _numbers(lines, header, names, [*required_names, *(columns or {})])
     return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
+
+
+class _UnitMissingError(ValueError):
+    """An error of a column whose unit is not stated."""
 
 
 class _ColumnReader:
@@ -335,32 +347,39 @@ class _ColumnReader:
     def choose(self, columns: Mapping[str, str] | None) -> None:
         """Assign the columns that the user names; None if users cannot name columns."""
         self.can_choose = columns is not None
+        faults: list[str] = []
         for name, file_name in (columns or {}).items():
-            match = self.quantity_of(name)
-            if match is None:
-                raise ValueError(f"columns names {name!r}; possible names are {self.possible}")
-            quantity, unit = match
-            spelling = file_name.lstrip("#%").strip()
-            matches = [i for i, cell in enumerate(self.cells) if cell == spelling] or [
-                i for i, cell in enumerate(self.cells) if cell.lower() == spelling.lower()
-            ]
-            if not matches:
-                raise ValueError(f"it has no column {file_name!r}; it has {_listed(self.cells)}")
-            if len(matches) > 1:
-                raise ValueError(f"it has the column {file_name!r} {len(matches)} times")
-            stated = column_name(spelling).unit
-            if unit is not None and stated in quantity.units and stated != unit:
-                raise ValueError(
-                    f"columns reads {file_name!r} as {name}: the header states {stated}"
-                )
-            if unit is None:
-                unit = self._unit(quantity, file_name, stated, {})
-            elif quantity.units is SECONDS and self.time_unit not in (None, unit):
-                raise ValueError(
-                    f"columns reads {file_name!r} as {name}, and time_unit is {self.time_unit}: "
-                    "give one of the two"
-                )
-            self._add(quantity, matches[0], unit)
+            try:
+                self._choose(name, file_name)
+            except ValueError as error:
+                faults.append(str(error))
+        _refuse(faults)
+
+    def _choose(self, name: str, file_name: str) -> None:
+        """Assign the column that the user names for a quantity."""
+        match = self.quantity_of(name)
+        if match is None:
+            raise ValueError(f"columns names {name!r}; possible names are {self.possible}")
+        quantity, unit = match
+        spelling = file_name.lstrip("#%").strip()
+        matches = [i for i, cell in enumerate(self.cells) if cell == spelling] or [
+            i for i, cell in enumerate(self.cells) if cell.lower() == spelling.lower()
+        ]
+        if not matches:
+            raise ValueError(f"it has no column {file_name!r}; it has {_listed(self.cells)}")
+        if len(matches) > 1:
+            raise ValueError(f"it has the column {file_name!r} {len(matches)} times")
+        stated = column_name(spelling).unit
+        if unit is not None and stated in quantity.units and stated != unit:
+            raise ValueError(f"columns reads {file_name!r} as {name}: the header states {stated}")
+        if unit is None:
+            unit = self._unit(quantity, file_name, stated, {})
+        elif quantity.units is SECONDS and self.time_unit not in (None, unit):
+            raise ValueError(
+                f"columns reads {file_name!r} as {name}, and time_unit is {self.time_unit}: "
+                "give one of the two"
+            )
+        self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
         """Leave out the columns that the user ignores."""
@@ -373,34 +392,75 @@ class _ColumnReader:
         refused: Mapping[str, str],
         bare: Mapping[str, str],
     ) -> None:
-        """Assign the remaining columns by their names; ValueError for an unknown column."""
+        """Assign the remaining columns by their names.
+
+        ValueError names all columns that are not understood.
+        """
         chosen = {index for index, _ in self.assigned.values()} | self.left_out
         words = [column_name(cell).words for cell in self.cells]
         matching = [form for form in formats if _letters(form.marker) in words]
-        patterns = [_letters(name) for form in matching for name in form.unused]
-        patterns += [_letters(name) for name in unused]
-        units = dict(bare)
-        for form in matching:
-            units.update(form.bare)
-        unknown = []
+        names = [name for form in matching for name in form.unused]
+        patterns = [_letters(name) for name in (*names, *unused)]
+        units = reduce(operator.or_, (form.bare for form in matching), dict(bare))
+        unknown: list[str] = []
+        without_unit: list[tuple[Quantity, str]] = []
+        faults: list[str] = []
         for index, cell in enumerate(self.cells):
             if index in chosen or not cell or re.fullmatch(r"unnamed: \d+", cell.lower()):
                 continue  # columns without a name are checked with the rows
             if (match := self.quantity_of(cell)) is not None:
                 quantity, unit = match
-                self._add(quantity, index, self._unit(quantity, cell, unit, units))
+                try:
+                    self._add(quantity, index, self._unit(quantity, cell, unit, units))
+                except _UnitMissingError:
+                    without_unit.append((quantity, printable(cell)))
+                except ValueError as error:
+                    faults.append(str(error))
             elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
-                raise ValueError(f"its column {printable(cell)!r} {reason}")
+                faults.append(f"its column {printable(cell)!r} {reason}")
             elif not any(fnmatchcase(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
-        if unknown:
-            columns = "columns are" if len(unknown) > 1 else "column is"
-            pronoun = "them" if len(unknown) > 1 else "it"
-            hint = did_you_mean(unknown[0], [quantity.name for quantity in self.quantities])
-            raise ValueError(
-                f"its {columns} not known: {_listed(unknown)}.{hint} Known are {self.possible}: "
-                f"rename {pronoun}, or give ignore: [{_listed(unknown)}] to leave {pronoun} out"
-            )
+        if without_unit:
+            faults.insert(0, self._lacking_units(without_unit))
+        if unknown:  # at the end, with the long list of the known columns
+            faults.append(self._unknown(unknown))
+        _refuse(faults)
+
+    def _unknown(self, cells: Sequence[str]) -> str:
+        """Return a message on columns that are not known."""
+        columns = "columns are" if len(cells) > 1 else "column is"
+        pronoun = "them" if len(cells) > 1 else "it"
+        hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
+        return (
+            f"its {columns} not known: {_listed(cells)}.{hint} Rename {pronoun}, or give ignore: "
+            f"[{_listed(cells)}] to leave {pronoun} out. Known are {self.possible}"
+        )
+
+    def _lacking_units(self, columns: Sequence[tuple[Quantity, str]]) -> str:
+        """Return a message on columns without a unit: quantity and name in the file of each."""
+        if len(columns) == 1:
+            return str(self._unit_missing(*columns[0]))
+        names = [
+            f"{quantity.name} ({_UNIT_WORDS[next(iter(quantity.units))]})"
+            for quantity, _ in columns
+        ]
+        pairs = ", ".join(f"{quantity.name}: {cell}" for quantity, cell in columns)
+        return (
+            f"its columns {_all_of([repr(cell) for _, cell in columns])} have no unit: call them "
+            f"{_all_of(names)}" + f", or give columns: {{{pairs}}}" * self.can_choose
+        )
+
+    def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
+        """Return the error on a column without a unit."""
+        first, *other_units = quantity.units
+        stem = quantity.name.removesuffix(f"_{first}")
+        choice = f", or give columns: {{{quantity.name}: {printable(cell)}}}" * self.can_choose
+        unit_option = ", or give time_unit" * (quantity.units is SECONDS)
+        names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
+        return _UnitMissingError(
+            f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
+            f"{_UNIT_WORDS[first]}{choice}; {names} is read as well{unit_option}"
+        )
 
     def _unit(
         self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
@@ -419,15 +479,7 @@ class _ColumnReader:
         if (implied := units.get(quantity.name)) is not None:
             return implied
         if quantity.bare is None:
-            first, *other_units = quantity.units
-            stem = quantity.name.removesuffix(f"_{first}")
-            choice = f", or give columns: {{{quantity.name}: {printable(cell)}}}" * self.can_choose
-            unit_option = ", or give time_unit" * (quantity.units is SECONDS)
-            names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
-            raise ValueError(
-                f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-                f"{_UNIT_WORDS[first]}{choice}; {names} is read as well{unit_option}"
-            )
+            raise self._unit_missing(quantity, cell)
         return None
 
     def _add(self, quantity: Quantity, index: int, unit: str | None) -> None:
@@ -477,6 +529,18 @@ class _ColumnReader:
             )
             names.append(f"{quantity.name} (or {', '.join(units)})" if units else quantity.name)
         return ", ".join(names)
+
+
+def _refuse(faults: Sequence[str]) -> None:
+    """Raise ValueError with all faults, if there are faults."""
+    if faults:
+        first, *others = faults
+        raise ValueError(". ".join([first, *(fault[0].upper() + fault[1:] for fault in others)]))
+
+
+def _all_of(names: Sequence[str]) -> str:
+    """Return names as text: «a, b and c»."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _listed(cells: Sequence[str]) -> str:

@@ -41,7 +41,7 @@ from pydantic_core import (
 from .arrays import AnyArray
 from .errors import LidarError, Mistakes
 from .signatures import ReadableSignature, readable
-from .words import did_you_mean, plural
+from .words import did_you_mean, listed, plural
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -305,11 +305,14 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
         field = tuple(step for step in path if not isinstance(step, int))
         groups.setdefault((field, detail["type"]), []).append(path)
     for first, *further_paths in groups.values():
-        count_note = (
-            f" {plural(len(further_paths), 'more entry', 'more entries')} like it."
-            if further_paths
-            else ""
-        )
+        count_note = ""
+        if further_paths:
+            like_it = "like it"
+            if details_by_path[first]["type"] == "literal_error":
+                values = [_in_file(details_by_path[path]["input"]) for path in further_paths]
+                like_it += f": {listed([*dict.fromkeys(values)])}"
+            count = plural(len(further_paths), "more entry", "more entries")
+            count_note = f" {count} {like_it}."
         hint, fields = _annotation_at(first, section)
         advice = field_hint(str(first[-1]), fields, section) if first else ""
         yield _sentence(first, [details_by_path[first]], hint, advice, _in_file) + count_note
@@ -355,12 +358,12 @@ def _sentence(
         return f"{location} is missing; it must be given."
     in_python = show is not _in_file
     requirements = dict.fromkeys(_requirement(detail, hint, in_python) for detail in details)
-    advice = ""
+    allowed = f"must {' or '.join(requirements)}.".replace(" or be ", " or ")
     if kind == "literal_error" and isinstance(value, str):
-        advice = did_you_mean(value, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
-    return f"{location} is {show(value)}; it must {' or '.join(requirements)}.{advice}".replace(
-        " or be ", " or "
-    )
+        suggestion = did_you_mean(value, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
+        if suggestion:  # before the allowed values, which may be many
+            return f"{location} is {show(value)}.{suggestion} It {allowed}"
+    return f"{location} is {show(value)}; it {allowed}"
 
 
 def _requirement(detail: ErrorDetails, hint: Any, in_python: bool) -> str:

@@ -16,11 +16,58 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     >>> did_you_mean("layer", ["layers", "step_deg"])
     " Did you mean 'layers'?"
     """
+    similar = _most_similar(word, candidates)
+    return f" Did you mean {similar!r}?" if similar is not None else ""
+
+
+def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
+    """Return `did_you_mean` of several words in a question, or empty.
+
+    Examples
+    --------
+    >>> did_you_mean_each(["layer", "speed", "step"], ["layers", "step_deg"])
+    " Did you mean 'layers' for layer, 'step_deg' for step?"
+    """
+    names = [*candidates]
+    if len(words) == 1:
+        return did_you_mean(words[0], names)
+    similar = {word: _most_similar(word, names) for word in words}
+    pairs = [f"{name!r} for {word}" for word, name in similar.items() if name is not None]
+    return f" Did you mean {', '.join(pairs)}?" if pairs else ""
+
+
+def _most_similar(word: str, candidates: Iterable[str]) -> str | None:
+    """Return the most similar candidate; None if there is no similar candidate."""
     lower = {name.lower(): name for name in candidates}
     matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
-    return f" Did you mean {lower[matches[0]]!r}?" if matches else ""
+    return lower[matches[0]] if matches else None
 
 
+def name_hint(pattern: str, names: Sequence[str]) -> str:
+    """Return the most similar name; without one, or for a pattern with * or ?, the first names.
+
+    Names that differ in their last number are listed as a pattern, with their number.
+
+    Examples
+    --------
+    >>> name_hint("Hose", ["House", "Tree"])
+    " Did you mean 'House'?"
+    >>> name_hint("Street*", ["House", "Tree", "Tree.2", "Tree.3"])
+    ' There are House, Tree* (3).'
+    """
+    is_pattern = any(sign in pattern for sign in "*?[")
+    if similar := "" if is_pattern else did_you_mean(pattern, names):
+        return similar
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(_LAST_NUMBER.sub("", name), []).append(name)
+    entries: list[str] = []
+    for stem, group in groups.items():
+        entries += [f"{stem}* ({len(group):,})"] if stem and len(group) > 2 else group
+    return f" There are {listed(entries, 8) or 'none'}."
+
+
+_LAST_NUMBER = re.compile(r"[\s._-]*\d+$")
 # A setting in a note, and the calls of Python that take the settings of a section.
 _SETTING = re.compile(r'<(file|scene|cloud|materials)\.(\w+)=("?)(\w+)\3>')
 _CALLS = {

@@ -11,7 +11,7 @@ import numpy as np
 from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarError
 from ..base.vectors import applied, length, matmul, turned
-from ..base.words import did_you_mean, plural
+from ..base.words import name_hint, plural
 from ..scene.colours import LINEAR, Colours, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked
@@ -92,8 +92,7 @@ def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[in
 
 def _unknown(name: str | int, kind: str, known: list[str]) -> str:
     """Return the message on a name that a model lacks."""
-    hint = did_you_mean(str(name), known) or f" There are {', '.join(known[:8])}."
-    return f"The model has no {kind} {name!r}.{hint}"
+    return f"The model has no {kind} {name!r}.{name_hint(str(name), known)}"
 
 
 def bodies_of(model: Any, choice: Choice) -> ModelBodies:

@@ -201,8 +201,8 @@ def encoder_class(name: str) -> type[PacketEncoder]:
     if plugin is None:
         names = [*ENCODERS, *plugins_of(GROUP)]
         raise LidarError(
-            f"{name!r} is not a format of packets; these are: {', '.join(names)}."
-            f"{did_you_mean(name, names)}"
+            f"{name!r} is not a format of packets.{did_you_mean(name, names)} There are "
+            f"{', '.join(names)}."
         )
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):

@@ -11,7 +11,7 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarError
-from ..base.words import did_you_mean
+from ..base.words import name_hint
 from .animation import Animation
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
@@ -73,8 +73,9 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
     """Check that each pattern of `wheels` matches a name of an object; LidarError if not."""
     for wheel in wheels:
         if not any(fnmatchcase(name, wheel) for name in names):
-            hint = did_you_mean(wheel, names) or f" There are {', '.join(names[:5])}."
-            raise LidarError(f"wheels names {wheel!r}, but no object has that name.{hint}")
+            raise LidarError(
+                f"wheels names {wheel!r}, but no object has that name.{name_hint(wheel, names)}"
+            )
 
 
 def _radii(

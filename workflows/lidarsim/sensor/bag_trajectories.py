@@ -107,7 +107,7 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
     available = f"it has the poses {', '.join(labels)}"
     if topic is None:
         raise LidarError(f"{available}: choose one with topic.")
-    raise LidarError(f"{available}, not {topic!r}.{did_you_mean(topic, labels)}")
+    raise LidarError(f"it has no poses {topic!r}.{did_you_mean(topic, labels)} I{available[1:]}.")
 
 
 def _row_of(pose: Any) -> list[float]:

@@ -16,6 +16,7 @@ from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import LidarError, message_of
 from ..base.textfile import read_text
+from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
 from .beams import Beams
 
@@ -187,7 +188,11 @@ def _table(name: str, text: str) -> Calibration:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
         if unknown:
-            raise ValueError(f"column {unknown[0]!r} is not one of {', '.join(names)}")
+            columns = "columns are" if unknown[1:] else "column is"
+            raise ValueError(
+                f"its {columns} not known: {', '.join(map(printable, unknown))}."
+                f"{did_you_mean_each(unknown, names)} Known are {', '.join(names)}"
+            )
         if duplicate := next((word for word in header if header.count(word) > 1), None):
             raise ValueError(f"it has the column {duplicate!r} twice")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))

@@ -21,7 +21,7 @@ from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarError
 from ..base.validation import checked_fields, shown
-from ..base.words import did_you_mean
+from ..base.words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
 REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
@@ -433,12 +433,11 @@ def _matching_kinds(
     for pattern in entry.material:
         rows_of_pattern = rows_named(pattern, names)
         if not len(rows_of_pattern):
-            listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
             measured = f" For a measured reflectance, write spectrum: {pattern!r}."
             raise LidarError(
                 f"materials names the material {pattern!r}, but no face of the scene has one of "
                 "that name."
-                + (did_you_mean(pattern, names) or (listed if names else " No face has any."))
+                + (name_hint(pattern, names) if names else " No face has any.")
                 + measured * (pattern in reflectances())
             )
         for row in rows_of_pattern.tolist():
@@ -478,10 +477,8 @@ def matching_rows(
         return np.array([object_rows[pattern]])
     rows = rows_named(pattern, names)
     if not len(rows):
-        listed = f" There are {', '.join(names[:5])}{', …' * (len(names) > 5)}."
         raise LidarError(
-            f"{subject} names {pattern!r}, but no object has that name."
-            + (did_you_mean(pattern, names) or listed)
+            f"{subject} names {pattern!r}, but no object has that name.{name_hint(pattern, names)}"
         )
     return rows
 

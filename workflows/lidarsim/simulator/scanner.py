@@ -19,7 +19,7 @@ from ..base.arrays import Floats, Floats32, Indices
 from ..base.declared import Names
 from ..base.errors import LidarError
 from ..base.validation import checked, shown
-from ..base.words import did_you_mean
+from ..base.words import name_hint
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
 from ..scene.actors import Actor
@@ -432,7 +432,7 @@ class Scanner:
             *list(self._numbers)[object_count:],
             *compress(self._rig.scene.names, self._movable),
         ]
-        hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
+        hint = name_hint(name, names)
         if number >= 0:
             hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
         raise LidarError(f"There is no actor or instance {name!r}.{hint}")

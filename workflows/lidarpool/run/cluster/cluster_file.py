@@ -87,8 +87,8 @@ class ClusterFile(BaseModel):
         for name, workers in file.partitions.items():
             if name not in (GPU, LIDAR, OTHER):
                 raise LidarError(
-                    f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
-                    f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
+                    f"{path}: partitions.{name} is not a partition of a survey."
+                    f"{did_you_mean(name, (GPU, LIDAR, OTHER))} There are GPU, LIDAR and OTHER."
                 )
             if mistake := workers.mistake():
                 raise LidarError(f"{path}: partitions.{name}.{mistake}")
