@@ -352,9 +352,9 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
         assert failed.code == 2 and "Traceback" not in failed.err
         lines = failed.err.splitlines()
         assert lines[0] == "lidarpool: 2 jobs failed, the other 2 are done:"
-        assert lines[1].startswith("job 0001 (scene.files.0.file b.obj): ")
-        assert lines[2].startswith("job 0003 ") and "b.obj" in lines[2]
-        assert lines[3:] == ["--retry-failed does these jobs again."]
+        value = "(scene.files.0.file b.obj)"
+        assert lines[1].startswith(f"jobs 0001 {value}, 0003 {value}: b.obj ")
+        assert lines[2:] == ["--retry-failed does these jobs again."]
     (files / "c.yaml").write_text((files / "c.yaml").read_text().replace("[a.obj", "[b.obj"))
     other = lidarpool(*run, "--resume")
     assert other.code == 2 and other.err.count("\n") == 1

@@ -217,6 +217,28 @@ def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
     assert 'it cannot run. The format las needs laspy and lazrs: pip install "' in outcome.err
 
 
+def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):
+    trees = [[x, 5, 0] for x in range(9)]
+    copies = [{"name": "tree", "box": [1, 1, 4], "at": trees}]
+    base = SHORT | {"scene": {"preset": "seed", "copies": copies}}
+    base["actors"] = [{"name": "Van", "box": [5, 2, 2], "at": [9, 9, 0]}]
+    base["materials"] = [{"objects": "*"}]
+    (tmp_path / "base.yaml").write_text(json.dumps(base))
+    vary = {
+        "materials.0.objects": {"each": ["Street*", "Hose", "Street*"]},
+        "noise.range_m": {"uniform": [0.01, 0.02]},
+    }
+    campaign = {"base": "base.yaml", "count": 3, "vary": vary}
+    (tmp_path / "c.yaml").write_text(json.dumps(campaign))
+    outcome = lidarpool("check", tmp_path / "c.yaml", "--out", tmp_path / "out")
+    assert outcome.code == 2
+    start, streets, house = outcome.err.splitlines()[-3:]
+    assert start == "lidarpool: it cannot run:"
+    assert streets.startswith("jobs 0000, 0002: ") and streets.count("Street*") == 1
+    assert "There are " in streets and "tree* (9), " in streets and "Did you" not in streets
+    assert house.startswith("job 0001: ")
+
+
 def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     monkeypatch.setattr(lidarpool.run.forecast, "MEMORY_LIMIT", 1_000_000)
     (tmp_path / "out").write_text("")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -12,10 +12,11 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from lidarsim.base.errors import LidarError, Mistakes
+from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural
 
+from ..base.job_errors import lines_of_errors
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
 from ..run.job_source import identity_of
@@ -87,22 +88,34 @@ def forecast_scenario(
     if campaign is None or number is not None:
         job, figures = forecast_job(number or 0)
         return figures, _job_lines(job, figures)
+    figures = _campaign_figures(campaign, options, lambda number: forecast_job(number)[1])
+    return figures, _campaign_lines(campaign, figures)
+
+
+def _campaign_figures(
+    campaign: CampaignSpec, options: RunOptions, forecast_job: Callable[[int], dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the figures of some jobs of a campaign; `forecast_job` returns the figures of one."""
     campaign.check_files()
     jobs: list[dict[str, Any]] = []
     notes: list[str] = []
     warnings: list[str] = []
-    mistakes = Mistakes()
+    errors: list[tuple[str, str]] = []  # name of a job, and an error
     last = campaign.count - 1
     for job_number in dict.fromkeys(last * i // (FORECAST_JOBS - 1) for i in range(FORECAST_JOBS)):
-        with mistakes.noted():
-            _, figures = forecast_job(job_number)
-            jobs.append(figures["job"])
-            notes += figures["notes"]
-            warnings += figures["warnings"]
-            mistakes.lines += figures["reasons"]
-    figures = {
-        "can_run": not mistakes.lines,
-        "reasons": list(dict.fromkeys(mistakes.lines)),
+        name = campaign.name(job_number)
+        try:
+            figures = forecast_job(job_number)
+        except LidarError as error:
+            errors.append((name, str(error)))
+            continue
+        jobs.append(figures["job"])
+        notes += figures["notes"]
+        warnings += figures["warnings"]
+        errors += [(name, reason) for reason in figures["reasons"]]
+    return {
+        "can_run": not errors,
+        "reasons": lines_of_errors(errors),
         "occupied": _holds_files(options.out),
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),
@@ -113,7 +126,6 @@ def forecast_scenario(
         "keep": asdict(campaign.keep),
         "jobs": jobs,
     }
-    return figures, _campaign_lines(campaign, figures)
 
 
 def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -> dict[str, Any]:

@@ -236,7 +236,9 @@ def check(
         raise
     options.show(figures, lines, as_json)
     if figures["reasons"]:
-        raise LidarError("it cannot run. " + " ".join(figures["reasons"]))
+        reasons = figures["reasons"]
+        start = "it cannot run:\n" if reasons[1:] else "it cannot run. "
+        raise LidarError(start + "\n".join(reasons))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         settings: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}

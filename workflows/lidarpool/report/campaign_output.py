@@ -15,6 +15,7 @@ from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural
 
+from ..base.job_errors import lines_of_errors
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
@@ -439,12 +440,14 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
     remove_run(run_folder)
 
 
-def failures(sums: CampaignRun, max_jobs: int = 5) -> str:
-    """Describe the jobs that have failed, with their values and errors."""
-    lines = [f"{plural(len(sums.failed), 'job')} failed, the other {sums.done:,} are done:"]
-    for row in sums.failed[:max_jobs]:
+def failures(sums: CampaignRun, max_errors: int = 5) -> str:
+    """Describe the different errors of jobs that have failed, with the values of the jobs."""
+    head = f"{plural(len(sums.failed), 'job')} failed, the other {sums.done:,} are done:"
+    errors = []
+    for row in sums.failed:
         values = ", ".join(f"{name} {value}" for name, value in row.values.items())
-        lines.append(f"job {row.name}{f' ({values})' if values else ''}: {row.error}")
-    if (hidden := len(sums.failed) - max_jobs) > 0:
-        lines.append(f"and {hidden:,} more, see jobs.csv")
-    return "\n".join(lines) + "\n--retry-failed does these jobs again."
+        errors.append((f"{row.name}{f' ({values})' if values else ''}", row.error))
+    lines = lines_of_errors(errors, max_jobs=3)
+    if (hidden := len(lines) - max_errors) > 0:
+        lines[max_errors:] = [f"and {plural(hidden, 'more error')}, see jobs.csv"]
+    return "\n".join([head, *lines, "--retry-failed does these jobs again."])
