@@ -129,6 +129,11 @@ def test_it_is_gone_on_with(unfinished):
         opened(unfinished, backend="embree", resume=True)
 
 
+FIELDS_OF_OTHERS = {
+    "survey": "cloud.keep_every is 2, was 1",
+    "scene": "scene.triangles is ",
+    "planning": "planning.",
+}
 OTHERS = {
     "survey": replace(JOB, survey=replace(SURVEY, keep_every=2)),
     "scene": replace(JOB, scene=Scene.from_meshes(seed_objects(rings=4, segments=7))),
@@ -139,8 +144,11 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS)
 def test_another_run_cannot_go_on(other, unfinished):
     for resume in (True, False):
-        with pytest.raises(LidarError, match=f"cannot be continued, it is of another {other}"):
+        with pytest.raises(LidarError) as raised:
             opened(unfinished, resume=resume, job=OTHERS[other])
+        differs = f"cannot be continued, it is of another {other}: {FIELDS_OF_OTHERS[other]}"
+        assert differs in str(raised.value)
+        assert "Only these may change: pool, and formats of output" in str(raised.value)
     remove_run(unfinished)
     opened(unfinished, job=OTHERS[other]).db.close()
 

@@ -358,7 +358,9 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     (files / "c.yaml").write_text((files / "c.yaml").read_text().replace("[a.obj", "[b.obj"))
     other = lidarpool(*run, "--resume")
     assert other.code == 2 and other.err.count("\n") == 1
-    assert "cannot be continued, it is of another campaign: its vary differs." in other.err
+    assert "it is of another campaign: vary.scene.files.0.file is b.obj, b.obj" in other.err
+    assert ", was a.obj, b.obj" in other.err
+    assert "Only these may change: pool, and count, which may grow. Drop it" in other.err
     assert "--fresh" in other.err and "give another folder" in other.err
 
 
@@ -537,7 +539,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
         other = lidarpool(*run, *more)
-        assert other.code == 2 and "is of another campaign: its seed differs" in other.err
+        assert other.code == 2 and "is of another campaign: seed is " in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
     made = unsealed(record.read_bytes())

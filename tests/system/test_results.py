@@ -69,6 +69,10 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     result.report(tmp_path, only_cloud=True)  # its own
     with pytest.raises(LidarError, match=r"holds the result of another survey: .*overwrite"):
         another.report(tmp_path)
+    sparse = replace(another, survey=replace(another.survey, keep_every=7))
+    words = r"of another survey, cloud\.keep_every is 7, was \d: .*overwrite"
+    with pytest.raises(LidarError, match=words):
+        sparse.report(tmp_path)
     another.report(tmp_path, only_cloud=True, overwrite=True)
     assert json.loads((tmp_path / "report.json").read_text())["identity"]["survey"] == "another"
     (tmp_path / "report.json").write_text("somebody's own")

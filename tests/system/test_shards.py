@@ -659,7 +659,7 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
-    with pytest.raises(LidarError, match=r"s\.yaml has another survey than these shards"):
+    with pytest.raises(LidarError, match=r"than these shards, steps is 26, was 25: give --scen"):
         merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
     (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")

@@ -15,6 +15,7 @@ from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural
 
+from ..base.field_words import differences
 from ..base.job_errors import lines_of_errors
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
@@ -37,6 +38,7 @@ CAMPAIGN_FILE = "campaign.json"  # the campaign of the data set, and the softwar
 # Entries of CAMPAIGN_FILE and their types.
 _RECORDED: dict[str, type] = {
     "identity": dict,
+    "fields": dict,
     "casting": dict,
     "backend": str,
     "sensors": dict,
@@ -211,6 +213,7 @@ class DataSetOutput(Output[CampaignRun]):
             store.rows(), seconds, store.resumed, sensors=store.sensors, **fields
         )
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
+        record |= {"fields": dict(store.fields)}
         record |= {"backend": store.backend, "sensors": sums.sensors}
         record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
         record |= {"shards": [str(self.campaign.shard)]}
@@ -406,9 +409,10 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
         )
     for name, value in campaign.identity.items():
         if record["identity"].get(name) != value:
+            changed = differences(record["fields"], campaign.fields)
             raise LidarError(
-                f"{storage} is of another campaign: its {name} differs. Make the job in a folder "
-                "of its own with --out."
+                f"{storage} is of another campaign: {changed or f'its {name} differs'}. Make the "
+                "job in a folder of its own with --out."
             )
     return record
 

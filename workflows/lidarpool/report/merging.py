@@ -19,6 +19,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import listed, plural
 
+from ..base.field_words import differences
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
@@ -221,8 +222,8 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
         fetch_database(run, path)
         try:
             with closing(RunDatabase(path, durable=False)) as db:
-                meta = {"casting": "{}"} | db.meta
-                texts = ("identity", "casting", "made_of")
+                meta = {"casting": "{}", "fields": "{}"} | db.meta
+                texts = ("identity", "fields", "casting", "made_of")
                 told = json.loads(meta["notes"])
                 record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
                 shard = Shard.parse(record["identity"].pop("shard"))
@@ -249,6 +250,7 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
     mistakes = Mistakes()
     expected = software()
     first = "the software here"
+    first_fields: Mapping[str, str] = {}
     parts_by_shard = dict[int, _Part]()
     for part in sorted(parts, key=lambda part: not part.record["casting"]):
         common = part.common
@@ -258,11 +260,14 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
         if differs := [
             name for name in expected if common.get(name, expected[name]) != expected[name]
         ]:
+            changed = differences(first_fields, part.record["fields"]) if first_fields else ""
             message = f"{part.storage} and {first} differ in {differs[0]}"
+            message += f" ({changed})" * bool(changed)
             mistakes.lines.append(f"{message}: merge shards of one run and of the same software.")
         elif len(common) > len(expected):
             expected = common
             first = str(part.storage)
+            first_fields = part.record["fields"]
         for shard in part.shards if part is not earlier else ():
             if (first_part := parts_by_shard.setdefault(shard.number, part)) is not part:
                 twice = f"shard {shard} is in {first_part.storage} and in {part.storage}"
@@ -455,7 +460,11 @@ def _merge_survey(
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
-        raise LidarError(f"{path} has another {differs[0]} than these shards: give --scenario.")
+        changed = differences(record["fields"], jobs.fields)
+        raise LidarError(
+            f"{path} has another {differs[0]} than these shards{f', {changed}' * bool(changed)}: "
+            "give --scenario."
+        )
     fields: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
     output = _Merged(out, job.survey, job.outputs, made_of["extent"], **fields)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)

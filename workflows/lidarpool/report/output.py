@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.interrupts import deferred_interrupts
@@ -21,6 +22,7 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
 from ..base import timeline
+from ..base.field_words import differences
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, result_folder, staging
@@ -82,15 +84,23 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
         if not run.continues_run:
-            self.refuse(lambda: run.jobs.identity, overwrite=run.options.overwrite)
+            jobs = run.jobs
+            self.refuse(lambda: jobs.identity, lambda: jobs.fields, overwrite=run.options.overwrite)
 
-    def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:
+    def refuse(
+        self,
+        identity: Callable[[], Mapping[str, str]],
+        fields: Callable[[], Mapping[str, str]],
+        *,
+        overwrite: bool = False,
+    ) -> None:
         """Refuse a target that holds the result of another survey, or files of no result.
 
         `identity` returns `RunResult.identity` of this result, which takes a moment for large
-        scenes. LidarError if there is a result of another scene or survey, a damaged result, or a
-        file that this result would replace and that no report there lists, each unless
-        `overwrite`; or a folder that would be replaced and holds foreign files.
+        scenes, and `fields` its fields in words. LidarError if there is a result of another scene
+        or survey, a damaged result, or a file that this result would replace and that no report
+        there lists, each unless `overwrite`; or a folder that would be replaced and holds foreign
+        files.
         """
         target = self.target
         storage = Storage.at(target)
@@ -101,11 +111,15 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 entries = set(storage.entries())
             except NotADirectoryError:
                 return
-        earlier, listed = _earlier(storage)
+        earlier, listed, earlier_fields = _earlier(storage)
         if REPORT in entries and not overwrite:
             expected = identity()
             if earlier != {name: expected[name] for name in _SURVEY}:
-                raise LidarError(f"{target} holds the result of another survey: {advice}")
+                changed = differences(earlier_fields, fields()) if earlier_fields else ""
+                raise LidarError(
+                    f"{target} holds the result of another survey{f', {changed}' * bool(changed)}: "
+                    f"{advice}"
+                )
         further = _further_files(self.survey, self.formats)
         foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
@@ -176,7 +190,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         folder = self._folder
         storage = self.target if isinstance(self.target, Storage) else None
         destination = Storage.at(storage or folder)
-        _, earlier = _earlier(destination)
+        earlier = _earlier(destination).files
         further = _further_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
         with (
@@ -316,18 +330,24 @@ def _known_further(names: Collection[str]) -> list[str]:
     return [row.file for row in _rows(names)] + measured
 
 
-def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
-    """Return the identity of the result in a folder, and its files, which may be removed.
+class _Earlier(NamedTuple):
+    """The result in a folder."""
 
-    Both are empty if there is no result, or a damaged result.
-    """
+    identity: Mapping[str, str] = MappingProxyType({})  # of scene and survey
+    files: frozenset[str] = frozenset()  # that may be removed
+    fields: Mapping[str, str] = MappingProxyType({})  # in words
+
+
+def _earlier(storage: Storage) -> _Earlier:
+    """Return the result in a folder; empty if there is no result, or a damaged result."""
     try:
         report = json.loads(storage.read(REPORT))
         identity = {name: report["identity"][name] for name in _SURVEY}
         files = frozenset(report["files"])
-        return identity, files | {*_DRAWN} if PICTURE_FILE in files else files  # drawn since then
+        files |= {*_DRAWN} if PICTURE_FILE in files else set()  # drawn since then
+        return _Earlier(identity, files, dict(report.get("fields", {})))
     except (OSError, ValueError, TypeError, LookupError):
-        return {}, frozenset()
+        return _Earlier()
 
 
 def _move(

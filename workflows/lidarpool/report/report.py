@@ -23,6 +23,7 @@ from lidarsim.sensor.survey import CloudOptions
 from lidarsim.sensor.weather import Weather
 
 from ..plan.planning import Search
+from ..run.job_source import fields_of
 from ..run.pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
 from ..run.run_result import RunResult
@@ -74,6 +75,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     return {
         "versions": versions(),
         "identity": dict(result.identity),
+        "fields": fields_of(scene, survey, result.planning),
         "machine": {"system": platform.platform(), "processor": platform.machine()},
         "backend": result.backend,
         "notes": list(result.notes),

@@ -9,13 +9,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
+
+from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Mounted, Sensor, Survey
+from lidarsim.sensor.survey import CloudOptions
+from lidarsim.sensor.weather import Weather
 
+from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
+from ..plan import Planning
 from ..scenario.build import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
@@ -35,6 +44,32 @@ def identity_of(job: Job) -> dict[str, str]:
         return {name: fingerprint(getattr(job, name)) for name in CONTENT}
     except LidarError as error:
         raise JobError(str(error)) from error
+
+
+def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
+    """Return the fields that a result depends on, in words, named as in a scenario.
+
+    Positions are in the scene's local coordinates.
+    """
+    size_m = np.ptp(scene.bounds, axis=0)
+    values: dict[str, Any] = {
+        "scene": {
+            "objects": len(scene.all_names),
+            "triangles": scene.triangles,
+            "size": " x ".join(f"{side:.6g}" for side in size_m) + " m",
+        }
+    }
+    for carried in survey.carried:
+        path = f"sensors.{carried.name}" if carried.name else "sensor"
+        values[path] = declared(carried, Mounted) | declared(carried.sensor, Sensor)
+        values[path] |= {"model": carried.sensor.name or "grid", "name": None, "sensor": None}
+    for section, kind in (("cloud", CloudOptions), ("weather", Weather)):
+        values[section] = declared(survey, kind)
+    values["cloud"]["columns"] = [column.name for column in survey.columns]
+    for name in ("poses", "trajectory", "steps", "materials", "returns", "noise", "navigation"):
+        values[name] = getattr(survey, name)
+    values |= {"faults": survey.faults, "planning": planning}
+    return dict(fields_in_words(values))
 
 
 class Jobs(Protocol):
@@ -70,6 +105,16 @@ class Jobs(Protocol):
         """Hashes of all inputs that the results depend on, by name."""
         ...
 
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Fields that the results depend on, in words, to name those that differ."""
+        ...
+
+    @property
+    def changeable(self) -> str:
+        """Words for what may change before a run is continued."""
+        ...
+
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Make a job with additional columns; `cache` has scenes that jobs share."""
         ...
@@ -100,6 +145,7 @@ class OneJob:
     numbers: range = range(1)
     title: str = ""
     names: tuple[str, ...] = ()
+    changeable: str = "pool, and formats of output that need no further columns"
 
     @cached_property
     def only_job(self) -> Job:
@@ -111,6 +157,12 @@ class OneJob:
     def identity(self) -> Mapping[str, str]:
         """Fingerprints of scene, survey and planning."""
         return identity_of(self.survey_job)
+
+    @cached_property
+    def fields(self) -> Mapping[str, str]:
+        """Fields of scene, survey and planning, in words."""
+        job = self.survey_job
+        return fields_of(job.scene, job.survey, job.planning)
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Return the only job, which has its columns."""

@@ -22,6 +22,7 @@ from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.validation import checked, sentences
 from lidarsim.base.yamlfile import read_yaml
 
+from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import Value
@@ -111,6 +112,8 @@ class CampaignSpec:
         self.choices = dict(jobs.choices)
         self._jobs = jobs
         self._splits = Splits(self.splits, head.seed)
+
+    changeable = "pool, and count, which may grow"
 
     @classmethod
     @checked
@@ -273,6 +276,12 @@ class CampaignSpec:
             "splits": fingerprint(dict(self.splits)),
             **self._jobs.identity,
         }
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """Fields that the data set depends on, in words: {path of a field: its value}."""
+        head = {"seed": self.seed, "keep": asdict(self.keep), "splits": self.splits}
+        return dict(fields_in_words({**head, "vary": self.choices})) | self._jobs.fields
 
 
 def _head(**fields: Any) -> CampaignSection:

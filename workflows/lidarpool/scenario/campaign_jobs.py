@@ -23,6 +23,7 @@ from lidarsim.base.validation import dotted, shown
 from lidarsim.base.words import plural
 from lidarsim.scene.files.mesh_formats import plugin_of
 
+from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.software import plugin_versions
 from ..datasets.job_table import Value
@@ -42,6 +43,7 @@ from .sections import file_states
 from .static_scene import SceneCache
 
 _NOISE = "noise.seed"  # path of the seed that differs from job to job
+_MAX_DESCRIBED = 20  # scenarios whose fields are stored with a run, to name those that differ
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
 
 
@@ -66,6 +68,11 @@ class JobSource:
     def scenario(self, number: int) -> Scenario | None:
         """Return the scenario of a job; None if a function makes the job."""
         return None
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """Fields of the scenarios that jobs are made of, in words."""
+        return {}
 
     def named_in(self, file: Path) -> str:
         """Return what names a file, to start a message, such as a scenario and its field."""
@@ -183,6 +190,12 @@ class ScenarioJobs(JobSource):
         self.identity = {"scenarios": fingerprint(fingerprints)}
         self._names = _unique([path.stem for path in paths])
 
+    @property
+    def fields(self) -> dict[str, str]:
+        """Fields of the first scenarios, in words."""
+        paths = self.paths[:_MAX_DESCRIBED]
+        return _fields_of({path.name: Scenario.load(path) for path in paths})
+
     def name(self, number: int) -> str:
         """Return the name of a job: the name of its file without suffix."""
         return self._names[number]
@@ -263,6 +276,14 @@ class VariedJobs(JobSource):
             "base": fingerprint([(base.name, _fingerprint(base.scenario)) for base in self._bases]),
             "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """Fields of the bases, and rows of the tables, in words."""
+        bases = self._bases[:_MAX_DESCRIBED]
+        tables = {f"rows of {text}": rows for base in bases for text, rows in base.tables.items()}
+        words = fields_in_words({name: to_json(rows).decode() for name, rows in tables.items()})
+        return _fields_of({base.name: base.scenario for base in bases}) | dict(words)
 
     def named_in(self, file: Path) -> str:
         """Return the field that names a file, also with table and line, to start a message."""
@@ -434,6 +455,15 @@ def _noise_seed(seed: int, number: int) -> int:
 def _seeded(noise: Any, seed: int) -> Any:
     """Return noise with a seed, if there is noise and its seed is 0."""
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
+
+
+def _fields_of(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
+    """Return the fields of scenarios by their names, without their sections on the cluster."""
+    words: dict[str, str] = {}
+    for name, scenario in scenarios.items():
+        content = scenario.model_dump(exclude={"pool"}, exclude_unset=True)
+        words |= {f"{name}: {field}": text for field, text in fields_in_words(content)}
+    return words
 
 
 def _fingerprint(scenario: Scenario) -> str:

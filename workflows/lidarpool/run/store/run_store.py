@@ -18,6 +18,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.simulator.scene_caster import AUTO_TAKES
 
+from ...base.field_words import differences
 from ...base.fingerprint import fingerprint
 from ...base.shard import shard_in_words
 from ...base.software import software
@@ -149,6 +150,7 @@ class RunStore:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
             meta = {"mark": mark, "identity": json.dumps(self._run_identity), "parts": shared}
+            meta["fields"] = json.dumps(dict(self.jobs.fields))
         try:
             return RunDatabase(path, durable=durable, **meta)
         except LidarError:
@@ -183,10 +185,10 @@ class RunStore:
         is another program's, or the earlier run differs from this one.
         """
         meta = self._read_mark(parts)
-        if meta is None or (earlier_mark and self._difference(meta["identity"])):
+        if meta is None or (earlier_mark and self._difference(meta)):
             return None
         read_parts_location(path)  # raises if the database is another program's
-        self._check_same(meta["identity"])
+        self._check_same(meta)
         self.begun = True
         if not earlier_mark:
             self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
@@ -227,7 +229,7 @@ class RunStore:
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if self.db.used:
-            self._check_same(self.db.meta["identity"])
+            self._check_same(self.db.meta)
         if (only_job := self.jobs.only_job) is not None:
             self.only_job = self._load(only_job)
         if self.db.used:
@@ -243,7 +245,7 @@ class RunStore:
             self.notes += check_parts(self.only_job, self.db, self._sizes, strays)
 
     def _write_mark(self) -> None:
-        names = ("mark", "identity", "parts", "backend", "casting")
+        names = ("mark", "identity", "fields", "parts", "backend", "casting")
         values = {name: self.db.meta[name] for name in names if name in self.db.meta}
         values["place"] = self.location.url
         self.storage.write(mark_name(values["mark"]), json.dumps(values).encode())
@@ -262,25 +264,29 @@ class RunStore:
                 f"them with {_DROP}."
             )
 
-    def _difference(self, identity: str) -> str:
-        """Return how an earlier run differs, as a clause; empty if the runs are the same."""
-        earlier = json.loads(identity)
+    def _difference(self, meta: Mapping[str, str]) -> str:
+        """Return how the run of a database differs, as a clause; empty if the runs are the same."""
+        earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
                 if name == "shard":
                     shards = str(earlier.get(name)), str(value)
                     earlier_shard, requested_shard = map(shard_in_words, shards)
                     return f"it is {earlier_shard}, not {requested_shard}"
-                if name in CONTENT:
-                    return f"it is of another {name}"
                 if name != "lidarpool":
-                    return f"it is of another campaign: its {name} differs"
+                    changed = differences(json.loads(meta.get("fields", "{}")), self.jobs.fields)
+                    differs = changed or f"its {name} differs"
+                    kind = name if name in CONTENT else "campaign"
+                    return (
+                        f"it is of another {kind}: {differs}. Only these may change: "
+                        f"{self.jobs.changeable}"
+                    )
                 return f"it was written with {name} {earlier.get(name, 'none')}, here it is {value}"
         return ""
 
-    def _check_same(self, identity: str) -> None:
+    def _check_same(self, meta: Mapping[str, str]) -> None:
         """Raise LidarError if an earlier run in this location differs from this run."""
-        if difference := self._difference(identity):
+        if difference := self._difference(meta):
             raise LidarError(
                 f"The run in {self.location} cannot be continued, {difference}. Drop it with "
                 f"{_DROP}, or give another folder."
@@ -304,6 +310,11 @@ class RunStore:
             self.db.set(backend=backend, casting=json.dumps(casting))
             with storing(self.storage):
                 self._write_mark()
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Fields that the results depend on, in words."""
+        return dict(json.loads(self.db.meta.get("fields", "{}")))
 
     @property
     def made_with(self) -> dict[str, Any]:

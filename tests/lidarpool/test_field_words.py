@@ -1,0 +1,58 @@
+"""Fields in words, by which messages name what differs between two runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarpool.base.field_words import differences, fields_in_words
+from lidarpool.plan import Planning
+from lidarpool.run.job_source import fields_of
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+
+POSES = [[x, 0, 1] for x in range(30)]
+
+
+def words(**sections):
+    """Return the fields of the survey of a scenario."""
+    built = build(Scenario.from_data({"poses": [[0, 0, 1]]} | sections))
+    return fields_of(built.scene, built.survey, built.planning)
+
+
+@pytest.mark.parametrize(
+    ("sections", "differs"),
+    [
+        ({"noise": {"range_m": 0.02}}, "noise.range_m is 0.02, was 0"),
+        ({"steps": 7}, "steps is 7, was "),
+        ({"weather": {"visibility_km": 2}}, "weather.visibility_km is 2, was not given"),
+        ({"cloud": {"columns": ["range"]}}, "cloud.columns is [range], was []"),
+        ({"poses": [[0, 0, 2]]}, "poses[0].position is [0, 0, 2], was [0, 0, 1]"),
+        ({"sensor": "velodyne/vlp16"}, "sensor.model is Velodyne VLP-16, was grid"),
+        ({"mount": [0, 0, 0.5]}, "sensor.mount.position is [0, 0, 0.5], was [0, 0, 0]"),
+        ({"scene": {"preset": "seed", "ground": {}}}, "scene.objects is 7, was 6"),
+    ],
+)
+def test_fields_that_differ_are_named_as_in_a_scenario(sections, differs):
+    assert differs in differences(words(), words(**sections), max_fields=20)
+
+
+def test_of_many_fields_some_are_named_and_the_others_counted():
+    earlier = {f"field{number}": "1" for number in range(9)}
+    now = dict.fromkeys(earlier, "2")
+    said = differences(earlier, now)
+    assert said.startswith("field0 is 2, was 1; field1 is 2") and said.endswith("; and 5 more")
+    assert differences(now, now) == ""
+
+
+def test_a_long_list_that_differs_has_other_content():
+    lists = [dict(fields_in_words({"poses": np.add(POSES, shift)})) for shift in (0, 1)]
+    assert differences(*lists) == "poses has other content"
+    poses = dict(fields_in_words({"poses": POSES[:-1]})), dict(fields_in_words({"poses": POSES}))
+    assert differences(*poses) == "poses is 30 entries, was 29 entries"
+
+
+def test_a_plan_is_of_the_fields():
+    plans = [Planning((0, 0), (10, 0), centres=[(5, 0)], radii=r) for r in (1, 2)]
+    fields = [dict(fields_in_words(plan, "planning")) for plan in plans]
+    assert differences(*fields) == "planning.radii is [2.0], was [1.0]"
