@@ -453,7 +453,10 @@ WRONG = {
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
         "actors.0.box.0 and actors.Van.box.0 lead to the same field",
     ),
-    "other section": ({"performance": {"choice": ["ideal"]}}, "It is a field of sensor"),
+    "other section": ({"performance": {"choice": ["ideal"]}}, "mean 'sensors.roof.performance'?"),
+    "of a list": ({"up_axis": {"choice": ["z"]}}, "Did you mean 'scene.files.0.up_axis'?"),
+    "of a section": ({"visibility_km": {"choice": [5]}}, "mean 'weather.visibility_km'?"),
+    "of a mapping": ({"rate_hz": {"choice": [5]}}, "mean 'sensors.roof.rate_hz'?"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
         "scene is chosen as a whole",

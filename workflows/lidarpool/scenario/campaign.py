@@ -127,8 +127,9 @@ class CampaignSpec:
             to no field, a value that can be drawn is not valid there, or a file is missing.
         """
         path = Path(path)
-        with sentences(CampaignSection, path):
-            section = CampaignSection.model_validate(read_yaml(path, _FORM))
+        content = read_yaml(path, _FORM)
+        with sentences(CampaignSection, path, content):
+            section = CampaignSection.model_validate(content)
         jobs = VariedJobs(section, path)
         self = cls.__new__(cls)
         self._begin(jobs, section.model_copy(update={"title": section.title or path.stem}))

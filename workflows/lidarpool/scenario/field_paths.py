@@ -8,7 +8,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import field_hint, fields_of, is_section, sections_in
+from lidarsim.base.field_advice import owner_of_file, owners_by_level
+from lidarsim.base.sections import fields_of, is_section, sections_in
 from lidarsim.base.words import did_you_mean, plural, shortened
 
 from .scenario import Scenario
@@ -42,7 +43,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
         if is_section(type(node)):
-            key, node, kind = _field(node, remaining[0], path)
+            key, node, kind = _field(scenario, node, remaining[0], path)
             part_count = 1
         elif isinstance(node, dict):
             keys = {str(key): key for key in node}  # of classes, numbers
@@ -61,16 +62,47 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     return tuple(steps), kind
 
 
-def _field(node: BaseModel, name: str, path: str) -> tuple[str, Any, Any]:
+def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[str, Any, Any]:
     """Return a field of the section at a path by its name in YAML: name, value, annotation."""
     attributes = {
         field.alias or attribute: attribute for attribute, field in fields_of(type(node)).items()
     }
     if name not in attributes:
         kind = f"a field of {path}" if path else "a section of a scenario"
-        raise LidarError(f"{name!r} is not {kind}.{field_hint(name, attributes, Scenario)}")
+        hint = did_you_mean(name, attributes) or _path_hint(scenario, name)
+        raise LidarError(f"{name!r} is not {kind}.{hint}")
     attribute = attributes[name]
     return name, getattr(node, attribute, None), fields_of(type(node))[attribute].annotation
+
+
+def _path_hint(scenario: Scenario, name: str) -> str:
+    """Return " Did you mean 'sensor.performance'?" for the field of a name, or empty."""
+    for owners in owners_by_level(name, owner_of_file(Scenario)):
+        paths = [path for owner in owners if (path := _path_in(scenario, owner.names, name))]
+        # Such as sensors instead of sensor, of which a scenario has one.
+        given = [path for path in paths if path.split(".")[0] in scenario.model_fields_set]
+        if paths:
+            return f" Did you mean {' or '.join(map(repr, (given or paths)[:3]))}?"
+    return ""
+
+
+def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
+    """Return the path of a field in a scenario, of the first entry of lists; empty if absent."""
+    node: Any = scenario
+    keys: list[str] = []
+    for section in names:
+        if node is None:
+            return ""
+        node = getattr(node, section, None)
+        keys.append(section)
+        if isinstance(node, (tuple, list, dict)):
+            if not node:
+                return ""
+            key: Any = next(iter(node)) if isinstance(node, dict) else 0
+            node = node[key]
+            keys.append(str(key))
+    is_absent = node is None and len(keys) > 1  # such as the file of an actor that is a box
+    return "" if is_absent else ".".join([*keys, name])
 
 
 def _match_name(names: Sequence[str], parts: Sequence[str], path: str) -> tuple[str, int]:

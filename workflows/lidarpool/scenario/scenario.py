@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
-from pydantic import PrivateAttr
+from pydantic import PrivateAttr, ValidationError
 
 from lidarsim.base.declared import Several, Text, about, by_text
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
@@ -134,7 +134,7 @@ class Scenario(Section):
         dict[Text, CarriedEntry],
         about(
             "instead of sensor: several on one carrier, by name, each with its mount",
-            {"front": {"model": "velodyne/vlp16", "mount": [2, 0, 0.5]}, "roof": "ouster/os1-64"},
+            {"roof": {"model": "ouster/os1-64", "mount": [0, 0, 2]}, "front": "velodyne/vlp16"},
             max_length=MAX_SENSORS,
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
@@ -256,7 +256,7 @@ class Scenario(Section):
 
         LidarError as `load`.
         """
-        with sentences(Scenario, source):
+        with sentences(Scenario, source, data, _is_contradictory):
             sections = Scenario.model_validate(data)
         changes = {name: getattr(sections, name) for name in sections.model_fields_set}
         scenario = self.model_copy(update=changes)
@@ -411,3 +411,11 @@ class Scenario(Section):
         """Whether faces keep the names of their materials: for a column or for materials."""
         columns = {*self.cloud.columns, *self.output.needs}
         return "material" in columns or any(m.material is not None for m in self.materials)
+
+
+def _is_contradictory(content: Any) -> bool:
+    """Return True if the sections of a scenario contradict each other."""
+    try:
+        return any(Scenario.model_validate(content)._contradictions())
+    except ValidationError:  # another fault
+        return False

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
-from lidarsim.base.validation import fields_of, is_section
+from lidarsim.base.sections import fields_of, is_section
 
 from .campaign_sections import CampaignSection
 from .placing import on_one_line

@@ -28,8 +28,7 @@ from typing import (
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
-from pydantic import ConfigDict, GetCoreSchemaHandler, GetPydanticSchema, WrapValidator
-from pydantic.fields import FieldInfo
+from pydantic import ConfigDict, GetCoreSchemaHandler, WrapValidator
 from pydantic_core import (
     ErrorDetails,
     PydanticKnownError,
@@ -40,14 +39,14 @@ from pydantic_core import (
 
 from .arrays import AnyArray
 from .errors import LidarError, Mistakes
+from .field_advice import Contradictory, list_advice, name_advice, place_advice
+from .sections import FieldPath, Fields, classes_in, dotted, fields_by_name
 from .signatures import ReadableSignature, readable
 from .words import did_you_mean, listed, plural
 
 P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
-Fields = Mapping[str, FieldInfo]
-FieldPath = tuple[int | str, ...]
 
 # No further fields, finite numbers, no conversion of text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -88,10 +87,6 @@ _ALLOWED = {
 _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
 _LENGTHS = ("min_length", "max_length")
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-_SYNONYMS = {
-    "position": "translation",
-    "translation": "position",
-}  # too different for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
 # {class: function that makes its schema, and the limits that the function takes}
 _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
@@ -102,6 +97,7 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     datetime: (core_schema.datetime_schema, ()),
     NoneType: (core_schema.none_schema, ()),
 }
+_UNKNOWN_FIELD = ("extra_forbidden", "invalid_key", "unexpected_keyword_argument")
 _MAX_LETTERS = 160  # of a value in a message
 _MAX_LINE = 119  # letters of a `repr`
 _MAX_VALUE = 64  # letters of the value of a field
@@ -279,22 +275,33 @@ def _attribute_check(protocol: type) -> Callable[[Any], Any]:
 
 
 @contextmanager
-def sentences(section: Any, source: object = "") -> Iterator[None]:
-    """Turn pydantic's error of the body into a LidarError with a line for each mistake."""
+def sentences(
+    section: Any,
+    source: object = "",
+    content: Any = None,
+    contradictory: Contradictory = lambda content: False,
+) -> Iterator[None]:
+    """Turn pydantic's error of the body into a LidarError with a line for each mistake.
+
+    `content` is the content of the file, if it is known, for advice on unknown fields;
+    `contradictory` returns True for a content whose fields contradict each other.
+    """
     try:
         yield
     except ValidationError as error:
         mistakes = Mistakes()
-        lines = validation_errors(error, section)
+        lines = validation_errors(error, section, content, contradictory)
         mistakes.lines += [f"{source}: {line}" if source else line for line in lines]
         mistakes.tell()
 
 
-def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
-    """Yield a line for each error in a file: field, value given, values allowed.
-
-    For an unknown field, a similar name is suggested, and the sections with the field are named.
-    """
+def validation_errors(
+    error: ValidationError,
+    section: Any,
+    content: Any = None,
+    contradictory: Contradictory = lambda content: False,
+) -> Iterator[str]:
+    """Yield a line for each error in a file: field, value given, values allowed, and advice."""
     details_by_path = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     groups: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: paths}
     for path, detail in details_by_path.items():
@@ -314,8 +321,15 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
             count = plural(len(further_paths), "more entry", "more entries")
             count_note = f" {count} {like_it}."
         hint, fields = _annotation_at(first, section)
-        advice = field_hint(str(first[-1]), fields, section) if first else ""
-        yield _sentence(first, [details_by_path[first]], hint, advice, _in_file) + count_note
+        detail = details_by_path[first]
+        advice = ""
+        if detail["type"] in _UNKNOWN_FIELD and first:
+            advice = place_advice(first, detail["input"], fields, section, content, contradictory)
+        elif detail["type"] in ("list_type", "tuple_type"):
+            advice = list_advice(hint, detail["input"])
+        elif detail["type"] in ("model_type", "dataclass_type", "dict_type"):
+            advice = name_advice(first, section)
+        yield _sentence(first, [detail], hint, advice, _in_file) + count_note
 
 
 def _in_file(value: Any) -> str:
@@ -344,7 +358,7 @@ def _sentence(
 ) -> str:
     """Return a sentence on the errors of a value: location, value and allowed values.
 
-    `advice` follows if the value is an unknown field. `show` formats the value.
+    `advice` follows. `show` formats the value.
     """
     location = dotted(path)
     kind = details[0]["type"]
@@ -352,7 +366,7 @@ def _sentence(
     if kind == "value_error":
         message = str(details[0]["ctx"]["error"])
         return f"{location}: {message}" if location else message
-    if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
+    if kind in _UNKNOWN_FIELD:
         return f"{location} is not a field.{advice}"
     if kind == "missing":
         return f"{location} is missing; it must be given."
@@ -363,7 +377,7 @@ def _sentence(
         suggestion = did_you_mean(value, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
         if suggestion:  # before the allowed values, which may be many
             return f"{location} is {show(value)}.{suggestion} It {allowed}"
-    return f"{location} is {show(value)}; it {allowed}"
+    return f"{location} is {show(value)}; it {allowed}{advice}"
 
 
 def _requirement(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
@@ -405,99 +419,16 @@ def _range(limits: Mapping[str, Any]) -> str:
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
 
 
-def field_hint(name: str, field_names: Collection[str], root: Any) -> str:
-    """Return advice on an unknown field: a similar field name, and sections with such a field.
-
-    `field_names` are the fields of the section, and `root` is the section of the whole file. Only
-    the outermost sections with the field are named, without classes derived from each other.
-    """
-    if (synonym := _SYNONYMS.get(name)) in field_names:
-        return f" Did you mean {synonym!r}?"
-    level = [("", root)]
-    owners = list[tuple[str, Any]]()
-    while level and not owners:
-        level = [
-            (f"{section_path}.{inner}", kind)
-            for section_path, outer in level
-            for inner, field in _fields_by_name(outer).items()
-            if not any(
-                isinstance(note, GetPydanticSchema) for note in field.metadata
-            )  # a field of Python only
-            for kind in sections_in(field.annotation)
-        ]
-        owners = [
-            (section_path[1:], kind)
-            for section_path, kind in level
-            if name in _fields_by_name(kind)
-        ]
-    kinds = {kind for _, kind in owners}
-    section_paths = [
-        section_path for section_path, kind in owners if kinds.isdisjoint(kind.__mro__[1:])
-    ]
-    listed = " and ".join(filter(None, [", ".join(section_paths[:-1]), *section_paths[-1:]]))
-    suggestion = did_you_mean(name, field_names)
-    if not section_paths:
-        return suggestion
-    return (
-        f"{suggestion} Or {name} of {listed}?"
-        if suggestion
-        else f" It is a field of {listed}: write it there."
-    )
-
-
 def _annotation_at(path: FieldPath, hint: Any) -> tuple[Any, Fields]:
     """Return the annotation at a path in a file, and the fields of the section around."""
     fields: Fields = {}
-    inner = _fields_by_name(hint)
+    inner = fields_by_name(hint)
     for step in path:
         fields = inner
         if step in fields:
             hint = fields[str(step)].rebuild_annotation()
-            inner = _fields_by_name(hint)
+            inner = fields_by_name(hint)
     return hint, fields
-
-
-def _fields_by_name(hint: Any) -> Fields:
-    """Return the fields of the sections in an annotation: {name in a file: field}."""
-    fields = (pair for kind in sections_in(hint) for pair in fields_of(kind).items())
-    return {field.alias or name: field for name, field in fields}
-
-
-def fields_of(section: Any) -> Fields:
-    """Return the fields of a section of files: {attribute: field}."""
-    return getattr(section, "model_fields", None) or _dataclass_fields(section)
-
-
-@cache
-def _dataclass_fields(section: Any) -> Fields:
-    """Return the fields of a dataclass: {attribute: field}."""
-    hints = get_type_hints(section, include_extras=True)
-    make_field = FieldInfo.from_annotated_attribute
-    return {field.name: make_field(hints[field.name], field) for field in dataclass_fields(section)}
-
-
-def is_section(kind: Any) -> bool:
-    """Return True for a section of files: a model, or a dataclass with `checked_fields`."""
-    return hasattr(kind, "model_fields") or hasattr(kind, "__pydantic_config__")
-
-
-def sections_in(annotation: Any) -> Iterator[Any]:
-    """Yield the sections in an annotation, such as `tuple[Section, ...] | None`."""
-    return filter(is_section, classes_in(annotation))
-
-
-def classes_in(annotation: Any) -> Iterator[type]:
-    """Yield the classes in an annotation, such as `tuple[Class, ...] | None`."""
-    if isinstance(annotation, type) and not get_args(annotation):
-        yield annotation
-    for inner in get_args(annotation):
-        yield from classes_in(inner)
-
-
-def dotted(path: Sequence[int | str]) -> str:
-    """Return a path as text: poses[0].position."""
-    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
-    return "".join(steps).removeprefix(".")
 
 
 def shown(value: object) -> str:

@@ -419,8 +419,9 @@ def _read(path: Path | Traversable) -> SensorModel:
     """Read the data file of a model; LidarError if the file cannot be used."""
     try:
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
-        with sentences(SensorModel, path):
-            return SensorModel.model_validate(load_yaml(text))
+        content = load_yaml(text)
+        with sentences(SensorModel, path, content):
+            return SensorModel.model_validate(content)
     except UNUSABLE as error:
         raise LidarError(f"{path} is not a usable model: {message_of(error)}") from error
 

@@ -81,7 +81,7 @@ class ClusterFile(BaseModel):
         is not a cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
-        with sentences(cls, path):
+        with sentences(cls, path, content):
             file = cls.model_validate(content)
         file._source = str(path)
         for name, workers in file.partitions.items():

@@ -1,0 +1,56 @@
+"""Sections of files: the fields of models and dataclasses, and the sections in annotations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields as dataclass_fields
+from functools import cache
+from typing import Any, get_args, get_type_hints
+
+from pydantic.fields import FieldInfo
+
+Fields = Mapping[str, FieldInfo]
+FieldPath = tuple[int | str, ...]
+
+
+def fields_by_name(hint: Any) -> Fields:
+    """Return the fields of the sections in an annotation: {name in a file: field}."""
+    fields = (pair for kind in sections_in(hint) for pair in fields_of(kind).items())
+    return {field.alias or name: field for name, field in fields}
+
+
+def fields_of(section: Any) -> Fields:
+    """Return the fields of a section of files: {attribute: field}."""
+    return getattr(section, "model_fields", None) or _dataclass_fields(section)
+
+
+@cache
+def _dataclass_fields(section: Any) -> Fields:
+    """Return the fields of a dataclass: {attribute: field}."""
+    hints = get_type_hints(section, include_extras=True)
+    make_field = FieldInfo.from_annotated_attribute
+    return {field.name: make_field(hints[field.name], field) for field in dataclass_fields(section)}
+
+
+def is_section(kind: Any) -> bool:
+    """Return True for a section of files: a model, or a dataclass with `checked_fields`."""
+    return hasattr(kind, "model_fields") or hasattr(kind, "__pydantic_config__")
+
+
+def sections_in(annotation: Any) -> Iterator[Any]:
+    """Yield the sections in an annotation, such as `tuple[Section, ...] | None`."""
+    return filter(is_section, classes_in(annotation))
+
+
+def classes_in(annotation: Any) -> Iterator[type]:
+    """Yield the classes in an annotation, such as `tuple[Class, ...] | None`."""
+    if isinstance(annotation, type) and not get_args(annotation):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from classes_in(inner)
+
+
+def dotted(path: Sequence[int | str]) -> str:
+    """Return a path as text: poses[0].position."""
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
+    return "".join(steps).removeprefix(".")
