@@ -32,8 +32,8 @@ def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> lis
         reason, _, values = message.partition(_VALUES)
         values_by_job.setdefault(_NUMBER.sub("", reason, count=1), {})[job] = values
     lines = []
-    for reason, values in values_by_job.items():
-        of_job = next(iter(values.values())) if len(values) == 1 else ""
-        line = f"{'jobs' if len(values) > 1 else 'job'} {listed([*values], max_jobs)}: {reason}"
+    for reason, jobs in values_by_job.items():
+        of_job = next(iter(jobs.values())) if len(jobs) == 1 else ""
+        line = f"{'jobs' if len(jobs) > 1 else 'job'} {listed([*jobs], max_jobs)}: {reason}"
         lines.append(f"{line} Its values are {of_job}" if of_job else line)
     return lines

@@ -65,7 +65,7 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
         values[path] |= {"model": carried.sensor.name or "grid", "name": None, "sensor": None}
     for section, kind in (("cloud", CloudOptions), ("weather", Weather)):
         values[section] = declared(survey, kind)
-    values["cloud"]["columns"] = [column.name for column in survey.columns]
+    values["cloud"]["columns"] = [getattr(column, "name", column) for column in survey.columns]
     for name in ("poses", "trajectory", "steps", "materials", "returns", "noise", "navigation"):
         values[name] = getattr(survey, name)
     values |= {"faults": survey.faults, "planning": planning}

@@ -103,7 +103,7 @@ def place_advice(
     direct: list[str] = []
     examples: list[str] = []
     for owners in (owners for start in starts for owners in owners_by_level(name, start)):
-        kinds = []
+        kinds: list[Any] = []
         for owner in owners:
             right = _right_value(owner.kind, name, value)
             changed = None

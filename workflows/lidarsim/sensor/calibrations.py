@@ -188,9 +188,9 @@ def _table(name: str, text: str) -> Calibration:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
         if unknown:
-            columns = "columns are" if unknown[1:] else "column is"
+            verb = "columns are" if unknown[1:] else "column is"
             raise ValueError(
-                f"its {columns} not known: {', '.join(map(printable, unknown))}."
+                f"its {verb} not known: {', '.join(map(printable, unknown))}."
                 f"{did_you_mean_each(unknown, names)} Known are {', '.join(names)}"
             )
         if duplicate := next((word for word in header if header.count(word) > 1), None):
