@@ -17,7 +17,7 @@ _END_LETTERS = 500  # of a line that is cut in its middle: what was expected, an
 
 
 _LONG_LIST = re.compile(r"(?:[^\s,]+(?: \([^)]*\))?, ){15,}\S+")
-_MIN_LIST_LETTERS = 200  # of a list with lines of its own
+_MIN_LIST_LETTERS = 300  # of a list with lines of its own
 _WIDTH = 100  # letters of these lines, as of --help
 _INDENT = "  "
 
