@@ -182,7 +182,10 @@ WRONG = {
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
         (SCENE, Survey(poses=AT), (25, 25), "Planning(("),
     ],
-    sweeps: [(3, "location is 3"), ("nowhere", "nowhere does not exist: give the folder of a data set")],
+    sweeps: [
+        (3, "location is 3"),
+        ("nowhere", "nowhere does not exist: give the folder of a data set"),
+    ],
     to_dask: [
         (3, "points is 3"),
         (Cloud(POINTS, {}), "it must be a StoredCloud"),

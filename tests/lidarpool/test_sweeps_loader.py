@@ -189,7 +189,10 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
             what()
         assert len(str(raised.value).splitlines()) == 1
 
-    told(lambda: lidarpool.sweeps(tmp_path / "nowhere"), "nowhere is no data set of lidarpool")
+    told(
+        lambda: lidarpool.sweeps(tmp_path / "nowhere"),
+        "nowhere does not exist: give the folder of a data set",
+    )
     first = lidarpool.sweeps(place)
     points = place / "sequences/00/velodyne/000000.bin"
     whole = points.read_bytes()

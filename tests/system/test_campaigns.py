@@ -461,9 +461,9 @@ def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
 
 def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
     (files / "report.json").write_text("{}")
-    for place in (files, files / "none"):
+    for place, says in ((files, "is no data set of lidarpool"), (files / "none", "does not exist")):
         refused = lidarpool("run", "--verify", place)
-        assert refused.code == 2 and "is no data set of lidarpool" in refused.err
+        assert refused.code == 2 and says in refused.err
     for option in (["--verify"], ["--job", 1], ["--retry-failed"]):
         refused = lidarpool("run", files / "base.yaml", "--out", files / "ds", *option)
         assert refused.code == 2 and "are for campaigns" in refused.err
