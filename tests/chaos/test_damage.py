@@ -47,6 +47,7 @@ def read_all(place: Path) -> str:
 READERS = {"sweeps": read_sweeps, "verify": read_all, "view": shown}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", READERS)
 def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
     reader: Reader = READERS[name]

@@ -59,6 +59,7 @@ def card(tmp_path_factory):
     return folder, write(place, iter(ROWS), Page((80, 40)))
 
 
+@pytest.mark.extended
 def test_figures_are_those_of_done_jobs(card):
     folder, report = card
     assert json.loads((folder / "report.json").read_text()) == report

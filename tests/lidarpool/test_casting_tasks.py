@@ -47,6 +47,7 @@ def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):
     rigs.drop_all("b")
 
 
+@pytest.mark.extended
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):  # noqa: F811
     driven = MADE["on the move"]
     spans = [(0, 9), (9, 28)]

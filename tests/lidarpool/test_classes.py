@@ -144,6 +144,7 @@ def test_kitti_has_them_as_semantic_kitti_api_reads_them(saved):
     assert len({tuple(colour) for colour in told["color_map"].values()}) == 5
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("layout", ["velodyne", "autoware", "ouster"])
 def test_bags_tell_late_listeners_and_label_the_points(saved, scene, sweeps, layout):
     with AnyReader([saved("rosbag2", layout=layout)]) as bag:

@@ -146,6 +146,7 @@ def test_a_ground_without_files_carries_copies_too(made):
     assert (low[:2] <= [97, 97]).all() and (high[:2] >= [123, 113]).all()
 
 
+@pytest.mark.extended
 def test_the_seed_and_the_name_choose_the_places(made):
     def at(**more):
         entry = TREE | {"name": more.pop("name", "Tree"), "scatter": {"count": 40, **more}}

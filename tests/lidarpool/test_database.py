@@ -88,6 +88,7 @@ def test_what_is_committed_is_there_once(db, job):
     again.close()
 
 
+@pytest.mark.extended
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(
@@ -335,6 +336,7 @@ def test_a_file_that_cannot_be_made(tmp_path):
         RunDatabase(tmp_path / "run.db")
 
 
+@pytest.mark.extended
 def test_one_run_at_a_time(db, job, tmp_path):
     commit(db, job, receipt(0, 5))
     code = (

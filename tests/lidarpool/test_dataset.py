@@ -137,7 +137,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     assert total == sum((job(number).object >= objects).sum() for number in (0, 1, 7))
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("format", DATA_SETS)
 def test_the_same_job_has_the_same_bytes_and_can_be_undone(written, job, sweeps, tmp_path, format):  # noqa: A002
     data, place = written(format)
@@ -165,7 +165,7 @@ def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
         data.write_job(JobRow(3, "003"), cloud, sweeps)
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("format", ["kitti", "mcap"])
 def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # noqa: A002
     data = DataSet(Storage.at(tmp_path / "both"), format)

@@ -45,6 +45,7 @@ def test_without_a_folder_for_compiled_loops(monkeypatch):
     assert "NUMBA_CACHE_DIR" in doctor._fix_first(SOUND)
 
 
+@pytest.mark.extended
 def test_a_port_that_is_in_use(monkeypatch):
     with closing(socket.create_server(("127.0.0.1", 0))) as server:
         port = server.getsockname()[1]

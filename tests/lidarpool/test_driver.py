@@ -615,6 +615,7 @@ class Mishaps:
         self.chance.choice([*work, *work, *work, *rare])()
 
 
+@pytest.mark.extended
 @settings(max_examples=60, deadline=None)
 @given(chance=st.randoms(use_true_random=False))
 def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance):
@@ -772,6 +773,7 @@ def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
     assert [number for number, error in empty.ended.items() if error] == [17]
 
 
+@pytest.mark.extended
 def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     begun = 0
     most = 0

@@ -78,6 +78,7 @@ def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
         fitted.save(tmp_path / "mine.json")
 
 
+@pytest.mark.extended
 def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
     page = fitted.save(tmp_path / "mine.yaml")[1].read_text()
     assert page.count("data-figure=") == len(fitted.figures["figures"])
@@ -177,6 +178,7 @@ def block():
     return city(30_000, seed=1)
 
 
+@pytest.mark.extended
 def test_a_sensor_that_moves_is_refused_with_its_speed(block):
     """26 m/s, 0.06 m a sweep, and a turn on the spot; most ranges of a street stay the same."""
     cases = (street(), 0.0, 1.3, 0.0), (block, 1.8, 1.3, 0.0), (block, 1.8, 0.06, 0.0)
@@ -208,6 +210,7 @@ def parked_street():
     return Scene.from_meshes(boxes)
 
 
+@pytest.mark.extended
 def test_a_drive_along_walls_is_found_by_parked_cars_and_posts():
     """26 m/s, of which most rays know nothing: such a drive looks like standing."""
     scene = parked_street()
@@ -229,6 +232,7 @@ def survey_along(speed_m_s, noise, sweeps=6):
     )  # fmt: skip
 
 
+@pytest.mark.extended
 def test_poses_of_a_result_are_used(cluster_client):
     """The result of a drive at 26 m/s is fitted in its scene, and refused without a scene."""
     scene = parked_street()
@@ -283,6 +287,7 @@ def test_a_slow_sensor_is_refused_with_its_speed(block):
     assert speed == pytest.approx(0.3, rel=0.15)
 
 
+@pytest.mark.extended
 def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
     stands = drive(block, 1.8, 0.0)
 
@@ -390,6 +395,7 @@ def test_rings_of_false_alarms_alone_are_of_the_same_sensor(recording):
     assert estimate["low"] < share < estimate["high"] < 2 * share
 
 
+@pytest.mark.extended
 def test_what_a_single_sweep_covers_tells_no_false_alarms(recording):
     """A third of the turn is in the first sweep only, and few of the returns there repeat."""
 
@@ -462,7 +468,7 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.extended(keep=("street",))
+@pytest.mark.extended
 @pytest.mark.slow(keep=("street", "forest"))
 @pytest.mark.parametrize("where", PLACES)
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
@@ -570,6 +576,7 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
         open_recording(tmp_path / "room.pcap")
 
 
+@pytest.mark.extended
 def test_a_result_is_fitted_as_a_cloud_and_as_files(cluster_client, tmp_path):
     from lidarpool import Scene, Survey, simulate
 

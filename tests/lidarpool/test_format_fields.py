@@ -125,6 +125,7 @@ def xyz_of(rows):
     return np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("model", SPINNING)
 @pytest.mark.parametrize("layout", ["velodyne", "images", "autoware", "ouster"])
@@ -431,7 +432,7 @@ def vectors_of(fields, prefix=""):
     return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.extended(every=18)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("compensated", [False, True])
@@ -562,7 +563,7 @@ def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, 
     assert ("world" if coordinates == "world" else "firing of each") in str(frame.record_data)
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended
 @pytest.mark.parametrize("chunk", [700, 1_000_000])
 @pytest.mark.parametrize(("head", "lines_s"), [("sine", 80), ("polygon", 50)])
 def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, lines_s, chunk):
@@ -585,6 +586,7 @@ def test_lines_of_mirrors_have_directions_and_ends(tmp_path, monkeypatch, head, 
         assert shares[0] == 1  # all lines of this polygon run from right to left
 
 
+@pytest.mark.extended
 def test_flight_lines_and_sensors_are_sources(tmp_path):
     _, cloud = flown_alone("sine")
     las = read_las(cloud, tmp_path / "a.laz")

@@ -62,6 +62,7 @@ SCALARS = st.one_of(
 )  # fmt: skip
 
 
+@pytest.mark.extended
 @given(st.lists(st.dictionaries(st.sampled_from(["points", "class_3", "a.b"]), SCALARS)))
 def test_values_keep_their_types(tmp_path_factory, rows):
     """Also text that looks like a number, and names that are those of other columns."""

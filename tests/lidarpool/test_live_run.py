@@ -119,6 +119,7 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         wait_for(lambda: displayed(live) == 600)
 
 
+@pytest.mark.extended
 def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])

@@ -197,6 +197,7 @@ MODULES = [
 ]
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name):
     done = doctest.testmod(importlib.import_module(name))

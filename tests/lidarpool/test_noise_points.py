@@ -45,6 +45,7 @@ def top_of(path, **options):
     return round((scene.bounds + scene.origin)[1, 2]), notes
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize(
     ("point_format", "columns", "left_out"),

@@ -64,6 +64,7 @@ def test_what_is_packed_comes_back(first, counts):
 SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
 
 
+@pytest.mark.extended
 def test_damage_at_any_place_is_noticed_or_changes_nothing():
     data = bytes(pack(SMALL))
     noticed = 0

@@ -182,7 +182,7 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
     assert ("only the backs" in placed.note) == (name == "box hall")
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("species", SPECIES, ids=lambda species: species.name)
 def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
     alone = tree(species)

@@ -249,6 +249,7 @@ def test_a_closed_ring_of_discs_has_no_way_out(enclosed):
     assert 9 * math.sqrt(2) <= shortest_path_length((0, 0), (9, 9), ring, ajar) < 14
 
 
+@pytest.mark.extended
 def test_of_thousands_of_discs_those_out_of_reach_cost_nothing():
     """Looking at all of them would take an hour."""
     x, y = np.meshgrid(np.linspace(-50, 50, 60), np.linspace(6, 60, 50))

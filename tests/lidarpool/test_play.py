@@ -83,6 +83,7 @@ def test_a_loop_goes_on_in_time_until_ctrl_c(kept, tmp_path):
     assert shifts_ns[3:] == pytest.approx([150e6, 150e6], rel=1e-3)
 
 
+@pytest.mark.extended
 def test_a_result_gives_the_points_of_its_scenario(cluster, tmp_path):
     scenario = tmp_path / "s.yaml"
     scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")

@@ -463,6 +463,7 @@ def test_the_command(tmp_path):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["room-scan", "building-3", "tree-1", "car-2", "ground", "scan"])
 def test_only_generated_scenes_are_painted(tmp_path, name):
     path = written(tmp_path / f"{name}.ply", plane())

@@ -318,6 +318,7 @@ def lanes(text: str) -> list[str]:
     return html.fromstring(text).xpath("//path[contains(@class, 'lane')]/title/text()")
 
 
+@pytest.mark.extended
 def test_the_timeline_shows_who_worked_when_and_is_bounded(write):
     text, _ = write()
     assert lanes(text)[5:] == [

@@ -192,7 +192,7 @@ def test_fields_of_several_numbers_and_of_the_same_name():
         point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("layout", "model", "mode"),
     [

@@ -367,6 +367,7 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("idle", "used"),
     [
@@ -404,6 +405,7 @@ YAML_VALUES = st.recursive(
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=100)
 @given(
     st.dictionaries(

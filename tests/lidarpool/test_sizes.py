@@ -56,6 +56,7 @@ def test_cells_of_any_length_are_refused_in_a_line(tmp_path, cell):
     assert "a cell has more than 131,072 letters" in refused(load_trajectory, path)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "name", ["z" * 300_000, "z(" * 150_000, "z [" + " " * 300_000, "_z" * 99_999]
 )

@@ -106,6 +106,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     assert not folder.exists()
 
 
+@pytest.mark.extended
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     store = opened()
     add(store, 0, 6)

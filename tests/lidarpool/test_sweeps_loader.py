@@ -254,6 +254,7 @@ def _read(data: Any, queue: Any) -> None:
     queue.put([(identity(sweep), float(sweep.points.sum())) for sweep in data])
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("kitti", "mcap"))
 @pytest.mark.parametrize("name", DATA_SETS)
 def test_threads_and_forks_read_beside_each_other(written, name):
@@ -347,6 +348,7 @@ def test_torch_gets_tensors(written, torch):
     assert list(data.torch(transform=identity)) == [identity(sweep) for sweep in data]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("ranks", "workers"), [(1, 1), (1, 4), (4, 1), (4, 3), (7, 2)])
 @pytest.mark.parametrize("even", [True, False])
 def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, workers, even):

@@ -36,6 +36,7 @@ def passing(beyond, times=(0.02, 0.065)):
     )
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
 def test_an_actor_is_hit_only_while_it_is_there(model, backend):
@@ -350,6 +351,7 @@ def test_unusable_data_is_refused(tmp_path, text, told):
         build(scenario(tmp_path, text))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("vehicles", "limit_bytes", "told"),
     [

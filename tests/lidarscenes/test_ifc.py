@@ -567,6 +567,7 @@ def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
         load_meshes(path)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("cut", [10, 60])
 def test_a_process_that_dies_within_a_frame_is_reported(tmp_path, monkeypatch, cut):
     output = b'{"what": "shape", "arrays": [["<f8", [4, 3]]]}\n' + bytes(96)

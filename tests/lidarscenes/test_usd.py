@@ -375,7 +375,7 @@ def played(path, name, code, first=1, rate_hz=24):
     return own.vertices_at(np.atleast_1d((code - first) / rate_hz / own.step_s))[0]
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["", "Walk", "Run"])
 def test_actors_play_animations_as_usdskel_evaluates_them(tmp_path, name):
     """At poses, and at random times between, where they move straight within 2 mm."""
@@ -643,6 +643,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
         load_meshes(write(tmp_path / "m.usda", levels))
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
 def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
     monkeypatch.setattr(child_process, "subprocess", subprocess)

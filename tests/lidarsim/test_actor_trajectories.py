@@ -41,6 +41,7 @@ WAYS = ActorTrajectories(
 )
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "members", [WAYS, ActorTrajectories(WAYS[:6]), ActorTrajectories(WAYS[7:9])]
 )

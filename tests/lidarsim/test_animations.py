@@ -518,6 +518,7 @@ def test_pictures_of_a_saved_result_show_people_as_they_walk(walker, tmp_path):
     assert (tmp_path / "p.npz").stat().st_size < 450_000
 
 
+@pytest.mark.extended
 def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
     around = np.linspace(0, 2 * np.pi, 50_000, endpoint=False)
     points = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
@@ -531,6 +532,7 @@ def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
         np.testing.assert_allclose(ring.placed(time_ns).vertices, want, atol=1e-3)
 
 
+@pytest.mark.extended
 def test_damaged_poses_in_a_file_of_pictures_are_told(walker, tmp_path):
     path = tmp_path / "p.npz"
     drawn_again([Actor(walker)], path)
@@ -606,6 +608,7 @@ def scenario(folder, *actors, **sections):
 WAY = {"points": [{"time_s": 0, "position": [4, 0, 0]}, {"time_s": 1, "position": [5.4, 0, 0]}]}
 
 
+@pytest.mark.extended
 def test_scenarios_name_animations(tmp_path):
     one = {"name": "A", "file": "pedestrian.glb", "animation": "Walk", "trajectory": WAY}
     walk = {"name": "Walk", "speed_m_s": 1.4, "repeat": False, "offset_s": 0.5}

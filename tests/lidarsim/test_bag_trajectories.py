@@ -137,6 +137,7 @@ def assert_same(track, *, atol=1e-6, turned=True):
 ROWS = range(len(TIMES))
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("message", [odometry, pose_stamped, covariant])
 def test_topics_of_poses(bag, message):
     path = bag(state=[message(row) for row in ROWS])

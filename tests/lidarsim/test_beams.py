@@ -123,7 +123,7 @@ def test_a_beam_on_a_road_is_one_return(model, subrays):
             assert found["intensity"][ray] == pytest.approx(exact, rel=0.05, abs=1e-6)
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("model", ["velodyne/vlp32c", "ouster/os1-64"])
 @pytest.mark.parametrize("subrays", [7, 61])
 def test_a_whole_sensor_reports_the_ground_once(model, subrays):

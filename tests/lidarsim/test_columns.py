@@ -243,7 +243,7 @@ def vectors(cloud, name):
     return np.stack([cloud[f"{name}_{axis}"] for axis in "xyz"], axis=1)
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("far_m", [0.0, 500_000.0])
 def test_normals_incidence_and_origins_of_a_ramp(cluster_client, far_m):
     # A plane that rises to the east by 30 degrees, and a sensor that drives 3 m above it.
@@ -279,6 +279,7 @@ def test_normals_incidence_and_origins_of_a_ramp(cluster_client, far_m):
     assert np.ptp(expected) > 30
 
 
+@pytest.mark.extended
 def test_normals_and_origins_in_the_sensors_axes(cluster_client):
     half = np.sqrt(0.5)
     track = Track([0, 1], [[0, 0, 1], [2, 1, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
@@ -321,6 +322,7 @@ def test_what_is_no_surface_has_neither_normal_nor_incidence(cluster_client):
     assert np.isfinite(vectors(cloud, "origin")).all()
 
 
+@pytest.mark.extended
 def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along(cluster_client):
     mirror = SceneMesh("Mirror", [[5, -9, -9], [5, 9, -9], [5, 9, 9.0]], [[0, 1, 2]])
     behind = SceneMesh("Wall", [[-5, -9, -9], [-5, 9, -9], [-5, 9, 9.0]], [[0, 1, 2]])

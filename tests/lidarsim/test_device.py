@@ -148,7 +148,7 @@ def test_columns_have_the_bits_of_numpy(name, scenes, backend):
     same(scenes["plain"], survey, backend, (0, 1, survey.scan_count // 2, survey.scan_count))
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.extended
 @pytest.mark.parametrize("scene", ["instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_instances(scene, name, scenes, backend):
@@ -250,6 +250,7 @@ def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
         assert np.array_equal(values, clouds[1].columns[name]), name
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "actors",
     [pytest.param((), id=""), pytest.param(ACTORS, id="actors", marks=NEEDS_NUMBA)],
@@ -266,7 +267,7 @@ def test_images_of_ranges(actors, scenes, backend):
     assert np.isinf(images[0][2]).all()
 
 
-@pytest.mark.extended(every=9)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("stations", [1, 20])
 @pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])

@@ -173,6 +173,7 @@ def test_a_mirror_that_moves_counts_twice():
     np.testing.assert_allclose(returns.radial_velocity[seen], -6 * cosine, rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
     sensor = Sensor.grid(90, 8, 40.0, step_deg=90)
     cart = Cart(stations=1)
@@ -186,6 +187,7 @@ def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
     np.testing.assert_allclose(one.radial_velocity, other.radial_velocity, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_noise_of_velocities():
     sensor = Sensor.grid(1000, 40, 30.0, step_deg=360)
     survey = Survey(
@@ -200,7 +202,7 @@ def test_noise_of_velocities():
     assert (found_of(Rig(Scene.seed(), other, "numpy")).radial_velocity != found).mean() > 0.99
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("subrays", [1, 7])
 def test_drops_are_at_rest(subrays):
     # A moving carrier in rain, before a wall and among cars.

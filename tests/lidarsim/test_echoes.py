@@ -218,7 +218,7 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
 MANY = 40_000
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("distance", [5.0, 80.0])
 @pytest.mark.parametrize("beam", [Returns(), Returns(subrays=7, divergence_mrad=0.5)])
 def test_ranges_have_the_noise_that_was_asked_for(distance, beam):
@@ -284,7 +284,7 @@ BEAMS = Beams(
 TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
 
 
-@pytest.mark.extended(every=9)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("options", [ALL_ON, NOISE_ONLY], ids=["all on", "noise"])
 @pytest.mark.parametrize("path", [TURNED, {"trajectory": Cart()}], ids=["standing", "moving"])

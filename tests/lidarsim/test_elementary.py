@@ -36,7 +36,7 @@ RANGES = {
 NAMES = {"arctan2": "atan2", "arcsin": "asin", "arccos": "acos"}
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize(("name", "limit"), [(name, 4 if "1" in name else 2) for name in RANGES])
 def test_it_is_within_units_of_the_last_place(name, limit):
     given = RANGES[name]

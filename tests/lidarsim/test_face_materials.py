@@ -332,7 +332,7 @@ def usd(folder):
     return folder / "house.usda"
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("colours", [False, True])
 @pytest.mark.parametrize("write", [gltf, dae, threemf, cityjson, usd])
 def test_faces_of_files_have_their_materials(write, colours, tmp_path):
@@ -470,6 +470,7 @@ def test_materials_of_one_entry_are_one_surface():
         cloud_of(scene, replace(options, materials=half))
 
 
+@pytest.mark.extended
 def test_only_the_faces_of_sheeting_bloom():
     scene = Scene.from_meshes([front(), level("Ground")])
     sign = Material(material="Glass", reflectance=1.0, retro=True)
@@ -484,6 +485,7 @@ def test_only_the_faces_of_sheeting_bloom():
     assert np.linalg.norm(np.asarray(cloud)[blooming] - (4, -5, 1), axis=1).min() > 4.9
 
 
+@pytest.mark.extended
 def test_a_device_leaves_what_faces_are_made_of_to_numpy(source_backend, monkeypatch):  # noqa: F811
     monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
     scene = Scene.from_meshes([front(), level("Ground")])

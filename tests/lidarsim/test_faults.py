@@ -92,6 +92,7 @@ def test_batches_and_backends_do_not_matter(place):
     assert same(whole, cast(survey, 7)) and same(whole, cast(survey, backend="numpy"))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", FAULTS)
 def test_other_sensors_keep_their_points(kind):
     two = [Mounted(LIDAR, name="left"), Mounted(LIDAR, Pose((1, 0, 0)), name="right")]

@@ -87,6 +87,7 @@ def refused(read, path):
     return message
 
 
+@pytest.mark.extended(every=7)
 @pytest.mark.parametrize("name", READERS)
 def test_devices_pipes_and_sockets_are_refused_at_once(tmp_path, monkeypatch, name):
     path = tmp_path / name
@@ -135,6 +136,7 @@ def test_folders_are_no_files(tmp_path, name):
     assert "Is a directory" in refused(READERS[name], path)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("suffix", endings(lambda row: row.advice))
 def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"

@@ -292,6 +292,7 @@ def moving_survey(model="mid360", **options):
     )  # fmt: skip
 
 
+@pytest.mark.extended
 def test_packets_continue_from_frame_to_frame_while_the_sensor_moves():
     """A frame of 5,000 firings is not a whole number of packets of 24."""
     survey = moving_survey()
@@ -329,6 +330,7 @@ def test_dropped_packets_are_left_out_and_counted():
     assert 0.2 < (208 - len(numbers)) / (208 - 104) < 0.5
 
 
+@pytest.mark.extended
 def test_a_jump_of_the_clock_is_in_the_stamps():
     survey = moving_survey(faults=[Fault("time_jump", from_s=0.05, by_s=0.02)], steps=36)
     groups = encoded(*points_of(survey, room()))

@@ -341,6 +341,7 @@ def obj(tmp_path, material, face="f 1/1 2/2 3/3 4/4", library="m.mtl", **options
     return Scene.load(write(tmp_path / "m.obj", OBJ.format(library=library, face=face)), **options)
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     ("lines", "face"),

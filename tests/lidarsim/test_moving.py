@@ -95,7 +95,7 @@ SURVEYS = {
 }
 
 
-@pytest.mark.extended(keep=("standing-*",))
+@pytest.mark.extended
 @pytest.mark.slow(keep=("standing-*", "driving-*"))
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("name", SURVEYS)
@@ -139,6 +139,7 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
             assert untouched == {k: v for k, v in both[True].items() if k[0] not in hidden}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
     pane = quad("Pane", (-90, 2, -9), (90, 2, -9), (90, 2, 9), (-90, 2, 9))
@@ -164,7 +165,7 @@ TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)],
 MIRROR = quad("Mirror", (-9, -3, 0), (9, -3, 0), (9, -3, 9), (-9, -3, 9))
 
 
-@pytest.mark.extended(keep=("driving-*",))
+@pytest.mark.extended
 @pytest.mark.slow(keep=("driving-*", "turned-*", "mirror-*"))
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
 @pytest.mark.parametrize("name", [*SURVEYS, "turned", "noise", "mirror"])

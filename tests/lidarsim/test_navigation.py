@@ -157,6 +157,7 @@ def test_errors_of_positions():
             assert abs(variances.mean() / expected - 1) < room, (axes, size)
 
 
+@pytest.mark.extended
 def test_axes_have_constant_scales_and_angles():
     """Of many units: a rotation about z shows the scale of one gyroscope and two angles."""
     half = np.linspace(0, 0.5, 11)
@@ -227,6 +228,7 @@ def exponential(vector):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("smooth", [False, True], ids=["linear", "smooth"])
 def test_dead_reckoning_finds_the_way_of_the_imu(smooth):
     path = tumbling(smooth)

@@ -393,6 +393,7 @@ def first_pixel(payloads, profile):
     raise AssertionError("there are no returns")
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("fault", ["range", "stamp", "column", "reflectivity"])
 def test_a_wrong_packet_is_noticed(profile, fault):

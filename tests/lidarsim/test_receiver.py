@@ -422,6 +422,7 @@ def ring(radius=30.0, sides=720):
     return SceneMesh("R", vertices, np.concatenate(faces))
 
 
+@pytest.mark.extended
 def test_a_sensor_that_turns_alike_is_seen_by_each_ray_its_delay_farther_away():
     delay = 200.0  # ns: the light comes so much later, as if 30 m farther away
     found, *_ = two(spinning(), spinning(delay), [ring()])
@@ -546,6 +547,7 @@ def test_batches_do_not_matter(subrays):
     assert set(causes.tolist()) == {SURFACE, FALSE_ALARM, CROSSTALK, BLOOMING}
 
 
+@pytest.mark.extended
 def test_what_a_receiver_adds_leaves_surfaces_as_they_are():
     rig, survey = drive(range_at_threshold_m=0.0, walk_m=0.0, false_alarm_hz=0.0, stray_light=0.0)
     on, same = drive(crosstalk=True)

@@ -96,7 +96,7 @@ def rays_of_scan(survey, scan):
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     survey = SURVEYS[name]
@@ -141,6 +141,7 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     assert scans == survey.scan_count
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
     survey = SURVEYS[name]

@@ -291,6 +291,7 @@ def add(packet, offset, value):
     number[:] = (number.astype(int) + value) % 36_000
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     "field", ["range", "azimuth + 1", "azimuth - 1", "stamp", "laser", "reflectivity", "type"]
 )
@@ -408,6 +409,7 @@ def moving_survey(model="rs-lidar-16", **options):
     )  # fmt: skip
 
 
+@pytest.mark.extended
 def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
     """A revolution of 1,801.8 firings is not a whole number of packets of 24."""
     survey = moving_survey()

@@ -164,6 +164,7 @@ def assert_image(image, sweep, sensor, number):
     np.testing.assert_allclose(image.reshape(-1), expected, rtol=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("sensor", [VLP16, LATE, replace(GRID, head=Spin(120, step_deg=77))])
 def test_an_image_has_the_firings_of_its_turn(scene, sensor):
     scanner = Scanner(scene, sensor, columns=SEEN, backend="numpy")
@@ -172,6 +173,7 @@ def test_an_image_has_the_firings_of_its_turn(scene, sensor):
         assert_image(image, scanner.sweep(HERE, number=number), sensor, number)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", IMAGES)
 @pytest.mark.parametrize("given", [GRID, Mounted(GRID, MOUNT)], ids=["sensor", "mounted"])
 def test_an_image_has_the_ranges_of_sweeps(scene, name, given, monkeypatch):
@@ -321,6 +323,7 @@ def with_copies(scene, crate=None, *grates):
     return Scene.from_meshes([*scene.meshes(), *placed]).with_actors(scene.actors)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend):
@@ -360,7 +363,7 @@ def with_bodies(scene, **options):
     return Scanner(bodies, GRID, columns=COLUMNS, **options)
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_bodies_that_move_together_give_the_bytes_of_bodies_that_move_one_by_one(
@@ -449,6 +452,7 @@ def test_a_copy_waits_for_sweeps_before_it_moves(scene):
         assert {sweep.result().positions.tobytes() for sweep in sweeps} <= {*seen}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("embree", FEW)])
 def test_threads_share_a_scanner(scene, backend, sensor):
     def scan(number):

@@ -94,7 +94,7 @@ def same(scene, cloud, whole):
     return is_cut.sum() > 20 and (~is_cut).sum() > 20
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "effects"])
 @pytest.mark.parametrize("kind", ["faces", "instances", "masks"])

@@ -133,6 +133,7 @@ class Watched:
         return made
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_steps_read_and_write_what_they_say(name):
     rig = Rig(Scene.seed(), SURVEYS[name], "embree", threads=1)

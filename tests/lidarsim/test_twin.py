@@ -154,7 +154,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended
 @pytest.mark.parametrize("waves", [False, True])
 @pytest.mark.parametrize("full", [0.01, 0.1])
 def test_saturation_is_that_of_the_twin(full, waves):
@@ -183,7 +183,7 @@ def test_saturation_is_that_of_the_twin(full, waves):
     assert (found.amplitude == full).mean() > 0.1
 
 
-@pytest.mark.extended(every=12)
+@pytest.mark.extended
 @pytest.mark.slow(every=4)
 @pytest.mark.parametrize("mode", ["all", "first", "last", "strongest", "dual", "two_strongest"])
 @pytest.mark.parametrize("losses", [{}, {"dropout": 0.2}, {"detection_range_m": 4.0}])
@@ -307,6 +307,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     assert np.allclose(found.energy, energy, 1e-5, 0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("each", [1, 7])
 def test_clumps_of_spray_are_those_of_the_twin(each):
     """Sub-rays and ranges to the bit, energies as those of drops; and what spray takes."""
@@ -362,6 +363,7 @@ def test_peaks_of_waveforms_are_those_of_the_twin(each, planes):
     assert (found.width > 1.05).sum() > 10
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("each", [1, 7, 19])
 def test_decomposition_gives_pulses_back(each):
     """Energies of pulses within a hundredth; narrow echoes 3 sigma from others within 1 mm."""

@@ -91,7 +91,7 @@ def test_projections_of_known_leaves():
 # -- Beer and Lambert ----------------------------------------------------------------------------
 
 
-@pytest.mark.extended(every=9)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("leaf_angle", ["spherical", "planophile", "erectophile", 2.0])
 @pytest.mark.parametrize("nadir_deg", [0.0, 50.0])
@@ -196,7 +196,7 @@ ALL_ON = {
 }
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("order", [1, -1])
 def test_layers_that_touch_each_other(backend, order):

@@ -226,6 +226,7 @@ def reader_us(firing, laser):
     return 160 / 3 * firing + 8 / 3 * (laser // 8 + 2 * (laser // 64)) - 7.0
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("model", "mode"), CASES)
 def test_velodyne_decoder_reads_the_returns_of_the_cloud(model, mode, tmp_path):
     """It rounds azimuths again to 0.01 degrees; in the VLS-128 it assumes another period."""
@@ -300,6 +301,7 @@ def add(packet, offset, value):
 FIELDS = ["range", "azimuth + 1", "azimuth - 1", "stamp", "laser", "mode", "product"]
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize(("model", "mode"), [("vlp16", "dual"), ("vls128", "strongest")])
 def test_a_fault_of_a_packet_is_detected(model, mode, field):

@@ -92,7 +92,7 @@ def same_points(cloud, scene, other, other_scene):
     assert len(cloud) > 50
 
 
-@pytest.mark.extended(keep=("*-both-actors", "source-*-actors", "*-faces-"))
+@pytest.mark.extended
 @pytest.mark.parametrize("actors", [(), ("Car", "Van")], ids=["", "actors"])
 @pytest.mark.parametrize("kind", ["faces", "instances", "both"])
 def test_a_sensor_sees_the_scene_without_the_unseen_objects(kind, actors, backend):
@@ -115,6 +115,7 @@ def test_a_sensor_sees_the_scene_without_the_unseen_objects(kind, actors, backen
     assert copy.sweep(HERE, number=1).positions.tobytes() == cloud.positions.tobytes()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", ["faces", "both"])
 def test_each_sensor_of_a_survey_has_its_own_unseen_objects(kind, backend):
     items = objects(kind)
@@ -224,6 +225,7 @@ EFFECTS = {
 }  # fmt: skip
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effects_do_not_see_unseen_objects_either(name):
     """A mirror, water around the sensor, a crown, and a retro-reflector beside the beams."""

@@ -260,6 +260,7 @@ def test_random_grids_stop_what_the_integral_says(tmp_path):
     assert abs(off) < 3 * math.sqrt(variance)
 
 
+@pytest.mark.extended
 def test_turned_scaled_and_mirrored_copies_are_where_they_stand(tmp_path):
     """Densities stay per m³; a grid that is turned by 90° is that of turned numbers."""
     draw = np.random.default_rng(6)

@@ -619,6 +619,7 @@ def test_what_is_no_surface_is_grey_and_has_no_object_s_colour():
     assert "thing 73" in colours_of(often, OBJECT, many)[1]
 
 
+@pytest.mark.extended(every=6)
 @pytest.mark.parametrize("column", TABLE.values(), ids=lambda column: column.name)
 def test_every_column_takes_no_points_equal_ones_and_its_largest(column):
     dtype = np.dtype(column.dtype)

@@ -155,6 +155,7 @@ def test_a_damaged_file_is_refused(damage, said, result):
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.extended
 def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
     wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
     shown = replace(unplanned, extra_columns=[replace(wet, source="")])
@@ -176,7 +177,7 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
         plot(result, "--only", "cloud", "--colour", "wettness")
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("coordinates", "pictures", "left_out"),
     [("world", {"scene.png", "hits.png", "cloud.png"}, "path"),
@@ -228,6 +229,7 @@ def test_a_picture_takes_the_place_of_a_link(tmp_path):
     assert theirs.read_bytes() == b"of another" and not link.is_symlink()
 
 
+@pytest.mark.extended
 def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
     result = make(tmp_path / "result", unplanned)
     at = unplanned.scene.vertices

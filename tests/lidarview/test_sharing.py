@@ -257,6 +257,7 @@ def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
     assert page_of(open_result(drive)) == page
 
 
+@pytest.mark.extended
 def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monkeypatch):
     dense = np.random.default_rng(0).normal(scale=[9, 9, 0.1], size=(40_000, 3))
     rows = np.zeros(40_000, row_type(np.dtype(np.float32), (SCAN,)))

@@ -67,6 +67,7 @@ def colourful(image):
     return int((np.ptp(image, axis=2) > 40).sum())
 
 
+@pytest.mark.extended
 def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
     image = pixels(draw_scene, shot, 9)
     for colour in object_colours(6):
@@ -75,6 +76,7 @@ def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
         assert alike[:, LEFT].sum() > 8
 
 
+@pytest.mark.extended
 def test_hits_colour_what_was_hit_and_only_that(pixels, scene):
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     hits = np.zeros(len(scene.faces), np.int64)
@@ -193,6 +195,7 @@ def test_numbers_beside_the_colours_are_whole(lower, upper, marks, scene, shot):
     assert figure.axes[0].get_ylabel() == "x (m)"
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["z", "amplitude", "normal_x", "triangle", "cause", "signal"])
 def test_words_of_a_column_are_within_the_picture(name, scene, shot):
     column = TABLE[name]
@@ -207,7 +210,7 @@ def test_words_of_a_column_are_within_the_picture(name, scene, shot):
         assert figure.bbox.y0 <= box_px.y0 and box_px.y1 <= figure.bbox.y1, text.get_text()
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("corners", "poses"),
     [
@@ -295,6 +298,7 @@ SHEET = sheet(6)
 AREA = 1 / len(SHEET.faces)
 
 
+@pytest.mark.extended
 @given(st.lists(st.integers(0, 40), min_size=72, max_size=72))
 def test_sharing_hits_keeps_their_number(counts):
     density = hit_density(SHEET, np.array(counts))
@@ -351,6 +355,7 @@ def closest_hit(scene, eye, ray):
     return best
 
 
+@pytest.mark.extended
 def test_each_pixel_shows_the_nearest_thing(row, row_shot):
     camera = row_shot.camera
     stage = row_shot.stage

@@ -41,6 +41,7 @@ def adaptive(minimum: int, maximum: int, **options: Any) -> dict[str, Any]:
     return {"adapt": [minimum, maximum], "idle_s": IDLE_S, **options}
 
 
+@pytest.mark.extended
 def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3), "IO": adaptive(0, 3), "FIX": {}}) as client:
         gpu = Partition("GPU", client)

@@ -57,6 +57,7 @@ def count_placed(client, keys):
     return client.run_on_scheduler(count)
 
 
+@pytest.mark.extended
 def test_each_worker_of_a_partition_gets_as_many_tasks(client, parts):
     gate = f"gate-{client.id}"
     futures = [parts["A"].submit(wait_here, gate) for _ in range(20)]
@@ -133,6 +134,7 @@ def test_nothing_is_left_after_dissolving(client, parts):
     assert "decide_worker_non_rootish" not in vars(scheduler)
 
 
+@pytest.mark.extended
 def test_simulated_workers_get_tasks_as_evenly_as_from_dask():
     figures = asyncio.run(placing.measure(200, rounds=50, tasks_per_worker=3))
     for name in ("partition", "others"):

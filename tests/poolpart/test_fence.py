@@ -149,6 +149,7 @@ def test_other_tasks_stay_out(client, way):
     assert set(way(client)) == OUTSIDE
 
 
+@pytest.mark.extended
 def test_without_a_fence_they_come_in(client):
     """Else the tests above would say nothing."""
     for way in (submitted, mapped, delayed, preferring_the_partition, shuffled):
@@ -182,6 +183,7 @@ async def steal(dask_scheduler):
     return ", ".join(thieves)
 
 
+@pytest.mark.extended
 def test_nothing_is_stolen_into_a_partition(client, wait_until):
     enclose(client, **A)
     futures = pile_up(client, wait_until, 60)
@@ -196,6 +198,7 @@ def complaints(warned):
     return [text for text in said if text.startswith("Tasks wait")]
 
 
+@pytest.mark.extended
 def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(client, wait_until):
     parts = enclose(client, **A, **B, C=["plain"])
     with warnings.catch_warnings(record=True) as caught:

@@ -149,7 +149,7 @@ def descend(depth):
     return first + sum(client.gather(client.map(descend, [depth - 1] * 2, pure=False)))
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_thread_and_one_slot_each_are_enough_at_any_depth(start, workers):
     client = start({str(number): {} for number in range(workers)})
@@ -232,6 +232,7 @@ def test_what_holds_a_resource_that_is_no_partition_lends_nothing(start):
 # -- workers that were started with a partition ------------------------------------------
 
 
+@pytest.mark.extended
 def test_a_partition_that_workers_were_started_with(start, wait_until):
     client = start({"a": {"resources": {"A": 1}}})
     scheduler = client.cluster.scheduler
@@ -274,6 +275,7 @@ def _lends(client):
     return [name for names in plugins for name in names if "lending" in name]
 
 
+@pytest.mark.extended
 def test_a_worker_without_this_package_ignores_the_plugin():
     code = (
         "import sys; sys.modules['poolpart'] = None\n"
@@ -516,13 +518,13 @@ def tree(request):
     return grow
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 def test_a_tree_of_waiting_tasks_on_two_slots_ends(start, tree):
     client = start({"a": {"resources": {"A": 2}, "nthreads": 2}})
     assert tree(client) == 2 ** (LEVELS + 1) - 1
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 def test_a_tree_of_waiting_tasks_on_two_workers_ends(start, tree):
     client = start({name: {"resources": {"A": 1}} for name in "ab"})
     assert tree(client) == 2 ** (LEVELS + 1) - 1

@@ -128,6 +128,7 @@ def test_futures_are_items(a, b):
     assert list(a.map(add, halves, [1] * 5, chunk=3)) == [1, 3, 5, 7, 9]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("window", [1, 3])
 @pytest.mark.parametrize("chunk", [1, 4])
@@ -192,6 +193,7 @@ def test_the_first_tasks_start_at_once(a, client, wait_until):
     assert repr(results).endswith("items taken, closed>")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("chunk", [None, 1, 10])
 @pytest.mark.parametrize("ordered", [True, False])
 def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, chunk, wait_until):
@@ -226,6 +228,7 @@ def test_an_error_that_cannot_be_sent_is_a_result_that_shows_it(a):
     assert error.__notes__ == ["poolpart: this was item 0 of a map: 1"]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("chunk", [1, None])
 def test_errors_as_results_of_a_map_of_a_map(a, b, chunk):
     inner = a.map(fail_at_tens, range(1, 50), chunk=chunk)
@@ -376,6 +379,7 @@ def length_and_place(data, other=0):
     return len(data) + other, get_worker().name.partition("-")[0]
 
 
+@pytest.mark.extended
 def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, received):
     io = Partition("IO", processes)
     gpu = Partition("GPU", processes)
@@ -387,7 +391,7 @@ def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, rec
     assert received.total() > 8 * 2**20
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_a_map_of_a_map_of_a_map_with_other_arguments(a, b, chunk):
     inner = a.map(twice, range(500), chunk=chunk)

@@ -113,6 +113,7 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     assert len(parts["A"].shrink(1)) == 1
 
 
+@pytest.mark.extended
 def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
     client, parts = divided
     released.clear()

@@ -71,6 +71,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.extended
 def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe, wait_until):
     """Tasks that wait at its ends would keep their slots for ever."""
 

@@ -32,7 +32,7 @@ def test_a_partition_of_a_cluster_declared_so(processes):
     assert [future.result(LONG_S) for future in waiting] == ["GPU-0"] * 5
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("other", [n_workers(1), rest()])
 def test_the_place_of_a_worker_that_does_not_come_back_goes_to_the_next(
     own_nannies, wait_until, monkeypatch, other

@@ -119,6 +119,7 @@ def test_nobody_wants_it():
     assert partition_for(worker("b"), rules, members) == "B"
 
 
+@pytest.mark.extended
 @given(
     gpus=st.lists(st.integers(0, 3), min_size=1, max_size=4),
     order=st.randoms(use_true_random=False),

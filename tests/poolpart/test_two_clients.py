@@ -46,6 +46,7 @@ def both(monkeypatch):
     return call
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("rule", "note"),
     [

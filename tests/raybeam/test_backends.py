@@ -59,6 +59,7 @@ def test_import_needs_numpy_only():
     run_python(code)
 
 
+@pytest.mark.extended
 def test_threads_of_one_process_may_share_a_caster(backend, shapes):
     caster = RayCaster(*shapes["vase"](), backend, threads=1)
     directions = np.random.default_rng(0).normal(size=(8, 5000, 3))

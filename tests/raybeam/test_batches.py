@@ -27,7 +27,7 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 def test_batches_may_be_cut_anywhere(caster, shapes, monkeypatch):
     vase = caster(*shapes["vase"]())
     origins, directions = rays(3000, 1)
@@ -83,6 +83,7 @@ def test_kernels_have_the_bits_of_numpy_at_seams(kernels, shapes, name):
 RESULT_BYTES = 8 + 4 + 8 + 8  # of a ray: distance, triangle, u, v
 
 
+@pytest.mark.extended
 def test_memory_of_a_cast_is_bounded(shapes):
     """Beyond its answer, a cast of many rays takes no more than one of a chunk, whatever they are.
 

@@ -154,6 +154,7 @@ def test_in_the_plane_is_a_miss(caster):
     assert not triangle.cast(origins, directions).hit.any()
 
 
+@pytest.mark.extended
 def test_nearly_in_the_plane_stays_beside_the_triangle(caster):
     """Planes that float64 cannot hold: hit or miss is rounding, but no distance from elsewhere."""
     rng = np.random.default_rng(5)

@@ -123,6 +123,7 @@ def replaced(content):
     return pickle.dumps(Trap())
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("damage", [cut, emptied, flipped, replaced])
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 def test_a_damaged_loop_is_compiled_again_with_a_note(package, function, caplog, kind, damage):

@@ -33,7 +33,7 @@ def exact(corners, origin, direction):
     return (weights * sign).min(axis=0), total * sign, (normal * a).sum(axis=1) * -sign
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @settings(
     max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -94,6 +94,7 @@ def test_as_the_same_triangles_in_one_mesh(backend, forest, kind, offset):
     np.testing.assert_allclose(got.u[seen], want.u[seen], atol=1e-4)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", ["turned", "uneven", "sheared"])
 def test_kernels_have_the_bits_of_numpy(kernels, forest, kind):
     instances, *_ = forest(kind, 2)

@@ -155,7 +155,7 @@ def listed(hits):
     return [*zip(*(column[rays_of(hits)].tolist() for column in columns), strict=True)]
 
 
-@pytest.mark.extended(every=15)
+@pytest.mark.extended
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("kind", ["fan", "any", "apart", "moving", "far", "paused"])
 def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):

@@ -65,7 +65,7 @@ def test_a_ray_passes_where_the_mask_is_false(backend, place, repeats):
     np.testing.assert_allclose(hits.distance, np.where(stopped, 5, 6), rtol=1e-12)
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", ["random", "sliver", "tiny"])
 def test_kernels_have_the_bits_of_numpy(kernels, shapes, kind):
     origins, directions = rays(4_000)

@@ -154,7 +154,7 @@ def test_forked_processes_cast_too():
     )
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 def test_which_rays_go_together_changes_nothing(mesh):
     """Groupings of rays are tried in turn, until one is known to be the fastest."""
     caster = RayCaster(*mesh, backend="embree", threads=1)

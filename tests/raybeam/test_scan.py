@@ -135,7 +135,7 @@ def check(caster, case, windows, limits):
         np.testing.assert_array_equal(to, directions[some])
 
 
-@pytest.mark.extended(every=12)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CASES)
 def test_rays_are_those_of_the_interface(caster, shapes, name):
@@ -180,6 +180,7 @@ def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
         same(got, vase.scan(pattern, *full, window=(0, 2400), rays_per_pose=40))
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize(("rays", "first"), [(7, 5), (40, 0), (40, 80), (40, 7)])
 @pytest.mark.parametrize("name", ["firings, lever arms", "on the move, lever arms"])
@@ -207,7 +208,7 @@ def thinned(want, groups, every, rays):
     return hits, keep
 
 
-@pytest.mark.extended(every=12)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize(
     ("name", "limits"),
@@ -237,6 +238,7 @@ def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeyp
             assert got.hits.dtype == got.tally.dtype == np.int64
 
 
+@pytest.mark.extended
 def test_thinning_where_rays_graze(caster):
     """A plane met at all angles, limits within it: rough distances are worst there."""
     plane = np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])

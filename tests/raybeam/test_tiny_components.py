@@ -78,6 +78,7 @@ def check(backend, instances, origins, directions, *, all_hit=True):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("origin", [ORIGIN, [-5e-324, 1e-18, -0.0]])
 def test_rays_at_a_mesh(backend, shapes, origin):
     check(backend, [Instance(Mesh(*shapes["sphere"]()))], origin, packets(60))

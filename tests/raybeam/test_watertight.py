@@ -34,7 +34,7 @@ def meshes(shapes, name):
         yield points + move, faces, INSIDE + move
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize("count", [3_000, pytest.param(100_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["cube", "sphere", "vase", "terrain box", "six objects"])
 def test_no_ray_escapes(exact_caster, shapes, name, count):

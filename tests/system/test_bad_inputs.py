@@ -331,6 +331,7 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused, preload, m
     refused(["run", "good.yaml", "--scheduler", cluster.address], message)
 
 
+@pytest.mark.extended
 def test_a_run_without_open3d_ends_before_it_starts(place, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d.pybind", None)
     refused(["run", "good.yaml"], "Clouds are written through Open3D, which does not load")

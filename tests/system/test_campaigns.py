@@ -287,6 +287,7 @@ def breaking(where: str) -> Callable[[int, np.random.Generator], Job]:
 WORDS = {"cast": "no direction", "describe": "ZeroDivisionError: no such step"}
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("cast",))
 @pytest.mark.parametrize("where", WORDS)
 def test_a_sensor_that_raises_in_a_worker_fails_its_job_only(client, tmp_path, where, left_over):
@@ -321,6 +322,7 @@ def test_jobs_that_cannot_be_sent_to_workers_fail_alone(client, tmp_path, left_o
     assert left_over(client) == ([], [], [])
 
 
+@pytest.mark.extended
 def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp_path, monkeypatch):
     write = DataSet.write_job
 
@@ -340,6 +342,7 @@ def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp
     assert not (tmp_path / "ds" / "jobs" / "0001").exists()
 
 
+@pytest.mark.extended
 def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj]}"
@@ -688,6 +691,7 @@ def test_finished_jobs_are_known_without_the_database(client, here, unwritten, l
     assert cast.get("intersect", 0) == 45 * (3 - known)
 
 
+@pytest.mark.extended
 def test_a_run_removes_its_own_files_only(client, here, unwritten):
     ds = here / "ds"
     for name in ("thesis.txt", "jobs/thesis.txt", "jobs/0000/thesis.txt", "README.md", "x/cloud"):
@@ -711,6 +715,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("kitti",))
 @pytest.mark.usefixtures("pictures")
 @pytest.mark.parametrize("kept", DATA_SETS)
@@ -786,6 +791,7 @@ KILLS = [
 forks = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
 
+@pytest.mark.extended
 @forks
 @pytest.mark.parametrize(
     "kills",

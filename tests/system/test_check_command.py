@@ -53,6 +53,7 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
     return check
 
 
+@pytest.mark.extended
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
     job = build(Scenario.from_data(SHORT), plans=False).job()
     with Client(cluster, set_as_default=False) as client:

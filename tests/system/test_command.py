@@ -167,6 +167,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     assert json.loads((tmp_path / "out" / "report.json").read_text())["planning"] is None
 
 
+@pytest.mark.extended
 def test_a_path_that_there_is_not(run):
     ring = [f"{{centre: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
             for a in np.arange(0, 6.28, 0.5)]  # fmt: skip
@@ -197,6 +198,7 @@ def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
     assert said["planning"]["best_length"] == report["planning"]["best_length"]
 
 
+@pytest.mark.extended
 def test_warnings_of_libraries_are_not_on_the_terminal(run, monkeypatch):
     progress = Terminal.progress
 
@@ -250,6 +252,7 @@ def hidden(page: Path) -> list[str]:
     return re.findall(r'data-picture="(\w+)" hidden', page.read_text("utf-8"))
 
 
+@pytest.mark.extended
 def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_path):
     out = tmp_path / "out"
     assert run("--no-plan", "--quiet").code == 0
@@ -284,6 +287,7 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "arguments",
     [["sensors"], pytest.param(["run", "s.yaml", "--only", "cloud", "-q"], marks=pytest.mark.slow)],

@@ -107,6 +107,7 @@ def test_a_worker_that_dask_pauses_gets_no_more_batches(
     assert placement_violations(result.records) == []
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("KeyboardInterrupt",))
 @pytest.mark.parametrize("kind", [OSError, KeyboardInterrupt])
 def test_an_error_in_the_callback_passes_through_and_stops_the_run(

@@ -521,7 +521,7 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("page", "package"),
     [

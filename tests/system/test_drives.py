@@ -91,6 +91,7 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
         actor.check(0.0, survey.duration_ns)
 
 
+@pytest.mark.extended
 def test_the_crossing_by_day_and_wet_by_night_can_be_made(tmp_path):
     write_scene(tmp_path / "city.glb", city(20_000))
     for name in ("crossing.yaml", "crossing-night.yaml", "car.obj", "pedestrian.glb"):
@@ -116,6 +117,7 @@ def test_a_frame_says_whose_it_is(cluster_client):
     assert [frame.sensor for frame in frames] == ["roof"] * 3 + ["nose"] * 3
 
 
+@pytest.mark.extended
 def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     """As rigs of this process cast it, and again with smaller batches."""
     out = town / "out"

@@ -68,6 +68,7 @@ def test_a_warning_is_on_stderr_and_strict_exits_with_1(run):
     assert (outcome.code, outcome.err) == (0, "")
 
 
+@pytest.mark.extended
 def test_json_has_the_warning_as_a_note(run):
     outcome = run("--json")
     [warning] = warnings(outcome)
@@ -144,6 +145,7 @@ def campaign(tmp_path) -> Path:
     return tmp_path / "c.yaml"
 
 
+@pytest.mark.extended
 def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tmp_path):
     given = ("--out", tmp_path / "set", "--scheduler", slots, "--quiet", "--strict", "--json")
     outcome = lidarpool("run", campaign, *given)
@@ -173,6 +175,7 @@ def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, sl
     assert json.loads((tmp_path / "set" / "report.json").read_text())["notes"] == [warning]
 
 
+@pytest.mark.extended
 def test_python_logs_a_warning(client, caplog, tmp_path):
     far = Survey(SMALL, poses=[(0, 0, 1000)], steps=2)
     result = simulate(room(), far, client=client)

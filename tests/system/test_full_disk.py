@@ -99,6 +99,7 @@ def test_a_disk_without_room_for_anything(disk, run):
     assert [path.name for path in folder.iterdir()] == ["filler"]
 
 
+@pytest.mark.extended
 def test_the_disk_of_the_result_is_full(
     disk, run, expected, cluster, lidarpool, tmp_path, monkeypatch
 ):

@@ -106,11 +106,12 @@ NOT_IGNORED = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
 @pytest.mark.parametrize(
     ("number", "local"),
     [
-        (signal.SIGINT, True),
+        (signal.SIGINT, False),
+        pytest.param(signal.SIGINT, True, marks=pytest.mark.extended),
         pytest.param(signal.SIGTERM, False, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, False, marks=pytest.mark.slow),
     ],
-    ids=["Ctrl-C", "from a job manager", "the terminal is closed"],
+    ids=["Ctrl-C", "Ctrl-C of a local run", "from a job manager", "the terminal is closed"],
 )
 def test_an_interrupted_survey_ends_cleanly(number, local, start, untouched, cluster):
     options = () if local else ("--scheduler", cluster)

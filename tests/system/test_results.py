@@ -110,6 +110,7 @@ def test_a_folder_of_a_format_with_a_file_of_the_user_is_not_replaced(result, tm
     assert not own.parent.exists()
 
 
+@pytest.mark.extended
 def test_its_page_and_that_of_its_run(result, scene, cluster_client, monkeypatch, capsys):
     def look() -> None:
         url = capsys.readouterr().out.split()[0]

@@ -126,6 +126,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert f"{part.name} was missing" in note
 
 
+@pytest.mark.extended
 def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]

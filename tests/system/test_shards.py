@@ -181,7 +181,7 @@ DAMAGE = {
 NAMED = {"manifest": ".jobs/0001.json"}
 
 
-@pytest.mark.extended(keep=("changed",))
+@pytest.mark.extended
 @pytest.mark.slow(keep=("changed", "manifest"))
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_files_are_named_and_the_next_merge_takes_them(

@@ -128,6 +128,7 @@ def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
     assert all(same(one, two, columns) for one, two in zip(expected, again, strict=True))
 
 
+@pytest.mark.extended
 def test_a_pickled_stream_gives_the_same_sweeps(cluster_client, expected):
     """Here, and in a task of its cluster."""
     data = cloudpickle.dumps(campaign(1).stream(client=cluster_client))

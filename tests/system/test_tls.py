@@ -83,6 +83,7 @@ def test_an_encrypted_local_cluster():
             Client(cluster.scheduler_address, security=stranger, timeout=5, set_as_default=False)
 
 
+@pytest.mark.extended
 def test_a_survey_on_an_encrypted_cluster(lidarpool, encrypted, tmp_path):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
     address, files = encrypted
