@@ -210,7 +210,7 @@ WRONG = {
         TREE | {"scatter": {"count": 9, "spacing_m": 25}},
         "of 9 found room on * within x -20 to 20, y -10 to 10: take fewer",
     ),
-    "no file": (TREE | {"table": "none.csv"}, "none.csv is not a usable table of copies"),
+    "no file": (TREE | {"table": "none.csv"}, "none.csv does not exist: check the name"),
     "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'; it has x, z"),
     "nan": (
         TREE | {"table": {"file": "a.csv", "columns": {"y": "z"}}},

@@ -254,7 +254,7 @@ steps: 36
     ("scenario", "options", "words"),
     [
         (TWO, [], "roof and rear both send to 127.0.0.1:2368: give each a port, as in --to roof"),
-        (TWO, ["--to", "front=127.0.0.1"], "there is no sensor 'front'; there are roof, rear."),
+        (TWO, ["--to", "front=127.0.0.1"], "there is no sensor 'front'. There are roof, rear."),
         (VLP16, ["--to", "::1"], "is of IPv6"),
         (VLP16, ["--to", "lidar=239.1.1.1"], "a multicast address"),
         (VLP16, ["--to", "255.255.255.255"], "no address of a receiver"),

@@ -165,7 +165,7 @@ def test_several_topics_have_to_be_chosen(bag):
         LidarError, match="the poses /odom, /slam, /tf:base_link: choose one with topic"
     ):
         load_trajectory(path)
-    with pytest.raises(LidarError, match=r"not '/odmo'\. Did you mean '/odom'"):
+    with pytest.raises(LidarError, match=r"has no poses '/odmo'\. Did you mean '/odom'"):
         load_trajectory(path, topic="/odmo")
     track = load_trajectory(path, topic="/slam")
     assert len(track.times_s) == 16

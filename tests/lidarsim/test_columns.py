@@ -58,7 +58,7 @@ def test_columns_are_chosen_by_name_once_and_in_order():
     ("columns", "message"),
     [
         (["intensty"], r"no column 'intensty'.*'intensity'"),
-        (["reflectance of the surface"], r"There are .*intensity.*"),
+        (["reflectance of the surface"], r"There are\n  scan, x, y, .*intensity.*"),
         ([Column("time", "u4", "s", "another")], "Two columns have the name 'time': rename one"),
         ([Column("a", "u1", "", ""), Column("a", "u2", "", "")], "Two columns have the name 'a'"),
         ([Column("ring", "u1", "", "")], "Two columns have the name 'ring'"),

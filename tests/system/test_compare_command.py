@@ -58,7 +58,10 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
         (["clean", "nowhere"], "nowhere does not exist: give the folder of a result"),
         (["clean", "clean.yaml"], "clean.yaml is not read: give the folder of a result"),
         (["clean", "clean", "--sweep", "3"], "there is no sweep 3: 3 pairs of sweeps, from 0"),
-        (["clean", "clean", "--sensor-a", "roof"], "not 'roof'"),
+        (
+            ["clean", "clean", "--sensor-a", "roof"],
+            "'roof'. It has no names of sensors: give none.",
+        ),
         (["clean", "clean", "--intensity-b", "signal"], "it has no column 'signal'"),
         (["clean", "clean", "--distance", "0"], "it must be lengths in metres"),
         (["clean", "clean", "--out", "clean.yaml"], "clean.yaml' is a file"),

@@ -21,7 +21,7 @@ LINE = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
 CAR = "actors: [{name: Car, box: [4, 2, 1.5]%s}]"
 # (scenario, the file it names, what is said)
 BAD = [
-    ("trajectory: none.txt", "", "none.txt.*No such file"),
+    ("trajectory: none.txt", "", "trajectory.file: .*none.txt does not exist"),
     ("trajectory: t.txt", LINE + "3 nan 0 0 0 0 0 1\n", "position of pose 2 is not finite"),
     ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 1.01\n", "quaternion of pose 2 is not of length 1"),
     ("trajectory: {file: t.txt, start_s: 4.5}", LINE, "start_s is 4.5 s, 2.5 s outside"),

@@ -424,7 +424,7 @@ def test_merge_leaves_other_files_and_runs(parts, tmp_path):
     with pytest.raises(LidarError, match=r"holds thesis\.txt: a data set needs a folder"):
         merge(parts, out)
     assert [*out.iterdir()] == [out / "thesis.txt"]
-    for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none holds no finished")):
+    for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none does not exist")):
         with pytest.raises(LidarError, match=told):
             merge(given, tmp_path / "new")
 

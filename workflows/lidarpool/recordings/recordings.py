@@ -867,15 +867,13 @@ def _choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> s
         return available[0]
     if chosen is not None and chosen in available:
         return chosen
-    listed = f"{name} has no {kind}"
-    if available:
-        listed = f"{name} has the {kind} {', '.join(available)}"
+    listed = f"has the {kind} {', '.join(available)}" if available else f"has no {kind}"
+    if available == [""]:
+        listed = f"has no names of {kind}: give none"
     if chosen is None and available:
         advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)"
-        raise SeveralSensorsError(f"{listed}: {advice}.", available)
+        raise SeveralSensorsError(f"{name} {listed}: {advice}.", available)
     if chosen is None:
-        raise LidarError(f"{listed}: record one.")
-    raise LidarError(
-        f"{name} has no {kind} {chosen!r}.{did_you_mean(chosen, available)} It has "
-        f"{', '.join(available) or 'none'}."
-    )
+        raise LidarError(f"{name} {listed}: record one.")
+    hint = did_you_mean(chosen, available)
+    raise LidarError(f"{name} does not have {chosen!r}.{hint} It {listed}.")
