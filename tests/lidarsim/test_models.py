@@ -277,6 +277,20 @@ def test_ousters_metadata_old_and_new(tmp_path, new):
     assert (quick.period, quick.head.rate_hz, quick.max_range_m) == (1024, 5, 9)
 
 
+@pytest.mark.parametrize(
+    ("product", "origin_mm"),
+    [("OS-0-128", 27.67), ("OS-1-16-A0", 15.806), ("OS-2-32-U0", 13.762), ("", 12.163)],
+)
+def test_ousters_metadata_of_firmware_before_2_has_the_origin_of_its_product(
+    tmp_path, product, origin_mm
+):
+    """Values as in ouster-sdk."""
+    data = {"beam_altitude_angles": [10.5, -10.25], "beam_azimuth_angles": [4.0, -1.5]}
+    path = write(tmp_path, "os.json", json.dumps({**data, "prod_line": product}))
+    origin = load_sensor(calibration=path).beams.origin
+    np.testing.assert_allclose(origin, [[origin_mm / 1000, 0, 0.03618]] * 2)
+
+
 def test_beams_of_ouster_that_are_turned_are_refused(tmp_path):
     mirrored = np.diag([1, -1, 1, 1]).ravel().tolist()
     data = {

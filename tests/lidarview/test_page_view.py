@@ -16,7 +16,7 @@ from lidarpool.live.opened import open_views
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
-from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column, Z
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
@@ -593,6 +593,11 @@ def colours_of(*arguments):
     return as_bytes(coloured.paint(arguments[0])), json.dumps(
         legend_of(coloured), ensure_ascii=False
     )
+
+
+def test_the_middle_of_a_bar_about_zero_is_zero_without_a_sign():
+    legend = colours_of(np.linspace(-8, 7.98, 200), Z)[1]
+    assert json.loads(legend)["marks"] == ["-8", "0", "8"]
 
 
 @pytest.mark.parametrize(

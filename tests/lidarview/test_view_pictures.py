@@ -421,3 +421,19 @@ def test_the_hall_stays_closed_where_the_sensor_is_outside():
     roof_seen = row_shot.visible([[0, 0, 4.0]])[1]
     floor_seen = row_shot.visible([[-3, -5, 0.3]])[1]
     assert roof_seen.all() and not floor_seen.any()
+
+
+def test_triangles_that_share_no_vertices_do_not_come_apart():
+    """A block as .stl files hold it, inside out, so that its surfaces are moved apart."""
+    corners = block("Block", (12, 20, 4), (0, 0, 2))
+    joined = SceneMesh("Block", corners.vertices, corners.faces[:, ::-1])
+    loose_corners = joined.vertices[joined.faces].reshape(-1, 3)
+    loose_faces = np.arange(len(loose_corners)).reshape(-1, 3)
+    loose = SceneMesh("Block", loose_corners, loose_faces)
+    depths = [
+        take_shot(Scene.from_meshes([mesh]), [], size=SIZE, backend="numpy").depth
+        for mesh in (joined, loose)
+    ]
+    inside = np.isfinite(depths[0])
+    assert inside.any()
+    np.testing.assert_allclose(depths[1][inside], depths[0][inside], rtol=1e-4)

@@ -2,12 +2,13 @@
 
 import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Event
 from tests.poolpart.helpers import LONG_S, declared, join, kill, wait_for, worker_name
 
-from poolpart import Pool, PoolError, n_workers, named, per_host, rest, steward
+from poolpart import Pool, PoolError, division, n_workers, named, per_host, rest, steward
 from poolpart.workers import worker_identities
 
 
@@ -149,6 +150,30 @@ def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
     threading.Timer(0.3, event.set).start()
     pool.dissolve()
     assert client.gather(tasks) == [True] * 3
+    assert declared(client) == {"a": {}, "b": {}}
+
+
+def test_a_partition_that_is_made_while_it_waits_is_undone_too(start, wait_until, monkeypatch):
+    client = start({"a": {}, "b": {}})
+    part, others = Pool.from_client(client).partition("A", workers=["a"])
+    event = Event("dissolve", client)
+    task = part.submit(wait_for, "dissolve")
+    wait_until(lambda: client.cluster.scheduler.tasks)
+    looked = threading.Event()
+    unfinished = division._unfinished
+
+    def look(*arguments):
+        looked.set()
+        return unfinished(*arguments)
+
+    monkeypatch.setattr(division, "_unfinished", look)
+    with ThreadPoolExecutor(1) as thread:
+        dissolved = thread.submit(Pool.from_client(client).dissolve)
+        assert looked.wait(LONG_S)
+        others.partition("B", workers=["b"], exclusive=True)
+        event.set()
+        assert sorted(dissolved.result(LONG_S)) == ["A", "B"]
+    assert task.result() is True
     assert declared(client) == {"a": {}, "b": {}}
 
 

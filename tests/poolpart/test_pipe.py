@@ -18,7 +18,7 @@ from tests.poolpart.helpers import LONG_S
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart import pipe as pipe_module
 from poolpart.pipe import take_news
-from poolpart.pipe_states import PipeState, no_pipes, pipes_of
+from poolpart.pipe_states import PipeState, no_pipes, open_pipe, pipes_of
 
 
 def other_end(pipe):
@@ -641,3 +641,11 @@ def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(
         pipe.close()
     for future in waiting:
         assert isinstance(future.exception(LONG_S), PipeClosed)
+
+
+def test_a_pipe_of_a_client_that_has_left_is_not_made(client):
+    """The last request of a client that was killed may arrive after the news of its end."""
+    before = known(client)
+    late = {"name": "late", "owner": "gone", "capacity": 1, "producers": 1}
+    assert client.run_on_scheduler(open_pipe, **late) is False
+    assert known(client) == before

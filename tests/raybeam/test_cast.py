@@ -212,6 +212,17 @@ def test_far_origins_lose_nothing(caster, shapes):
         np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
 
 
+@pytest.mark.parametrize("far", [1e20, 1e200])
+def test_rays_from_absurdly_far_away_give_neither_warnings_nor_what_is_no_number(
+    caster, shapes, far
+):
+    """Float64 cannot aim from there: a ray towards the cube may meet it or not."""
+    cube = caster(*shapes["cube"]())
+    axes = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1]]])
+    assert not cube.cast(far * axes, axes).hit.any()
+    assert not np.isnan(cube.cast(far * axes, -axes).distance).any()
+
+
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
 def test_any_unit_of_length(caster, shapes, size):
