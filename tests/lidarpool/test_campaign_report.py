@@ -80,6 +80,7 @@ def test_figures_are_those_of_done_jobs(card):
     assert [one["number"] for one in report["slowest"]] == list(range(29, 19, -1))
 
 
+@pytest.mark.extended
 def test_splits_name_the_jobs_that_are_there(card):
     folder, report = card
     train, val = ((folder / "splits" / f"{n}.txt").read_text().split() for n in ("train", "val"))
@@ -135,6 +136,7 @@ def test_same_jobs_make_the_same_files(card, tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
 
 
+@pytest.mark.extended
 def test_casting_times_are_in_the_report_alone(card, tmp_path):
     folder, _ = card
     slower = [replace(row, seconds=2 * row.seconds + 1) for row in ROWS]

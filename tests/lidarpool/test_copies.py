@@ -77,6 +77,7 @@ def test_a_list_gives_places_turns_and_factors(made):
     assert len(scene.instances.parts) == 1 and scene.triangles == 400 + 2 + 3 * 208
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("text", "more"),
     [
@@ -109,6 +110,7 @@ def test_a_table_without_z_stands_on_the_surface(made, folder):
     assert np.allclose(places(scene)[:, 2], [height(np.array([[1, 2]]))[0], 8])
 
 
+@pytest.mark.extended
 def test_scattered_copies_stand_on_what_is_seen_from_above(made):
     scatter = {"count": 300, "surfaces": "Hill", "spacing_m": 0.6, "scale": [0.5, 1.5]}
     scene = made(TREE | {"scatter": scatter}).scene

@@ -180,6 +180,7 @@ def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # no
     assert files_of(tmp_path / "both") == files_of(tmp_path / "one")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("format", ["kitti", "mcap", "folder"])
 def test_what_killed_writers_left_is_removed_at_the_end(written, tmp_path, format):  # noqa: A002
     data, place = written(format)
@@ -208,6 +209,7 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
     assert max(held) < 16 * len(job(0)) / 3
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("format", DATA_SETS)
 def test_a_manifest_lists_the_files_of_a_job(written, format):  # noqa: A002
     data, place = written(format, (4,))

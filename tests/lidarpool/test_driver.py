@@ -666,6 +666,7 @@ def two(run):
     return run
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("how", ["failed", "intersect", "collect", "cast"])
 def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
     two.stages.advice = 1

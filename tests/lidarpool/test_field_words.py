@@ -20,6 +20,7 @@ def words(**sections):
     return fields_of(built.scene, built.survey, built.planning)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("sections", "differs"),
     [

@@ -261,6 +261,7 @@ def test_poses_of_sweeps_are_used(cluster_client, dropout):
         assert figures["range_m"]["value"] == pytest.approx(0.01, rel=0.1)
 
 
+@pytest.mark.extended
 def test_poses_that_are_given_are_one_or_one_for_each_sweep_of_a_scene():
     scene = parked_street()
     made = drive(scene, 0.0, 1.3)
@@ -279,6 +280,7 @@ def test_poses_that_are_given_are_one_or_one_for_each_sweep_of_a_scene():
         assert len(str(raised.value).splitlines()) == 1
 
 
+@pytest.mark.extended
 def test_a_slow_sensor_is_refused_with_its_speed(block):
     """Steps of 15 mm are not told from noise; nine of these are."""
     with pytest.raises(LidarError, match="is of a sensor that moves") as raised:
@@ -305,6 +307,7 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
     assert fit(replace(stands, read=passed)).figures["sweeps"] == 6
 
 
+@pytest.mark.extended
 def test_points_that_are_not_in_metres_are_refused(recording):
     def scaled(number):
         points, columns, pose = recording.read(number)

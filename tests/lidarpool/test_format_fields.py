@@ -249,6 +249,7 @@ def test_pcd_and_bags_say_which_frame_their_points_have(tmp_path, compensated):
             np.testing.assert_allclose(file.numpy(("time",))[:, 0], since, atol=1e-8)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates):
     cloud = Drive("velodyne/vlp16").cloud(coordinates)
@@ -263,6 +264,7 @@ def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates
     assert metadata[b"coordinates"].decode() == coordinates
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 def test_samples_for_training_are_in_the_sensors_axes_and_say_so(tmp_path, coordinates):
     """Their pose takes compensated points to the world, whatever the frame of the cloud."""

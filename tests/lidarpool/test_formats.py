@@ -224,6 +224,7 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
         np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["mcap", "rosbag2"])
 def test_trajectories_of_bags_are_read_again(written, survey, name):
     path = written(name, "velodyne")
@@ -455,6 +456,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(sys.platform == "win32", reason="has no limits of files")
 @pytest.mark.parametrize("name", OF_ANY_SENSOR)
 def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, tmp_path, name):
@@ -626,7 +628,7 @@ def in_camera(folder, sweep, instance):
     return points[instances == instance] @ back.T, centre, turn, (length, height, width)
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["ply", *OF_ANY_SENSOR])
 def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, name):
     known = replace(cloud, sweeps=lambda: sweeps)
@@ -710,6 +712,7 @@ def test_documentation_and_installation_follow_the_table_of_formats():
         assert re.search(rf"\| `{layout}` \|.*\| {', '.join(needed)} \|", text), layout
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["kitti", "nuscenes", "webdataset", "parquet", "pcd", "images"])
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
@@ -862,6 +865,7 @@ def test_normals_and_origins_follow_the_points_into_the_sensors_axes(drive, tmp_
         np.testing.assert_allclose(normal @ turn.T, normals[here], atol=1e-6, err_msg=name)
 
 
+@pytest.mark.extended
 def test_e57_has_normals_in_the_sensors_axes(drive, tmp_path, monkeypatch):
     lost = save_cloud(drive, tmp_path / "c.e57")
     assert not {*lost} & {"normal_x", "normal_y", "normal_z"} and "origin_x" in lost

@@ -122,7 +122,7 @@ def made(tmp_path_factory):
     return make
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_each_ray_that_was_fired_is_there_once(made, name):
     cloud, sweeps, images = made(name)
@@ -138,7 +138,7 @@ def test_each_ray_that_was_fired_is_there_once(made, name):
     assert 0 < silent == survey.ray_count - len(pulses) < survey.ray_count
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_images_have_the_values_of_the_cloud(made, name):
     """Each value is found by the scan, the firing and the channel of its ray."""
@@ -193,6 +193,7 @@ def test_what_has_no_return_has_no_values(made):
             assert np.isfinite(image[name]).all()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_a_saved_survey_gives_the_same_images(made, tmp_path, name):
     cloud, sweeps, images = made(name)
@@ -208,6 +209,7 @@ def test_a_saved_survey_gives_the_same_images(made, tmp_path, name):
 SENSORS = [name for name in model_names() if not read_model(name).needs_calibration]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", [*SENSORS, "listed"])
 def test_a_described_sensor_fires_the_same_rays(name):
     sensor = LISTED if name == "listed" else load_sensor(name)

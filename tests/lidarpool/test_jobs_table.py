@@ -163,6 +163,7 @@ def cloud_of(count, dtype=np.float64):
     return Cloud(rng.random((count, 3)).astype(np.float32).astype(dtype), columns)
 
 
+@pytest.mark.extended
 @given(st.lists(st.integers(0, 500), max_size=8))
 def test_hash_and_classes_do_not_depend_on_the_division(cuts):
     cloud = cloud_of(500)

@@ -62,6 +62,7 @@ def test_a_robot_reaches_its_goal_by_its_ranges(capsys):
     assert 340 < steps < 400 and 68 < reward < 74 and left < 1
 
 
+@pytest.mark.extended
 def test_a_robot_of_mujoco_scans_while_balls_fall(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
     monkeypatch.chdir(tmp_path)
@@ -143,6 +144,7 @@ class Falling:
         return SimpleNamespace(numpy=self.poses.copy)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("example", "modules"),
     [("pybullet_lidar.py", ["pybullet"]), ("newton_lidar.py", ["newton", "warp"])],
@@ -162,6 +164,7 @@ def test_a_lidar_scans_falling_boxes(tmp_path, monkeypatch, capsys, example, mod
     assert (tmp_path / "boxes.ply").exists()
 
 
+@pytest.mark.extended
 def test_a_node_publishes_what_a_bag_holds(tmp_path):
     node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
     scene = Scene.seed()

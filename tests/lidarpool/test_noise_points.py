@@ -143,6 +143,7 @@ def with_columns(path, names, *values):
     return path
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("name", "value", "is_left_out"),
     [

@@ -264,6 +264,7 @@ def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):
         assert points.rings is None if path.name == "a.bin" else points.rings.tolist() == [4, 31]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", BAGS)
 def test_sweeps_of_a_bag_are_where_its_frames_say(exported, name, monkeypatch):
     folder, _, sweeps = exported

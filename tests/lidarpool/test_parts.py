@@ -43,6 +43,7 @@ def part_of(first, counts, seed=0, columns=COLUMNS):
     return PartColumns(first, counts, made, triangles, tally, hits, samples)
 
 
+@pytest.mark.extended
 @settings(max_examples=50)
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 7), min_size=1, max_size=6))
 def test_what_is_packed_comes_back(first, counts):
@@ -196,6 +197,7 @@ counts_of_parts = st.lists(
 )
 
 
+@pytest.mark.extended
 def test_a_notebook_shows_stored_points_as_it_shows_points_in_memory(tmp_path):
     cloud, _ = stored_cloud(Storage.at(tmp_path), [[3, 2], [40]])
     shown = cloud._repr_html_()

@@ -93,7 +93,7 @@ LONG = creation.cylinder(0.01, 6.0)
 LONG.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("mesh", "points", "rays"),
     [
@@ -171,7 +171,7 @@ def flipped(scene):
     return Scene(scene.vertices, scene.faces[:, ::-1], scene.face_object, scene.names, scene.origin)
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("name", PLACES)
 def test_in_a_place_the_sensor_stands_in_the_middle(name):
     scene = PLACES[name]()

@@ -122,6 +122,7 @@ def test_rooms_tunnels_and_courtyards_are_no_faults(tmp_path, meshes, position):
     assert warnings_of(tmp_path, meshes, poses=[[*position]]) == []
 
 
+@pytest.mark.extended
 def test_a_sensor_in_the_body_of_an_actor(tmp_path):
     points = [{"time_s": 0, "position": [-20, 5, 0.8]}, {"time_s": 4, "position": [20, 5, 0.8]}]
     write_scene(tmp_path / "car.glb", Scene.from_meshes([block("Car", (4.5, 1.8, 1.5), 0, 0)]))
@@ -215,6 +216,7 @@ def test_quaternions_in_another_order(tmp_path, path):
     assert re.match(r"the carrier's z axis is \d+ degrees from up: ", warning)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("yaw_deg", "side"), [(90, "left"), (-90, "right")])
 def test_a_carrier_that_faces_aside_all_along(tmp_path, yaw_deg, side):
     aside = drive((0, -20, 5, 2, yaw_deg), (4, 20, 5, 2, yaw_deg))

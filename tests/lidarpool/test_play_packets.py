@@ -136,6 +136,7 @@ def test_live_packets_are_those_of_the_file(receiver, played, tmp_path):
         assert sum(summary["lateness"].values()) == summary["sent"]
 
 
+@pytest.mark.extended
 def test_velodyne_decoder_reads_live_packets_as_the_points_of_the_sweeps(receiver, tmp_path):
     decoder = pytest.importorskip("velodyne_decoder")
     sensor = load_sensor("velodyne/vlp16")
@@ -478,6 +479,7 @@ def test_the_interface_of_an_ouster_answers_for_a_recording(tmp_path):
     assert "a.pcap of 192.168.1.200 sends to 127.0.0.1, port 7502; Ouster's HTTP" in outcome.stdout
 
 
+@pytest.mark.extended
 def test_several_sensors_send_to_a_port_each(receiver, tmp_path):
     (tmp_path / "s.yaml").write_text(TWO)
     with bound() as other:
@@ -492,6 +494,7 @@ def test_several_sensors_send_to_a_port_each(receiver, tmp_path):
     assert [packet[1200:] for packet in roof] == [packet[1200:] for packet in rear]
 
 
+@pytest.mark.extended
 def test_stamps_are_those_of_the_clock_of_this_machine(receiver, tmp_path):
     (tmp_path / "s.yaml").write_text(VLP16)
     to = f"127.0.0.1:{port_of(receiver)}"

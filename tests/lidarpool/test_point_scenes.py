@@ -128,6 +128,7 @@ def off_plane(scene, at=(0, 0, 0)):
     return np.abs(z - x / 2).max()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "name",
     [
@@ -152,6 +153,7 @@ def test_points_in_one_voxel_become_one_surfel(tmp_path):
     assert 400 < len(many.faces) / 2 < len(GRID), "by default about the spacing of the points"
 
 
+@pytest.mark.extended
 def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
     real = Scene.seed()
     sensor = load_sensor("ouster/os1-64")

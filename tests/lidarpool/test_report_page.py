@@ -174,6 +174,7 @@ def test_the_points_are_shown_from_above(write):
     assert np.count_nonzero(shade) == 3
 
 
+@pytest.mark.extended
 def test_names_are_words_and_never_markup(write):
     tame, _ = write(notes=("a note",))
     evil, _ = write(

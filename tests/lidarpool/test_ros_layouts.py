@@ -122,6 +122,7 @@ def test_fields_are_those_of_the_driver(layout, model, tmp_path):
     assert stamp.sec * 10**9 + stamp.nanosec == START_NS + round(cloud.sweeps().begins_ns[1])
 
 
+@pytest.mark.extended
 def test_a_custom_message_of_livox_has_the_same_points(tmp_path):
     cloud = cast("livox/mid360")
     save_cloud(cloud, tmp_path / "c.mcap", layout="livox")

@@ -282,6 +282,7 @@ def test_a_long_list_of_names_follows_the_hint_in_lines_of_its_own(scenario):
     assert names[-1].endswith(" or 'normal_z'. 1 more entry like it: 'x_m'.")
 
 
+@pytest.mark.extended
 def test_all_faults_are_told_at_once(scenario, tmp_path):
     of_fields = "steps: 0\nsensor: {layers: 0, layer: 1}\ncloud: {keep_every: 0}\n"
     of_sections = (
@@ -467,6 +468,7 @@ def mesh_file(path, size, height, **asset):
     return path
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("height", "expected"), [(2.4, [0.6, 1.2, 1.8]), (3.1, [0.775, 1.55, 2.325]), (6, [1, 2, 3])]
 )
@@ -525,6 +527,7 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 @pytest.mark.parametrize(
     ("epsg", "place", "words"),

@@ -43,6 +43,7 @@ def test_a_loaded_value_is_the_shared_one_until_it_is_written_to():
     assert second["grid"][0, 0] == original["grid"][0, 0] == 0
 
 
+@pytest.mark.extended
 @linux
 def test_another_process_loads_it_as_long_as_the_owner_lives():
     owner = subprocess.Popen(

@@ -148,6 +148,7 @@ def scenario(folder, text=FCD, traffic=(), **sections):
     return Scenario.from_data(data | sections, folder=folder)
 
 
+@pytest.mark.extended
 def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     read = scenario(tmp_path)
     built = build(read)

@@ -200,6 +200,7 @@ def test_another_scene_replaces_all_that_was_shown(bridge, played):
     assert client.of("/scene") == client.of("/actors") == [everything]
 
 
+@pytest.mark.extended
 @needs_foxglove
 def test_slow_and_malformed_clients_do_not_matter(bridge, played, capfd):
     port = port_of(bridge.description)

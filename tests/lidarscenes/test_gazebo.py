@@ -746,6 +746,7 @@ def test_lidars_of_models_that_fell_are_listed(tmp_path):
         imported(tmp_path / "x", world(fallen))
 
 
+@pytest.mark.extended
 def test_garbled_worlds_give_objects_or_a_line(tmp_path):
     peak_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     add_model(tmp_path, "crate")

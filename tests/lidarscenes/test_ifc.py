@@ -559,6 +559,7 @@ def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
         load_meshes(house)
 
 
+@pytest.mark.extended
 def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "find_spec", lambda name: None)
     path = tmp_path / "a.ifc"

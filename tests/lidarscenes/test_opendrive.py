@@ -622,6 +622,7 @@ def test_replaced_numbers_are_read_or_refused(tmp_path):
     assert 0.1 < refused / len(spans) < 0.8
 
 
+@pytest.mark.extended
 def test_garbled_files_are_read_or_refused(tmp_path):
     lanes = section(lane(1, WIDTHS + mark(kind="broken")), lane(-1, width(3) + mark()))
     text = document(road(lanes, more=thing("pole", 'radius="0.5" height="3"')))

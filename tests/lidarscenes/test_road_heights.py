@@ -111,6 +111,7 @@ def lane_meshes(meshes):
 coefficient = st.floats(-1, 1).map(lambda x: round(x, 3))
 
 
+@pytest.mark.extended
 @settings(max_examples=12)
 @given(
     kind=st.sampled_from(["line", "arc", "spiral", "poly3", "paramPoly3"]),
@@ -249,6 +250,7 @@ def test_heights_step_where_a_piece_starts(tmp_path, parts, before, after):
     np.testing.assert_allclose(heights[IS_AFTER], after, atol=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("parts", "before", "after"),
     [

@@ -22,6 +22,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import Cutout
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".GLB"])
 def test_round_trip(tmp_path, suffix):
     made = city(5_000)

@@ -907,6 +907,7 @@ def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
         assert seen(path, assets=folder.parent) == (PICTURE, [])
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 @pytest.mark.parametrize(
     "text",

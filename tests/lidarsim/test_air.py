@@ -132,6 +132,7 @@ def expected(number, slope, largest_mm, reflectance, alpha, edges, brighter=0.0)
     return np.array(counts)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("weather", "rays", "given"),
     [
@@ -184,6 +185,7 @@ def test_what_falls_behind_a_surface_does_not_return_and_before_it_is_the_same()
     assert same(pane, free), "snow falls behind a pane as well"
 
 
+@pytest.mark.extended
 def test_each_sub_ray_is_blocked_by_its_own_surface():
     beam = Returns("all", subrays=19, divergence_mrad=1000 * DIVERGENCE, pulse_ns=0)
     free, half = (
@@ -378,6 +380,7 @@ def test_nothing_falls_within_water(weather):
         assert np.array_equal(ranges, alone[alone < 3])
 
 
+@pytest.mark.extended
 def test_flakes_behind_a_thick_pane_return():
     pane = box("Pane", (3, -50, -50), (3.02, 50, 50))
     glass = [

@@ -645,6 +645,7 @@ def test_what_is_wrong_with_a_scenario_is_a_line(tmp_path, entry, message):
         build(scenario(tmp_path, {"name": "A", "trajectory": WAY} | entry))
 
 
+@pytest.mark.extended
 def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
     steps = "".join(
         f"""<timestep time="{t}.00"><person id="p" x="0" y="{t}" angle="0" type="ped"/>

@@ -69,6 +69,7 @@ def beyond(offset):
     return (math.acos(offset) - offset * math.sqrt(1 - offset**2)) / math.pi
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 133])
 @pytest.mark.parametrize("offset", [-0.8, -0.3, 0.0, 0.5])
@@ -101,6 +102,7 @@ def footprint(distance_m, grazing, radius):
     return distance_m * (1 + variance) / (1 + 3 * variance), 1 + 3 * variance
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("subrays", [7, 61])
 @pytest.mark.parametrize(
     "model",

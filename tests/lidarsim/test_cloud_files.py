@@ -101,6 +101,7 @@ def test_units_in_names_are_units_of_the_axes(tmp_path):
     assert read(tmp_path, "a.txt", "# X [ft] Y [ft] Z\n1 2 3\n").units_m == (0.3048, 0.3048, 1.0)
 
 
+@pytest.mark.extended
 def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
     count = 70_000
     values = np.random.default_rng(1).uniform(-100, 100, (count, 4)).round(3)

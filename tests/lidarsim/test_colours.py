@@ -403,6 +403,7 @@ def test_colours_that_do_not_fit_are_refused():
             SceneMesh("Hills", vertices, faces, colours=colours)
 
 
+@pytest.mark.extended
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=20))
 def test_light_and_bytes_are_one_another(rows):
     colours = np.array(rows, np.uint8)

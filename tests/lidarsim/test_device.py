@@ -238,6 +238,7 @@ def test_columns_of_actors(scene, name, scenes, backend):
     same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))
 
 
+@pytest.mark.extended
 def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
     sensor = MADE["few columns"].sensor
     clouds = [

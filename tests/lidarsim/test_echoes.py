@@ -246,6 +246,7 @@ def test_light_goes_where_a_beam_points_and_its_angle_is_reported_without_noise(
     assert np.abs(across).max() < 1e-2, "reported along the nominal ray"
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("distance", [80, 95, 100, 105, 130])
 def test_weak_returns_are_lost_by_the_model(distance):
     """Threshold detection of a signal in normally distributed noise."""

@@ -268,6 +268,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).packed()
 
 
+@pytest.mark.extended
 def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
     crate = Actor(block("Crate", (1, 1, 1)), Track([0, 1], [(3, 0, 0), (3, 2, 0)]))
     scene = ROOM.with_actors([crate])

@@ -79,6 +79,7 @@ def test_sweeps_and_ranges_are_those_of_a_scene_with_the_bodies_in_place(shift):
         assert np.array_equal(images, scanner.ranges([matrix, matrix], number=number))
 
 
+@pytest.mark.extended
 def test_each_beam_of_a_step_meets_the_world_of_its_time():
     """A wall that flees at 20 m/s while the sensor drives at 10 m/s; steps beside the sweeps."""
     follower = Follower(BODIES, VLP16, static=STATIC, columns=["range", "time"], precision_m=1e-5)

@@ -338,6 +338,7 @@ FIELDS = [
 ]  # fmt: skip
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize(("model", "mode"), [("xt32", "dual"), ("pandar40p", "last")])
 def test_a_fault_of_a_packet_is_detected(model, mode, field):
@@ -378,6 +379,7 @@ RECORDED = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("model", MODELS)
 def test_packets_are_those_that_the_sdk_has_read(model):
     sensor, shots = synthetic_shots(model)

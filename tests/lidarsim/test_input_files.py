@@ -107,6 +107,7 @@ def test_devices_pipes_and_sockets_are_refused_at_once(tmp_path, monkeypatch, na
         assert "it is a socket" in refused(READERS[name], path)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", READERS)
 def test_pointers_of_git_lfs_are_no_content(tmp_path, name):
     path = tmp_path / name
@@ -127,6 +128,7 @@ def test_a_note_names_materials_that_are_a_pointer_of_git_lfs(tmp_path):
     assert any("a.mtl (it is a Git LFS pointer, get the file itself" in note for note in notes)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "name", [name for name in READERS if not name.startswith(("recording", "trajectory"))]
 )  # those may be folders

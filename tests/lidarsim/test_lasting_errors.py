@@ -38,6 +38,7 @@ def errors(noise):
     return cast(replace(SURVEY, noise=noise))["range"].astype(float) - TRUE["range"]
 
 
+@pytest.mark.extended
 def test_a_channels_error_is_constant_and_its_own():
     """Of 30 units: normal with the standard deviation given, uncorrelated, the same for ever."""
     each = []

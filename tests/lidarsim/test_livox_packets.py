@@ -319,6 +319,7 @@ def test_packets_continue_from_frame_to_frame_while_the_sensor_moves():
     check_rows(shifted, expected, "mid360", 1)
 
 
+@pytest.mark.extended
 def test_dropped_packets_are_left_out_and_counted():
     fault = Fault("dropped_packets", from_s=0.05, share=0.3, packet=24)
     survey = moving_survey(faults=[fault], steps=36)

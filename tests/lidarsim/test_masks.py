@@ -273,6 +273,7 @@ def test_triangles_are_read_whatever_is_broken_in_their_material(tmp_path, caplo
         assert caplog.records[0].levelno == logging.WARNING
 
 
+@pytest.mark.extended
 def test_an_image_beside_is_read_and_too_large_ones_are_not(tmp_path, monkeypatch, caplog):
     header, body = card()
     (tmp_path / "a b").mkdir()

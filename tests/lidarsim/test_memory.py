@@ -98,6 +98,7 @@ def test_the_estimate_is_safe_and_near(name):
     assert taken < cast_bytes(SCENE, survey, scans) < 1.5 * taken
 
 
+@pytest.mark.extended
 @given(st.floats(0, 1e10), st.sampled_from(sorted(SURVEYS)))
 def test_as_many_scans_as_fit(limit, name):
     survey = SURVEYS[name]

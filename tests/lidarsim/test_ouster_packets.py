@@ -295,6 +295,7 @@ def test_packets_of_all_models_hold_the_returns_of_the_cloud(model, columns):
         check(lidar_of(groups), metadata, case, profile)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("profile", [SINGLE, LOW_RATE])
 def test_packets_of_a_moving_sensor_hold_the_returns_of_the_cloud(profile):
     start = datetime(2025, 3, 1, 12, 0, 1, 123_456, tzinfo=UTC)

@@ -68,6 +68,7 @@ def test_ply_faces_of_any_mixture(tmp_path, order, more):
     assert mesh.is_watertight and mesh.volume == pytest.approx(4)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("order", ["", "<", ">"])
 def test_a_cut_ply_of_mixed_faces_is_refused(tmp_path, order):
     content = ply_roof(order, after="texcoord").rstrip(b"\n")

@@ -126,6 +126,7 @@ def test_a_full_receiver_clips_and_widens(distance, waveform):
     assert found["range"] == pytest.approx([distance - early])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("apart", [0.99, 1.01])
 @pytest.mark.parametrize("waveform", ["none", "peaks"])
 def test_returns_within_a_full_pulse_are_one(apart, waveform):

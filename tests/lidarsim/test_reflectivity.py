@@ -55,6 +55,7 @@ def test_above_white_scales_are_logarithmic_or_linear():
     assert SCALES["hesai"].codes(np.array([1.01, 1.5, 2.55, 220])).tolist() == [101, 150, 255, 255]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("maker", SCALES)
 @pytest.mark.parametrize("reflectance", [0.1, 0.5, 0.9])
 def test_reflectivity_is_that_of_the_surface_at_all_ranges(reflectance, maker):

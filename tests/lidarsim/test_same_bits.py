@@ -66,6 +66,7 @@ def suspects(source):
             yield node.lineno
 
 
+@pytest.mark.extended(every=10)
 @pytest.mark.parametrize("name", SOURCES)
 def test_no_byte_comes_from_functions_that_differ(name):
     lines = sorted({*suspects(SOURCES[name].read_text())})

@@ -104,7 +104,7 @@ def same(one: Cloud, other: Cloud):
     return True
 
 
-@pytest.mark.extended(every=12)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["", "physics"])
 @pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
@@ -192,6 +192,7 @@ def correlations(*rows):
     return np.abs(np.corrcoef(rows) - np.eye(len(rows))).max()
 
 
+@pytest.mark.extended
 def test_each_name_has_random_numbers_of_its_own(scene):
     given = {"columns": COLUMNS, "backend": "numpy"}
     plain = Scanner(scene, GRID, **given).sweep(HERE)
@@ -266,6 +267,7 @@ def test_an_actor_stands_where_it_was_put(scene):
         scanner.sweep((0, 0, 1), start_s=9)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_actor_is_like_one_that_was_there_before(scene, physics):
     """In cast, normals, and energies."""
@@ -436,6 +438,7 @@ def test_a_pickled_scanner_gives_the_same_bytes(scene, dumps):
     assert same(scanner.sweep(HERE, number=2), copy.sweep(HERE, number=2))
 
 
+@pytest.mark.extended
 def test_a_copy_waits_for_sweeps_before_it_moves(scene):
     """So each of them sees it in one place."""
     scanner = Scanner(with_copies(scene), VLP16, threads=1)
@@ -566,6 +569,7 @@ WRONG = {
 }
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_arguments(scene, name):
     call, says = WRONG[name]

@@ -27,6 +27,7 @@ def world(scene):
     return scene.vertices[scene.faces] + scene.origin
 
 
+@pytest.mark.extended
 @given(
     st.tuples(*[st.floats(-6e6, 6e6)] * 3),
     st.lists(st.tuples(*[st.floats(-500, 500)] * 3), min_size=1, max_size=5),
@@ -43,6 +44,7 @@ def test_world_coordinates_come_back(centre, offsets):
         assert not scene.origin.any()
 
 
+@pytest.mark.extended
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
 def test_unique_names(names):
     unique = unique_names(names)

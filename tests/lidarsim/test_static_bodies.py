@@ -141,6 +141,7 @@ def test_instances_that_are_cut_or_left_out_can_move(uncut):
         assert same(scene, scanner.sweep(HERE, number=1), whole.sweep(HERE, number=1))
 
 
+@pytest.mark.extended
 def test_bodies_that_fall_for_ever_are_left_out(uncut):
     """And are there again once they are put back."""
     crates = [SceneInstance(box("Crate", (2, 1, 1)), Pose((x, -4, 0))) for x in (5, -5, 0)]
@@ -182,6 +183,7 @@ def test_parts_of_triangles_cover_the_box_and_share_corners():
     assert cut(vertices[4:], faces[:1] * 0 + [0, 1, 2], box_planes(region)) is None
 
 
+@pytest.mark.extended
 def test_a_note_says_what_is_left_out(caplog):
     Scanner(vast("faces"), GRID, backend="numpy")
     (record,) = caplog.records

@@ -145,6 +145,7 @@ def test_steps_read_and_write_what_they_say(name):
     assert sum(map(len, rig.cast(0, 6))) > 500
 
 
+@pytest.mark.extended
 def test_a_survey_without_effects_has_no_steps():
     (pulses,) = Rig(Scene.seed(), Survey(poses=[(0, 0, 1)]), "numpy").pulse_casters
     assert pulses.steps == []

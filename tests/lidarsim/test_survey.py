@@ -105,6 +105,7 @@ def test_few_poses_make_straight_ways_and_parabolas():
         np.testing.assert_allclose(found[:, 1], found[:, 0] ** degree, atol=1e-12)
 
 
+@pytest.mark.extended
 def test_pieces_and_the_signs_of_quaternions_do_not_matter():
     flips = np.where(RNG.random(len(TURNS)) < 0.5, -1.0, 1.0)
     one, other = (Track(TIMES, PLACES, q, smooth=True) for q in (TURNS, TURNS * flips[:, None]))

@@ -258,6 +258,7 @@ def test_ground_truth_of_euroc(tmp_path, first):
     assert np.allclose(angles(track), [40, 0, 0])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("remarks", "columns"),
     [

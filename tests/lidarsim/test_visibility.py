@@ -185,7 +185,7 @@ def test_unseen_objects_of_a_vast_scene_are_left_out(monkeypatch):
         assert not {0, 7} & {*cloud.object.tolist()}
 
 
-@pytest.mark.extended(keep=("*-both", "source-*"))
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("kind", ["faces", "instances", "both"])
 def test_a_sensor_may_see_nothing_at_all(kind, backend):
     scene = scene_of(objects(kind))

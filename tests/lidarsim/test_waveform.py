@@ -143,6 +143,7 @@ def test_the_receiver_widens_the_echo():
     assert echo["pulse_width"] == pytest.approx([math.hypot(3, 3.120)], rel=1e-3)
 
 
+@pytest.mark.extended
 def test_heights_decide_which_echoes_are_detected_and_strongest():
     """A slanted wall returns as much light as one at right angles, and half of the height."""
     returns = Returns("all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform="peaks")
@@ -183,6 +184,7 @@ def survey(**given):
     return Survey(sensor, **options | given)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
 def test_scans_in_one_cast_or_each_by_itself_are_the_same(waveform):
     noise = Noise(range_m=0.02, angle_deg=0.1, detection_range_m=60)
@@ -248,6 +250,7 @@ def test_recorded_noise_is_a_fifth_of_the_threshold():
     assert quiet.mean() == pytest.approx(0, abs=noise.threshold / 50)
 
 
+@pytest.mark.extended
 def test_recording_changes_no_point_and_no_batch_changes_a_record():
     made = survey(noise=Noise(range_m=0.02, detection_range_m=60), waveform_samples=64)
     rig = Rig(fence(), made, "numpy")
@@ -259,6 +262,7 @@ def test_recording_changes_no_point_and_no_batch_changes_a_record():
     assert all(whole[name] == values for name, values in bare.items())
 
 
+@pytest.mark.extended
 def test_fog_and_false_alarms_have_waveforms_too():
     noise = Noise(detection_range_m=60, false_alarm_hz=3e6)
     fog = {"visibility_km": 0.05, "fog_lidar_ratio_sr": 65}

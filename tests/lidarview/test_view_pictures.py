@@ -88,6 +88,7 @@ def test_hits_colour_what_was_hit_and_only_that(pixels, scene):
     assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
 
 
+@pytest.mark.extended
 def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
     """A floor of 8 by 4 metres, with hits on its left half alone: no diagonal between colours."""
     scene = Scene.from_meshes([quad("Floor", (0, 0, 0), (8, 0, 0), (8, 4, 0), (0, 4, 0))])
@@ -102,6 +103,7 @@ def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
         assert vivid[across < 3.6].all() and not vivid[across > 5].any()
 
 
+@pytest.mark.extended
 def test_objects_that_touch_do_not_stipple(pixels):
     """A slab whose top lies in the plane of that of a block within it has one colour there."""
     scene = Scene.from_meshes([box("Slab", (8, 8, 1)), box("Block", (4, 4, 1))])
@@ -134,6 +136,7 @@ def test_a_picture_within_a_page_takes_its_ink_from_there(shot):
     assert (opacity == 255).sum() > 30, "objects hide what is behind them"
 
 
+@pytest.mark.extended
 def test_sample_rays_are_drawn(pixels, scene, shot):
     hits = np.zeros(len(scene.faces), np.int64)
     rays = np.array([[[0, 0, 2], [20, -20, 2]], [[0, 0, 2], [-9, 9, 2]]], np.float32)
@@ -144,6 +147,7 @@ def test_sample_rays_are_drawn(pixels, scene, shot):
     assert changed.sum() > 40
 
 
+@pytest.mark.extended
 def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
     assert (
         colourful(pixels(draw_cloud, shot, Cloud(np.empty((0, 3)), {}), 0)[:, LEFT]) < 60
@@ -175,6 +179,7 @@ def test_half_of_the_colours_are_for_half_of_the_heights():
         assert np.array_equal(middle, TURBO[127])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("lower", "upper", "marks"),
     [

@@ -66,6 +66,7 @@ def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, w
         assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
 
 
+@pytest.mark.extended
 def test_the_minimum_stays_and_the_range_can_be_changed(queue, wait_until):
     with cluster_of({"GPU": adaptive(1, 2)}) as client:
         gpu = Partition("GPU", client)
@@ -170,6 +171,7 @@ def test_a_job_in_the_queue_is_cancelled_when_its_work_is_gone(queue, wait_until
         wait_until(lambda: not client.cluster.worker_spec)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", [{"adapt": [0, 1]}, {}])
 def test_a_map_waits_for_workers_that_are_queued_or_can_be(queue, wait_until, kind):
     queue.held = True
@@ -254,6 +256,7 @@ def test_workers_of_one_job_go_together(queue, wait_until):
         assert long.result(LONG_S)
 
 
+@pytest.mark.extended
 def test_what_a_client_wants_ends_with_it(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3, slots=2), "FIX": {}}) as client:
         with Client(client.cluster) as other:
@@ -270,6 +273,7 @@ def test_what_a_client_wants_ends_with_it(queue, wait_until):
         wait_until(lambda: len(Partition("GPU", client)) == 0)
 
 
+@pytest.mark.extended
 def test_tasks_for_one_worker_start_no_others(queue, wait_until):
     with cluster_of({"GPU": adaptive(1, 3)}) as client:
         gpu = Partition("GPU", client)
@@ -283,6 +287,7 @@ def test_tasks_for_one_worker_start_no_others(queue, wait_until):
         client.gather(tasks)
 
 
+@pytest.mark.extended
 def test_a_map_has_work_for_all_that_may_come(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3)}) as client:
         gpu = Partition("GPU", client)

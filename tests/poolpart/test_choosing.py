@@ -76,6 +76,7 @@ def test_tasks_of_others_stay_outside_and_are_spread(client, parts):
         assert gather_places(stranger, futures) == dict.fromkeys(outside, 4)
 
 
+@pytest.mark.extended
 def test_a_worker_that_is_free_is_chosen_before_busy_workers(client, parts):
     gate = f"gate-{client.id}"
     busy = [parts["A"].submit(wait_here, gate) for _ in range(4)]
@@ -89,6 +90,7 @@ def place_of_input(data, *_):
     return data, worker_name()
 
 
+@pytest.mark.extended
 def test_a_task_runs_where_its_input_is(client, parts):
     for _ in range(8):
         data = parts["A"].submit(worker_name)
@@ -97,6 +99,7 @@ def test_a_task_runs_where_its_input_is(client, parts):
         assert place == own
 
 
+@pytest.mark.extended
 def test_a_task_that_takes_several_slots_goes_to_a_worker_that_has_them(client):
     rules = {"A": n_workers(5, slots=1), "B": rest(slots=3)}
     parts = Pool.from_client(client).divide(rules)
@@ -105,6 +108,7 @@ def test_a_task_that_takes_several_slots_goes_to_a_worker_that_has_them(client):
         assert parts["B"].submit(worker_name, slots=3).result(LONG_S) in members
 
 
+@pytest.mark.extended
 def test_workers_that_join_leave_and_move_are_counted(client, parts):
     parts["A"].grow(2, source="B")
     gate = f"gate-{client.id}"
@@ -116,6 +120,7 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
     assert places.keys() == members
 
 
+@pytest.mark.extended
 def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypatch, caplog):
     monkeypatch.delattr("poolpart.choosing.free_slots_of")
     members = {worker.name for worker in parts["A"].workers}

@@ -156,6 +156,7 @@ def test_without_a_fence_they_come_in(client):
         assert not set(way(client)) <= OUTSIDE, way.__name__
 
 
+@pytest.mark.extended
 def test_tasks_of_the_partition_pass(client):
     parts = enclose(client, **A, **B)
     assert set(parts["A"].map(worker_name, range(20))) == {"A-0", "A-1"}

@@ -38,7 +38,7 @@ def client(start):
     return client
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("way", ["get_client", "worker_client", "compute"])
 def test_at_any_depth_and_on_a_single_slot(client, way):
     names = Partition("A", client).submit(descend, 3, way).result(LONG_S)
@@ -108,6 +108,7 @@ async def coroutine(number=0):
     return number
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("method", ["submit", "map"])
 def test_coroutine_functions_are_refused(client, method):
     arguments = () if method == "submit" else ([1, 2],)

@@ -178,6 +178,7 @@ def not_wait_long(gate):
     return child.result()
 
 
+@pytest.mark.extended
 def test_errors_and_timeouts_give_the_slots_back(start):
     part = one_worker(start, slots=2, nthreads=2)
     assert part.submit(fail_below).result(LONG_S) == 3
@@ -295,6 +296,7 @@ def wait_and_say(gate):
     return worker_name()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("who", ["parent", "child"])
 def test_whoever_dies_while_the_parent_waits(nannies, wait_until, who):
     part = Pool.from_client(nannies).divide({"A": rest()})["A"]
@@ -530,6 +532,7 @@ def test_a_tree_of_waiting_tasks_on_two_workers_ends(start, tree):
     assert tree(client) == 2 ** (LEVELS + 1) - 1
 
 
+@pytest.mark.extended
 def test_with_more_slots_than_threads_tasks_lend_their_thread_again(start):
     """Dask then starts a nested task that has no thread: it waits for that of its parent."""
     client = start({"a": {"resources": {"A": 3}, "nthreads": 1}})

@@ -166,6 +166,7 @@ def test_processes_of_the_user_are_started_as_ever(processes, monkeypatch):
         assert data["name"] == name and data.keys() & {"init_main_from_name", "init_main_from_path"}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("restart", [False, True])
 def test_a_worker_that_is_slow_to_come_back_is_not_given_up(restart):
     """Dask's SpecCluster closes the nanny of a worker that is not back after this time."""

@@ -83,6 +83,7 @@ def task_count(client):
     return len(client.cluster.scheduler.tasks)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("ordered", [True, False])
 def test_each_item_gives_its_result_once(a, ordered):
     for function, count, chunk in ((slow_if_even, 30, 1), (abs, 3000, None), (abs, 0, None)):
@@ -156,6 +157,7 @@ def last_on_task_clock(x):
     return x
 
 
+@pytest.mark.extended
 def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long_ones(
     a, client, monkeypatch, wait_until
 ):
@@ -281,6 +283,7 @@ def test_a_client_that_is_closed_ends_it(client, gate):
         next(results)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("by_another", [False, True])
 def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, ordered):
@@ -333,6 +336,7 @@ WAITED = (
 )
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("by_rule", [False, True])
 def test_a_map_whose_only_worker_left_for_good_ends(start, monkeypatch, by_rule):
     monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
@@ -359,6 +363,7 @@ def test_a_map_waits_again_as_long_after_a_worker_has_come(start, monkeypatch, w
     assert list(results) == [2, 4]
 
 
+@pytest.mark.extended
 def test_a_map_waits_while_the_nanny_starts_the_only_worker(nannies, monkeypatch):
     monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
     part = Pool.from_client(nannies).divide({"A": n_workers(1)})["A"]
@@ -426,6 +431,7 @@ def test_dask_counts_the_bytes_of_results(a, client, wait_until):
     assert [len(result) for result in results] == [10_000_000] * 4
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("chunk", [1, 2, None])
 def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
     results = b.map(twice, a.map(fail_at_3, range(9), chunk=chunk))
@@ -440,7 +446,7 @@ def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
 # -- lost workers ----------------------------------------------------------------------
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended
 @pytest.mark.parametrize("ordered", [True, False])
 def test_a_lost_worker_is_survived(nannies, ordered):
     partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)
@@ -452,6 +458,7 @@ def test_a_lost_worker_is_survived(nannies, ordered):
     assert len(set(pids)) >= 2
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("ordered", [True, False])
 def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordered):
     client = start({"x": {"resources": {"A": 1}}, "y": {"resources": {"A": 1}}})

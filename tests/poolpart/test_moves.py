@@ -199,6 +199,7 @@ def test_a_cluster_that_was_divided_when_it_was_started(start):
     assert set(client.cluster.scheduler.plugins) == plugins
 
 
+@pytest.mark.extended
 def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch):
     parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
     target = members(parts["A"])[0]

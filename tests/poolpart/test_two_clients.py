@@ -107,6 +107,7 @@ def test_one_name(two, both, others):
     assert {worker.name for worker in again.workers} == members
 
 
+@pytest.mark.extended
 def test_the_same_workers_under_different_names(two, both):
     mine, theirs = map(Pool.from_client, two)
     outcomes = both(

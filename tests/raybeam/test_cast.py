@@ -223,6 +223,7 @@ def test_rays_from_absurdly_far_away_give_neither_warnings_nor_what_is_no_number
     assert not np.isnan(cube.cast(far * axes, -axes).distance).any()
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
 def test_any_unit_of_length(caster, shapes, size):
@@ -236,6 +237,7 @@ def test_any_unit_of_length(caster, shapes, size):
     np.testing.assert_allclose(got.distance / size, want.distance, rtol=1e-12)
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1, -1])

@@ -42,6 +42,7 @@ def rays_down(count, tilt, seed=0):
     return origins, np.column_stack([tilt * rng.normal(size=(count, 2)), np.full(count, -1.0)])
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("gap", SHEETS)
 def test_sheets_close_together(same_as_numpy, gap):
@@ -50,6 +51,7 @@ def test_sheets_close_together(same_as_numpy, gap):
         assert hits.hit.sum() > 100
 
 
+@pytest.mark.extended
 def test_limits_at_the_surfaces(same_as_numpy):
     """Limits that are exactly, or nearly, the distance of a hit."""
     mesh = sheets([0.0, 1e-7, 1e-7, 1e-3, 0.5])

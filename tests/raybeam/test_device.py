@@ -75,6 +75,7 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
     np.testing.assert_array_equal(directions.T, to)
 
 
+@pytest.mark.extended
 def test_instances_may_be_counted_as_a_whole(vase):
     one = np.stack([np.arange(vase.instance_count), np.zeros(vase.instance_count)], axis=1)
     counters = one.astype(np.int64), vase.instance_count
@@ -83,6 +84,7 @@ def test_instances_may_be_counted_as_a_whole(vase):
     assert counts.tolist() == [counted.sum()] == [len(hits[0])]
 
 
+@pytest.mark.extended
 def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
     rng = np.random.default_rng(5)
     ray = np.flatnonzero(rng.random(2000) < 0.3).astype(np.uint32)

@@ -72,7 +72,7 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-@pytest.mark.extended(every=15)
+@pytest.mark.extended
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("offset", [0.0, 5e5])
 @pytest.mark.parametrize("kind", ["turned", "mirrored", "uneven", "sheared"])
@@ -118,6 +118,7 @@ def test_embree_has_the_bits_of_numpy(forest):
     assert differ.sum() <= 3
 
 
+@pytest.mark.extended
 def test_scans_and_tallies_of_many_instances(backend, shapes):
     """2,000 instances of two meshes, cast as a scan and ray by ray."""
     rng = np.random.default_rng(6)
@@ -192,6 +193,7 @@ def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest
     same(caster.cast(origins, directions), after)
 
 
+@pytest.mark.extended
 def test_closed_meshes_do_not_leak(exact_backend, shapes):
     """Rays from inside an instance at the corners and edges of its mesh."""
     rng = np.random.default_rng(10)
@@ -222,6 +224,7 @@ def test_an_instance_without_a_transform_is_its_mesh(backend, shapes):
         alone.move(0, np.eye(4))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_meshes_much_smaller_and_larger_than_the_scene(exact_backend, shapes, scale):
     """The scene is 1 km across; a ray's answer depends on the mesh that it meets."""

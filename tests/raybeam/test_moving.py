@@ -180,6 +180,7 @@ def test_hits_of_a_million_rays(kind):
     assert listed(hits) == by_all(moving, scan, times)
 
 
+@pytest.mark.extended(every=3)
 def test_only_hits_before_what_stands_there_count(backend):
     scan, times, _ = scans("fan")
     moving = Bodies(24, 1).moving(backend)

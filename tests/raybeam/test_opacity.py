@@ -86,6 +86,7 @@ def test_embree_has_the_bits_of_numpy(shapes):
         assert differ.sum() <= 2
 
 
+@pytest.mark.extended
 def test_a_mask_that_is_true_everywhere_changes_no_bit(backend, shapes):
     vertices, faces = shapes["vase"](20, 20)
     uv = np.random.default_rng(5).normal(size=(len(faces), 3, 2))
@@ -103,6 +104,7 @@ def test_a_mask_that_is_true_everywhere_changes_no_bit(backend, shapes):
             assert not hits.hit.any()
 
 
+@pytest.mark.extended(every=3)
 def test_meshes_that_share_a_mask_keep_it_once(backend):
     mask = np.random.default_rng(6).random((64, 64)) < 0.5
     uv = SQUARE[HALVES][:, :, :2]

@@ -51,6 +51,7 @@ def found(caster, directions, order, **options):
     return distance, triangle
 
 
+@pytest.mark.extended
 def test_neighbours_have_no_effect(mesh):
     directions = lidar()
     rng = np.random.default_rng(2)
@@ -67,7 +68,7 @@ def test_neighbours_have_no_effect(mesh):
     np.testing.assert_array_equal(got.triangle, want[1][few])
 
 
-@pytest.mark.extended(every=3)
+@pytest.mark.extended
 @pytest.mark.parametrize("limits", [(0.0, np.inf), (0.7, 1.5)])
 def test_embree_has_the_bits_of_numpy(mesh, limits):
     directions = lidar()

@@ -15,7 +15,7 @@ def grid(rings, firings, fov_deg, *, sector_deg=360.0):
     return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1)
 
 
-@pytest.mark.extended(every=7)
+@pytest.mark.extended
 @pytest.mark.parametrize("fov_deg", [0.4, 10.0, 33.2, 120.0])
 @pytest.mark.parametrize("firings", [36, 360, 1024, 1800])
 @pytest.mark.parametrize("rings", [4, 5, 8, 16, 31, 64, 100, 128, 255, 256])

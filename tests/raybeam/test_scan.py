@@ -155,7 +155,7 @@ def test_rays_are_those_of_the_interface(caster, shapes, name):
 CUT = ["one pose", "a pose each ray", "firings, lever arms", "on the move, lever arms"]
 
 
-@pytest.mark.extended(every=12)
+@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("name", CUT)
 def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
@@ -168,6 +168,7 @@ def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
         same(scanned(vase, case, (700, 2700), t_min=0.5, t_max=2), whole)
 
 
+@pytest.mark.extended
 def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
     vase = caster(*shapes["vase"]())
     case = case_of("firings")

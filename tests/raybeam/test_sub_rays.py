@@ -52,7 +52,7 @@ def poses(rng, kind, rays):
     return {**many, "rays_per_pose": 49, "motion": motion if kind == "moves" else None}
 
 
-@pytest.mark.extended(every=20)
+@pytest.mark.extended
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])
@@ -113,6 +113,7 @@ def test_offsets_add_to_the_angles_of_each_beam():
     assert np.array_equal(moved_directions, expected_directions)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])
 def test_sub_rays_hit_what_moves(shapes, kind):
     pytest.importorskip("numba")

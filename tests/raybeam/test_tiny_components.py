@@ -101,7 +101,7 @@ def test_rays_that_start_outside(backend, shapes):
     check(backend, [Instance(mesh)], [30.0, 0.1, -0.2], directions, all_hit=False)
 
 
-@pytest.mark.extended(keep=("embree-*",))
+@pytest.mark.extended
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_rays_at_an_instance(backend, shapes, name):
     check(backend, [instance(Mesh(*shapes["sphere"]()), name)], ORIGIN, packets(60))
@@ -167,7 +167,7 @@ def test_rays_at_moving_bodies(backend, shapes):
         np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))
 
 
-@pytest.mark.extended(keep=("embree-*",))
+@pytest.mark.extended
 @pytest.mark.parametrize("count", [1, 2, 5, 16, 19])
 def test_few_rays(backend, shapes, count):
     directions = packets(2, 4)[:count]

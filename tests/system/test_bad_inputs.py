@@ -311,6 +311,7 @@ ANOTHER_PYTHON = "import platform; platform.python_version = lambda: '3.99.1'"
 OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345678'"
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("preload", "message"),
     [

@@ -675,6 +675,7 @@ LOST = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.slow(keep=("half of it",))
 @pytest.mark.parametrize("lost", LOST)
 def test_finished_jobs_are_known_without_the_database(client, here, unwritten, lost):
