@@ -41,12 +41,11 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.export import las as las_module
-from lidarpool.export import parquet, pieces
+from lidarpool.export import parquet, pieces, well_known_text
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.export.formats import Format
-from lidarpool.export.las import wkt
+from lidarpool.export.well_known_text import wkt
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
@@ -547,11 +546,11 @@ def test_zones_of_utm_need_no_other_package(epsg, middle, north):
 
 
 def test_other_coordinate_systems_come_from_rasterio(monkeypatch):
-    if las_module.find_spec("rasterio"):
+    if well_known_text.find_spec("rasterio"):
         assert wkt(2056).startswith('PROJCS["CH1903+ / LV95"')
         with pytest.raises(LidarError, match="rasterio cannot write EPSG:1024 as WKT 1"):
             wkt(1024)
-    monkeypatch.setattr(las_module, "find_spec", lambda name: None)
+    monkeypatch.setattr(well_known_text, "find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r"EPSG:2056 is not a UTM zone .*lidarpool\[geo\]"):
         wkt(2056)
 

@@ -521,7 +521,7 @@ def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
-        survey = build(scenario(f"cloud: {{epsg: 25832, start: {text}}}")).survey
+        survey = build(scenario(f"world: {{epsg: 25832}}\ncloud: {{start: {text}}}")).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
@@ -537,7 +537,11 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         (7415, [84_600, 447_000, 0], ""),
         (3857, [0, 0, 0], r"Pseudo-Mercator\), for maps of the world"),
         (3395, [1_000_000, 6_000_000, 0], "for maps of the world"),
-        (2056, [0, 0, 0], r"metre is 0\.983 m long at x 0, y 0, where the scene is \(translation"),
+        (
+            2056,
+            [0, 0, 0],
+            r"metre is 0\.983 m long at x 0, y 0, where the scene is \(world\.origin",
+        ),
         (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true metres"),
         (2263, [0, 0, 0], "which is not in metres"),
         (4326, [8, 47, 0], "which is not in metres"),
@@ -546,13 +550,13 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
 def test_the_coordinate_system_has_true_metres(tmp_path, epsg, place, words):
     mesh_file(tmp_path / "hall.stl", (8, 6, 2), 2)
     entries = [{"file": "hall.stl", "up_axis": "z", "translation": place}]
-    data = {"scene": {"files": entries}, "cloud": {"epsg": epsg}}
+    data = {"scene": {"files": entries}, "world": {"epsg": epsg}}
     scenario = Scenario.from_data(data, folder=tmp_path)
     if not words:
         assert build(scenario).survey.epsg == epsg
         return
     with pytest.raises(
-        LidarError, match=rf"cloud\.epsg \(in Python epsg=\) is EPSG:{epsg}.*{words}"
+        LidarError, match=rf"world\.epsg \(in Python epsg=\) is EPSG:{epsg}.*{words}"
     ):
         build(scenario)
     if epsg == 2056:

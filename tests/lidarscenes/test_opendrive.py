@@ -552,7 +552,7 @@ def test_stretched_metres_are_noted_with_the_scale_that_helps(tmp_path, system):
     assert "whose metre is 0.67" in note
     scale, again = re.search(r"here: scale \[(0\.67\d+), (0\.67\d+), 1\] makes", note).groups()
     assert scale == again and float(scale) == pytest.approx(0.678, abs=1e-3)
-    assert "cloud.epsg" not in note
+    assert "world.epsg" not in note
 
 
 def test_unknown_elements_are_named_once(tmp_path):

@@ -183,7 +183,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     row = (-34.5 - latitude) * 1200
     np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=0.3)
     wide = write(tmp_path / "wide.tif", crs="EPSG:4326", place=from_origin(-10, 50, 5, 1))
-    with pytest.raises(LidarError, match=r"spans 40 degrees.*give cloud\.epsg"):
+    with pytest.raises(LidarError, match=r"spans 40 degrees.*give world\.epsg"):
         read(wide)
     assert read(wide, epsg=3035)[1].epsg == 3035
     with pytest.raises(LidarError, match="EPSG:1024, a code that rasterio does not know"):
@@ -338,10 +338,10 @@ def test_options_of_others_are_refused(tmp_path):
         read(complex_one)
 
 
-def epsg_of(folder, *files, **cloud):
-    scenario = Scenario.from_data(
-        {"scene": {"files": [*files]}, "cloud": {"precision_m": 0.001, **cloud}}, folder=folder
-    )
+def epsg_of(folder, *files, **world):
+    cloud = {"precision_m": 0.001}
+    data = {"scene": {"files": [*files]}, "world": world, "cloud": cloud}
+    scenario = Scenario.from_data(data, folder=folder)
     return build(scenario).survey.epsg
 
 
@@ -393,7 +393,7 @@ def test_true_metres_stay_and_chosen_ones_are_checked(tmp_path):
     path = write(tmp_path / "m.tif", crs="EPSG:3857", place=from_origin(1e6, 6e6, 2, 2))
     assert read(path, epsg=25832)[1].epsg == 25832
     for epsg, message in (
-        (3857, r"cannot be brought to EPSG:3857 \(.*maps of the world.*cloud\.epsg"),
+        (3857, r"cannot be brought to EPSG:3857 \(.*maps of the world.*world\.epsg"),
         (3395, "maps of the world"),
         (3994, r"EPSG:3994 \(.*\), whose metre is 0\.898 m long.*EPSG:32632 has true metres"),
     ):
@@ -404,7 +404,7 @@ def test_true_metres_stay_and_chosen_ones_are_checked(tmp_path):
 def test_a_wide_raster_of_stretched_metres_asks_for_a_system(tmp_path):
     place = from_origin(1e6, 6e6, 300_000, 50_000)
     path = write(tmp_path / "m.tif", crs="EPSG:3857", place=place)
-    with pytest.raises(LidarError, match=r"spans 21\.\d+ degrees.*give cloud\.epsg"):
+    with pytest.raises(LidarError, match=r"spans 21\.\d+ degrees.*give world\.epsg"):
         read(path)
     _, taken, notes = read(path, epsg=3035)
     assert taken.epsg == 3035 and notes == []

@@ -29,6 +29,7 @@ from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
+from .shared_options import world_lines
 from .terminal import Terminal
 
 FORECAST_JOBS = 5  # of a campaign
@@ -223,6 +224,7 @@ def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
     spans = ", ".join(f"{axis} {lower:,.2f} to {upper:,.2f}" for axis, lower, upper in sides)
     lengths = " x ".join(f"{upper - lower:,.2f}" for _, lower, upper in sides)
     yield f"size        {lengths} m; {spans}"
+    yield from world_lines(figures["epsg"], figures["world_origin"])
     if masked := figures["masked"]:
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
         have = plural(len(masked), "object has masks", "objects have masks")

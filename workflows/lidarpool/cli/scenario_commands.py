@@ -610,7 +610,9 @@ def stations(
     notes = advice(replace(built, placing=Placing(())))  # stations replace its poses
     notes += _shortfalls(plan, count, coverage)
     figures = _plan_figures(plan, built.scene.names, sensor.model, notes)
-    lines = [*_plan_lines(plan, built.scene.names), *(f"note: {note}" for note in notes)]
+    figures |= {"epsg": built.survey.epsg, "world_origin": [*scenario.world.origin]}
+    lines = [*_plan_lines(plan, built.scene.names)]
+    lines += options.world_lines(built.survey.epsg, scenario.world.origin)
     options.show(figures, lines, as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
@@ -643,9 +645,11 @@ def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: Stati
     named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
     for file_entry in filter(None, named):
         file_entry["file"] = relative(scenario.path(file_entry["file"]))
+    world = scenario.world.model_dump(exclude_unset=True, mode="json")
     is_file = model.endswith((".yaml", ".yml"))
     data = {
         **({"scene": entry} if entry else {}),
+        **({"world": world} if world else {}),
         "sensor": {"model": relative(Path(model)) if is_file else model},
         "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
         "steps": 36,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, reduce, wraps
 from itertools import chain
 from pathlib import Path
@@ -180,6 +180,16 @@ def scheduler(command: Command) -> Command:
     return click.option(
         "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
     )(with_files)
+
+
+def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
+    """Yield a line on the coordinate system of what is written, and on its origin."""
+    if epsg is None and not any(origin):
+        return
+    system = "no EPSG code" if epsg is None else f"EPSG:{epsg}"
+    added = ", ".join(f"{value:,.12g}" for value in origin)
+    moved = f"; ({added}) m is added to the scenario's coordinates" if any(origin) else ""
+    yield f"world       {system}{moved}"
 
 
 def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:

@@ -19,6 +19,7 @@ from lidarsim.columns.table import COLOURS, NORMAL
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
+from .well_known_text import wkt
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
@@ -27,12 +28,15 @@ _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write each sweep that has points, in the sensor frame: pose, intensity, colours, normals.
 
+    Poses are in the world, whose coordinate system is stored as WKT.
+
     Normals are in the extension for surface normals; 0, 0, 0 without a surface.
     """
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
     normals = {*NORMAL} <= {column.name for column in cloud.table}
-    file_class, fields = (_WithNormals, _normal_fields) if normals else (pye57.E57, nullcontext)
-    with _named_by(content), fields(), file_class(str(path), mode="w") as file:
+    file_class, fields = (_WithNormals, _normal_fields) if normals else (_File, nullcontext)
+    system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
+    with _named_by(content), fields(), file_class(path, system) as file:
         if normals:
             file.image_file.extensionsAdd("nor", _NORMALS_URI)
         try:
@@ -62,7 +66,32 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
     )
 
 
-class _WithNormals(pye57.E57):
+class _File(pye57.E57):
+    """A new file whose header states a coordinate system, which pye57 leaves empty."""
+
+    def __init__(self, path: Path, system: str) -> None:
+        self._system = system
+        self._in_header = False
+        super().__init__(str(path), mode="w")
+
+    def write_default_header(self) -> None:
+        """Write the header, with the system as its coordinateMetadata."""
+        self._in_header = True
+        super().write_default_header()
+        self._in_header = False
+
+    @property
+    def root(self) -> Any:
+        """Root of the file; while the header is written, an object that takes its fields."""
+        return SimpleNamespace(set=self._set_field) if self._in_header else super().root
+
+    def _set_field(self, name: str, node: Any) -> None:
+        if name == "coordinateMetadata":  # no field can be set twice
+            node = libe57.StringNode(self.image_file, self._system)
+        super().root.set(name, node)
+
+
+class _WithNormals(_File):
     """A file whose scans have normals, which pye57 leaves out."""
 
     def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:

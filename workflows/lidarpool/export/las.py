@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 from datetime import UTC, date, datetime
 from functools import partial
-from importlib import import_module
-from importlib.util import find_spec
 from os import SEEK_END
 from pathlib import Path
 from shutil import copyfileobj
 from struct import Struct
 from tempfile import TemporaryFile
 from textwrap import shorten
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import laspy
 import lazrs
@@ -21,7 +19,6 @@ import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
@@ -29,6 +26,7 @@ from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 from .flight_lines import FlightLines
+from .well_known_text import wkt
 
 ANGLE_DEG = 0.006  # step of the format's scan angle
 FULL_INTENSITY = 65_535  # the format's intensity for 1 and above
@@ -49,27 +47,8 @@ _WAVES = Struct("<QQI")
 _MAX_VLR_BYTES = 65_535  # of a variable length record
 _TEXT_AREA = 3  # number of the record with a description in words
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
+_ON_GRID = 0.1  # share of the precision by which positions in single precision may be beside it
 _MAX_STEPS = 2**31 - 1  # steps of precision from the offset to the farthest point
-
-
-class _Geodetic(NamedTuple):
-    """A geodetic coordinate system with UTM zones."""
-
-    name: str
-    datum: str
-    ellipsoid: str
-    inverse_flattening: float
-    codes: tuple[int, int, int]  # EPSG codes of system, datum and ellipsoid
-
-
-_WGS84 = _Geodetic("WGS 84", "WGS_1984", "WGS 84", 298.257223563, (4326, 6326, 7030))
-_ETRS89 = _Geodetic(
-    "ETRS89",
-    "European_Terrestrial_Reference_System_1989",
-    "GRS 1980",
-    298.257222101,
-    (4258, 6258, 7019),
-)
 
 
 def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
@@ -168,6 +147,10 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
     lower, upper = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, precision_m)
     header.offsets = np.floor((lower + upper) / 2)
+    # Steps from whole metres may miss the grid of the points, as of a world origin of millimetres.
+    steps = (lower - header.offsets) / precision_m
+    beside = (steps - np.round(steps)) * precision_m
+    header.offsets += np.where(np.abs(beside) > _ON_GRID * precision_m, beside, 0.0)
     if np.abs(np.stack([lower, upper]) - header.offsets).max() / precision_m > _MAX_STEPS:
         raise LidarError(
             f"{name} holds 2^32 steps of {precision_m} m along an axis, "
@@ -272,54 +255,3 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
 def _name(name: str) -> str:
     """Return the name in the extra bytes of a column that has a name in files."""
     return _NAMES.get(name, name[:32])
-
-
-def wkt(epsg: int) -> str:
-    """Return the WKT 1 of an EPSG code: of UTM zones of WGS 84 and ETRS89, or through rasterio.
-
-    Raises
-    ------
-    LidarError
-        If rasterio is missing, or knows no such system.
-    """
-    zone = epsg % 100
-    if epsg // 100 in (326, 327) and 1 <= zone <= 60:
-        return _utm(epsg, zone, epsg // 100 == 327, _WGS84)
-    if 25828 <= epsg <= 25838:
-        return _utm(epsg, zone, False, _ETRS89)
-    if find_spec("rasterio") is None:
-        raise LidarError(
-            f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need rasterio: "
-            f"{install_command('lidarpool[geo]')}."
-        )
-    crs = import_module("rasterio.crs")
-    try:
-        return str(crs.CRS.from_epsg(epsg).to_wkt(version="WKT1_GDAL"))
-    except crs.CRSError as error:
-        raise LidarError(f"rasterio cannot write EPSG:{epsg} as WKT 1: {error}.") from error
-
-
-def _utm(epsg: int, zone: int, south: bool, system: _Geodetic) -> str:
-    """Return the WKT 1 of a UTM zone."""
-
-    def code(number: int) -> str:
-        return f'AUTHORITY["EPSG","{number}"]'
-
-    geographic_code, datum_code, ellipsoid_code = map(code, system.codes)
-    flattening = system.inverse_flattening
-    spheroid = f'SPHEROID["{system.ellipsoid}",6378137,{flattening},{ellipsoid_code}]'
-    values = {
-        "latitude_of_origin": 0,
-        "central_meridian": zone * 6 - 183,
-        "scale_factor": 0.9996,
-        "false_easting": 500_000,
-        "false_northing": 10_000_000 if south else 0,
-    }
-    parameters = ",".join(f'PARAMETER["{key}",{value}]' for key, value in values.items())
-    return (
-        f'PROJCS["{system.name} / UTM zone {zone}{"S" if south else "N"}",'
-        f'GEOGCS["{system.name}",DATUM["{system.datum}",{spheroid},{datum_code}],'
-        f'PRIMEM["Greenwich",0,{code(8901)}],UNIT["degree",0.0174532925199433,{code(9122)}],'
-        f'{geographic_code}],PROJECTION["Transverse_Mercator"],{parameters},'
-        f'UNIT["metre",1,{code(9001)}],AXIS["Easting",EAST],AXIS["Northing",NORTH],{code(epsg)}]'
-    )

@@ -47,6 +47,7 @@ class Pieces(pieces.Pieces):
         ]
         objects = "\n".join(sweeps.all_names)  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
+        words |= {} if sweeps.epsg is None else {"crs": f"EPSG:{sweeps.epsg}"}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
         if any(column.name == "material" for column in cloud.table):
             words |= {"materials": json.dumps(sweeps.materials)}

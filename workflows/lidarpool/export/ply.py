@@ -36,7 +36,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     About a million points are in memory at a time. float64 positions are stored in single precision
     if the error is below a twentieth of the precision of the sweeps, else in double. Names of
     classes and materials are comments: `class 40 road`, `material 0 Brick`. A comment says if
-    points are not in the world frame.
+    points are not in the world frame, and which coordinate system the world has: `crs: EPSG:25832`.
     """
     position_type = real_type(cloud.bounds, sweeps.precision_m)
     with GrowingPly(path, cloud.table, position_type, sweeps, len(cloud)) as file:
@@ -194,6 +194,8 @@ class GrowingPly:
 def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
     """Return the lines of a header that lidarpool adds to those of Open3D."""
     comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
+    if sweeps.epsg is not None and sweeps.coordinates == "world":
+        comments += f"comment crs: EPSG:{sweeps.epsg}\n"
     comments += "".join(f"comment class {n} {name}\n" for n, name in sweeps.classes.items())
     if any(column.name == "material" for column in table):
         names = enumerate(map(_comment, sweeps.materials))

@@ -144,6 +144,8 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "objects": len(scene.all_names),
         "triangles": scene.triangles,
         "origin": scene.origin.tolist(),
+        "epsg": survey.epsg,
+        "world_origin": scene.world_origin.tolist(),
         "sensor": sensors[0],
         "sensors": {
             mounted.name: sensor

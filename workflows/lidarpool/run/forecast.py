@@ -132,6 +132,8 @@ def forecast(
         "masked": list(job.scene.masked),
         "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
         "bounds": (job.scene.bounds + job.scene.origin).tolist(),
+        "epsg": job.survey.epsg,
+        "world_origin": job.scene.world_origin.tolist(),
         "poses": job.survey.path.stations,
         "drive": _drive(job.survey),
         "scans": job.survey.scan_count,

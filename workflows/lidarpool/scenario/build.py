@@ -205,8 +205,8 @@ def _build(
     shapes = Shapes(scenario, findings)
     epsg = _common_epsg(scenario, findings)
     with prefixed(scenario.source):  # errors begin with the scenario's name
-        if scenario.cloud.epsg is not None:
-            check_epsg(scenario.cloud.epsg, scene)
+        if scenario.world.epsg is not None:
+            check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
         track = _carrier_track(shapes, static.standing)
         sensors = _mounted_sensors(shapes)
     placing: Placing | None = None
@@ -243,7 +243,8 @@ class Built:
     scenario
         The scenario that was built.
     scene, survey, planning
-        In the scene's local coordinates; the planning is None if the scenario asks for none.
+        In the scene's local coordinates; the planning is None if the scenario asks for none. The
+        world coordinates of the scene are those of the scenario, without `world.origin`.
     placing
         Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
         or a trajectory, or has the default objects.
@@ -261,10 +262,12 @@ class Built:
     def job(self, **fields: Any) -> Job:
         """Return scene, survey and planning as a job with further fields, such as `name`.
 
-        Results always have a PLY, so that PLY is not among the job's outputs.
+        The job's scene is where `world.origin` places it. Results always have a PLY, so that PLY is
+        not among the job's outputs.
         """
         outputs = tuple(entry for entry in self.scenario.output.write if entry.format != "ply")
-        return Job(self.scene, self.survey, self.planning, outputs=outputs, **fields)
+        scene = self.scene.georeferenced(self.scenario.world.origin)
+        return Job(scene, self.survey, self.planning, outputs=outputs, **fields)
 
 
 class _SurveyParts(NamedTuple):
@@ -359,23 +362,31 @@ def check_epsg(epsg: int, scene: Scene) -> None:
     """
     lower, upper = scene.bounds + scene.origin
     x, y, _ = ((lower + upper) / 2).tolist()
-    why_there = ", where the scene is (translation moves it)"
+    why_there = ", where the scene is (world.origin moves it)"
     if problem := target_problem(epsg, x, y, why_there=why_there):
-        raise LidarError(f"cloud.epsg (in Python epsg=) is {problem}.")
+        raise LidarError(f"world.epsg (in Python epsg=) is {problem}.")
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
     """Return the EPSG code of the rasters whose placement keeps x and y, or None.
 
-    LidarError if the coordinate systems of these rasters differ.
+    LidarError if the coordinate systems of these rasters differ, or `world.origin` would move them.
     """
     unmoved = [(e.file, raster) for e, raster in findings.rasters if e.transform().keeps_xy]
     systems = {raster.crs: file for file, raster in unmoved if raster.crs}
+    x, y, _ = scenario.world.origin
+    if systems and (x or y):
+        crs, file = next(iter(systems.items()))
+        raise LidarError(
+            f"{scenario.source}: world.origin would be added to {file} as well, whose coordinates "
+            f"are those of {crs[:60]} already: give the file translation: [{-x:.12g}, {-y:.12g}, "
+            "0], or leave out world.origin."
+        )
     if len(systems) > 1:
         listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
         raise LidarError(
             f"{scenario.source}: rasters of one scene have several coordinate systems: "
-            f"{listed}. Give cloud.epsg, the code of the one that all of them are brought to."
+            f"{listed}. Give world.epsg, the code of the one that all of them are brought to."
         )
     return next((raster.epsg for _, raster in unmoved if raster.crs), None)
 
@@ -609,7 +620,6 @@ def _build_survey(
     format_columns = scenario.output.needs
     cloud = declared(scenario.cloud, CloudOptions)
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
-    cloud["epsg"] = scenario.cloud.epsg or parts.epsg
     if scenario.scene.has_seed:
         cloud["keep_every"] = cloud["keep_every"] or (
             1 if "ray" in format_columns else SEED_KEEP_EVERY
@@ -634,6 +644,7 @@ def _build_survey(
         noise=Noise() if all_have_noise else Noise(**dict(scenario.noise)),
         navigation=scenario.navigation,
         faults=scenario.faults,
+        epsg=scenario.world.epsg or parts.epsg,
         **declared(scenario.weather, Weather),
         **cloud,
     )

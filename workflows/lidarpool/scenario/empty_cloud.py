@@ -30,6 +30,7 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are the
     scans that were cast, by default all.
     """
+    scene = scene.georeferenced((0, 0, 0))  # poses that the reason names are the scenario's
     if survey.scan_count == 0 or (scans is not None and not len(scans)):
         return "no scan was cast"
     if scene.triangles > MAX_TRIANGLES:
@@ -103,6 +104,6 @@ def _span(ranges: Floats) -> str:
 
 
 def _start(scene: Scene, survey: Survey) -> str:
-    """Return the first position of the sensor in words, world coordinates."""
+    """Return the first position of the sensor in words, in the coordinates of the scenario."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

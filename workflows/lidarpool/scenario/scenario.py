@@ -40,6 +40,7 @@ from .sections import (
     SceneSection,
     Section,
     SensorSection,
+    WorldSection,
     may_be_empty,
     scene_in_short,
 )
@@ -91,11 +92,11 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, sensor, materials, returns, noise, weather, navigation, faults, cloud, output, \
+    scene, world, sensor, materials, returns, noise, weather, navigation, faults, cloud, output, \
     planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Poses of the sensor, in world coordinates. By default the sensor is at the origin (default
+        Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files chosen by `place_sensor`: in the
         middle of a room or landscape, or around an object.
     steps, classes
@@ -108,13 +109,14 @@ class Scenario(Section):
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
+    world: Annotated[WorldSection, may_be_empty(WorldSection)] = WorldSection()
     sensor: Annotated[
         SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
     ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
-            "poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
+            "poses of the sensor in the scene, metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
             "ceiling, or around an object that is no place to stand in",
             [[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}],
@@ -290,6 +292,12 @@ class Scenario(Section):
             )
         if self.sensors and (self.sensor != SensorSection() or self.mount):
             yield "give either sensor and mount, or sensors, each with a mount."
+        gnss = self.navigation and self.navigation.gnss
+        if gnss and gnss.origin is not None and any(self.world.origin):
+            yield (
+                "navigation.gnss.origin is where the world's zero is, and world.origin moves the "
+                "survey away from it: give world.epsg in place of navigation.gnss.origin."
+            )
 
     def _planning_contradictions(self) -> Iterator[str]:
         """Yield the reasons why the planning lacks a start or target."""

@@ -38,6 +38,7 @@ from lidarsim.sensor.beams import Rate, Step
 from lidarsim.sensor.materials import SemanticClass
 from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor
 from lidarsim.sensor.packet_settings import Identifier
+from lidarsim.sensor.survey import EpsgCode
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 
 from ..export.formats import Format
@@ -380,6 +381,35 @@ class SceneSection(Section):
     def has_seed(self) -> bool:
         """Whether the scene has the six default objects."""
         return self.preset == "seed" or (self.preset is None and not (self.files or self.copies))
+
+
+class WorldSection(Section):
+    """Coordinate system of what is written, and the place of the survey in it.
+
+    Scene, poses, trajectories and plans stay in the coordinates of the scenario: `origin` is added
+    to points and poses as they are written.
+    """
+
+    epsg: Annotated[
+        EpsgCode | None,
+        about(
+            "EPSG code of the coordinate system, which files of clouds state and rasters are "
+            "converted to; by default the rasters'",
+            25832,
+        ),
+    ] = None
+    origin: Annotated[
+        Triple,
+        short(
+            lambda v: isinstance(v, (list, tuple)) and len(v) == 2,
+            lambda v: [*v, 0.0],
+            Pair | Triple,
+        ),
+        about(
+            "where the scenario's zero is in that system: x and y (east and north), perhaps z, "
+            "metres"
+        ),
+    ] = (0, 0, 0)
 
 
 class PacketSection(Section):

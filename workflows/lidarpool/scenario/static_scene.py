@@ -141,7 +141,7 @@ def _key(scenario: Scenario) -> object:
         scenario.path(""),
         scenario.coloured,
         scenario.names_materials,
-        scenario.cloud.epsg,
+        scenario.world.epsg,
     )
     return section.model_dump_json(), *reading_options, states
 
@@ -262,7 +262,7 @@ class Shapes:
             transform=transform,
             colours=scenario.coloured,
             materials=scenario.names_materials,
-            epsg=scenario.cloud.epsg,
+            epsg=scenario.world.epsg,
             assets=self._assets_of(entry),
             animation=animation,
             tell=findings.notes.append,

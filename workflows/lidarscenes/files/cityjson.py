@@ -403,7 +403,7 @@ class _System:
             ]
         if self.epsg is None:
             return [f"is in {self.name}, which is not used"] if self.name else []
-        return [f"is in EPSG:{self.epsg}: <cloud.epsg={self.epsg}> writes that to LAS"]
+        return [f"is in EPSG:{self.epsg}: <world.epsg={self.epsg}> writes that to LAS"]
 
 
 def _looks_like_angles(corners: Floats) -> bool:

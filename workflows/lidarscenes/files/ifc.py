@@ -21,7 +21,7 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.extras import install_command
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
-from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem
+from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -252,7 +252,7 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
     if not (any(conversion["offset"]) or turn or abs(scale - 1) > 1e-9):
         if problem := scale_problem(system, *middle.tolist()) if epsg else "":
             return [f"is in {system}, {problem}"]
-        return [f"is in EPSG:{epsg[1]}: <cloud.epsg={epsg[1]}> writes that to LAS"] if epsg else []
+        return [f"is in EPSG:{epsg[1]}: <world.epsg={epsg[1]}> writes that to LAS"] if epsg else []
     if problem := scale_problem(system, x, y, in_system=False) if epsg else "":
         where += f", {problem}, unlike that of the building"
     moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
@@ -261,6 +261,8 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
     if abs(scale - 1) > 1e-9:
         moves.append(f"scale {scale:.9g}")
     verb = "moves" if len(moves) == 1 else "move"
+    all_of_it = "" if moves[1:] else f"; {world_advice(x, y, z)}"
     return [
         f"has a map conversion, which is not applied: {' and '.join(moves)} {verb} it into {where}"
+        f"{all_of_it}"
     ]

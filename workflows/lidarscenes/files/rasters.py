@@ -322,7 +322,7 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
         with suppress(Exception):  # errors of GDAL have classes that rasterio keeps private
             place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
     if problem := target_problem(epsg, *place.tolist()):
-        raise MeshFileError(f"cannot be brought to {problem} (cloud.epsg)")
+        raise MeshFileError(f"cannot be brought to {problem} (world.epsg)")
     return target
 
 
@@ -338,7 +338,7 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
     width_deg = _width_deg(source)
     if width_deg > _WIDEST_DEG and code not in POLAR_EPSG:
         raise MeshFileError(
-            f"spans {width_deg:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of "
+            f"spans {width_deg:.4g} degrees, too wide for a UTM zone: give world.epsg, the code of "
             "a projection in metres"
         )
     return crs_of_code(code)

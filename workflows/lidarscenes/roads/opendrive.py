@@ -17,7 +17,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colours import Colours
-from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem
+from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -207,13 +207,15 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
             moves.append(f"rotation_deg [0, 0, {np.degrees(heading):.9g}]")
         verb = "move" if heading else "moves"
         where = system if text else "its coordinate system"
+        all_of_it = "" if heading else f"; {world_advice(x, y, z)}"
         return [
             f"has an offset, which is not applied: {' and '.join(moves)} {verb} it into {where}"
+            f"{all_of_it}"
         ]
     if problem:
         return [f"is in {system}"]
     if epsg:
-        return [f"is in EPSG:{epsg}: <cloud.epsg={epsg}> writes that to LAS"]
+        return [f"is in EPSG:{epsg}: <world.epsg={epsg}> writes that to LAS"]
     if text:
         return [f"is in {system}, which is not used"]
     return []

@@ -69,11 +69,11 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
 
 _LAST_NUMBER = re.compile(r"[\s._-]*\d+$")
 # A setting in a note, and the calls of Python that take the settings of a section.
-_SETTING = re.compile(r'<(file|scene|cloud|materials)\.(\w+)=("?)(\w+)\3>')
+_SETTING = re.compile(r'<(file|scene|world|materials)\.(\w+)=("?)(\w+)\3>')
 _CALLS = {
     "file": "Scene.load(path",
     "scene": "Scene.load(path",
-    "cloud": "Survey(…",
+    "world": "Survey(…",
     "materials": "Material(…",
 }
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
@@ -59,7 +60,10 @@ class Scene:
     names
         Names of the static objects, without duplicates; an object's number is its index.
     origin
-        float64 (3,), whole metres.
+        float64 (3,), whole metres, plus `world_origin`.
+    world_origin
+        float64 (3,), metres: what `georeferenced` has added to `origin`. Without it, world
+        coordinates are those of the scene's files.
     actors
         Moving objects, numbered after the static objects; their meshes are not in `faces`.
     instances
@@ -86,6 +90,7 @@ class Scene:
     instances: Instances | None = None
     colours: Colours | None = None
     materials: ObjectMaterials | None = None
+    world_origin: Floats = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -113,6 +118,7 @@ class Scene:
         faces = np.ascontiguousarray(as_array("faces", self.faces, np.int32))
         owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
+        world_origin = _world_position(self.world_origin)
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
             raise LidarError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
         if not are_indices(faces, len(vertices)):
@@ -122,7 +128,8 @@ class Scene:
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
             )
-        arrays = {"vertices": vertices, "faces": faces, "face_object": owners, "origin": origin}
+        arrays = {"vertices": vertices, "faces": faces, "face_object": owners}
+        arrays |= {"origin": origin, "world_origin": world_origin}
         for name, array in arrays.items():
             # A read-only array is already another scene's: both keep the same Python object.
             if array.flags.writeable:
@@ -338,6 +345,23 @@ class Scene:
         object.__setattr__(scene, "actors", actors)
         return scene
 
+    def georeferenced(self, world_origin: ArrayLike) -> Scene:
+        """Return the same scene at another place of the world.
+
+        Local coordinates stay, and so do the poses of surveys; points that are written have
+        `world_origin` (3,), metres, added to the coordinates of the scene's files. Zero undoes it.
+
+        Examples
+        --------
+        >>> Scene.seed().georeferenced((500_000, 5_400_000, 0)).origin.tolist()
+        [500000.0, 5400000.0, 0.0]
+        """
+        added = _world_position(world_origin)
+        scene = copy(self)
+        object.__setattr__(scene, "origin", self.origin - self.world_origin + added)
+        object.__setattr__(scene, "world_origin", added)
+        return scene
+
     def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Scene:
         """Return the same scene with instances `rows` (m,) at other poses.
 
@@ -500,6 +524,7 @@ class Scene:
             np.append(self.face_object, owners),
             self.all_names,
             self.origin,
+            world_origin=self.world_origin,
             colours=join_colours([self.colours, *(mesh.colours for mesh in meshes)], sizes),
         )
 
@@ -603,6 +628,15 @@ class Scene:
         if (instances := self.instances) is not None:
             np.maximum.at(reach, instances.owner, instances.reach(centres[instances.owner]))
         return np.column_stack([centres, reach])
+
+
+def _world_position(value: ArrayLike) -> Floats:
+    """Return a position (3,) as read-only float64; LidarError if it is none."""
+    position = np.array(as_array("world_origin", value))
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise LidarError(f"world_origin is {shown(value)}; it must be x, y and z in metres.")
+    position.flags.writeable = False
+    return position
 
 
 def local_origin(vertices: Floats) -> Floats:

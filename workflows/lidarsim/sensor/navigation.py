@@ -146,7 +146,7 @@ class Gnss:
         GeodeticPosition | None,
         about(
             "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
-            "world's zero, x to the east and y to the north; by default by cloud.epsg",
+            "world's zero, x to the east and y to the north; by default by world.epsg",
             [48.7758, 9.1829, 290.0],
         ),
     ] = None

@@ -49,6 +49,8 @@ MAX_PARTICLES = 100  # that a pulse may return from
 MAX_RAYS = 1 << 32  # of a scan, which is cast in one call
 PRECISION_M = 0.01  # of points, if a sensor states no resolution
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
+# EPSG code of the world's coordinate system.
+EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
 MAX_DURATION_NS = 2.0**63  # of the type of the column time: 292 years
 
 
@@ -191,16 +193,6 @@ class CloudOptions:
             le=4096,
         ),
     ] = 0
-    epsg: Annotated[
-        int | None,
-        about(
-            "EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
-            "are converted to; by default the rasters'",
-            25832,
-            ge=1024,
-            le=32767,
-        ),
-    ] = None
     start: Annotated[
         datetime | None,
         written_as(Annotated[AwareDatetime, Strict(False)] | None),
@@ -257,6 +249,9 @@ class Survey(CloudOptions, Weather):
     classes
         Names of semantic classes, {number: name}, for reports and files; with them the cloud has
         the column `class`.
+    epsg
+        EPSG code of the world's coordinate system, which files that can hold one state;
+        `Scene.georeferenced` places a scene with local coordinates in it.
     **options
         The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -284,6 +279,7 @@ class Survey(CloudOptions, Weather):
     navigation: Navigation | None = None
     faults: Sequence[Fault] = ()
     classes: ClassNames = field(default_factory=dict, compare=False)
+    epsg: EpsgCode | None = None
 
     def __post_init__(self) -> None:
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))

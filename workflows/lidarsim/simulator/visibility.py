@@ -75,4 +75,5 @@ def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
         scene.names,
         scene.origin,
         instances=instances,
+        world_origin=scene.world_origin,
     )

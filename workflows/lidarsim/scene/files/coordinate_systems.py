@@ -333,6 +333,14 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
     return clause
 
 
+def world_advice(x: float, y: float, z: float) -> str:
+    """Return advice, as a clause, on a mesh whose file states an offset to a coordinate system."""
+    return (
+        f"with world.origin [{x:.12g}, {y:.12g}, {z:.9g}] in its place, scene and poses of a "
+        "scenario stay as they are, and what is written is there"
+    )
+
+
 def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
     """Return why lengths in a chosen system are not true metres at a place of that system.
 

@@ -1,0 +1,158 @@
+"""The section world: a survey in local coordinates, and what is written in a coordinate system."""
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pye57
+import pytest
+import yaml
+from click.testing import CliRunner
+from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
+
+from lidarpool import LidarError, Scene, read_cloud
+from lidarpool.cli.commands import cli
+from lidarpool.export.formats import Format
+from lidarpool.live.preview import first_sweeps
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.empty_cloud import empty_cloud_reason
+from lidarpool.scenario.scenario import Scenario
+from lidarsim.scene.files.las import las_system
+from lidarsim.scene.files.stated_system import StatedSystem
+
+ORIGIN = [500_000, 5_400_000]
+ROOM = {"copies": [{"name": "Room", "box": [8, 6, 3], "at": [[0, 0, 0]]}]}
+PLAN = {"scene": ROOM, "poses": [[0, 0, 1], [1.5, -1, 1]], "sensor": "velodyne/vlp16", "steps": 2}
+
+
+def job_of(**sections):
+    return build(Scenario.from_data({**PLAN, **sections})).job()
+
+
+def cloud_of(job):
+    (cloud,) = first_sweeps(job)
+    return cloud
+
+
+@pytest.mark.parametrize(
+    ("origin", "added"),
+    [
+        (ORIGIN, [500_000, 5_400_000, 0]),
+        ([500_000.125, 5_400_000.001, 312.5], [500_000.125, 5_400_000.001, 312.5]),
+    ],
+)
+def test_a_local_plan_is_written_in_its_system(tmp_path, origin, added):
+    local = cloud_of(job_of()).positions
+    job = job_of(world={"epsg": 25832, "origin": origin})
+    assert [pose.position for pose in job.survey.poses] == [(0, 0, 1), (1.5, -1, 1)]
+    cloud = cloud_of(job)
+    expected = np.round(local + added, 6)
+    np.testing.assert_array_equal(cloud.positions, expected)
+    for name in ("las", "laz", "ply", "e57", "parquet"):
+        Format(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
+    for name in ("las", "laz"):
+        las = laspy.read(tmp_path / f"cloud.{name}")
+        np.testing.assert_allclose(las.xyz, expected, rtol=0, atol=1e-8)
+        assert 'AUTHORITY["EPSG","25832"]]' in las_system(tmp_path / f"cloud.{name}").text
+    np.testing.assert_array_equal(read_cloud(tmp_path / "cloud.ply").positions, expected)
+    head = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0].decode()
+    comments = [line.removeprefix("comment ") for line in head.splitlines()]
+    assert StatedSystem.of_comments(comments) == StatedSystem("EPSG:25832")
+    part = pq.read_table(tmp_path / "cloud.parquet" / "part-00000.parquet")
+    np.testing.assert_array_equal(np.stack([part[axis] for axis in "xyz"], axis=1), expected)
+    assert part.schema.metadata[b"crs"] == b"EPSG:25832"
+    with pye57.E57(str(tmp_path / "cloud.e57")) as file:
+        assert StatedSystem(file.root["coordinateMetadata"].value()).units() is not None
+        assert 'AUTHORITY["EPSG","25832"]]' in file.root["coordinateMetadata"].value()
+        np.testing.assert_allclose(file.get_header(0).translation, np.add([0, 0, 1], added))
+        scan = file.read_scan(0, ignore_missing_fields=True)
+        points = np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
+    np.testing.assert_allclose(points, expected, rtol=0, atol=1e-6)
+
+
+def test_without_a_world_files_state_no_system(tmp_path):
+    job = job_of()
+    cloud = cloud_of(job)
+    for name in ("las", "ply", "e57", "parquet"):
+        Format(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
+    assert las_system(tmp_path / "cloud.las") is None
+    assert b"crs" not in (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0]
+    assert b"crs" not in pq.read_schema(tmp_path / "cloud.parquet/part-00000.parquet").metadata
+    with pye57.E57(str(tmp_path / "cloud.e57")) as file:
+        assert file.root["coordinateMetadata"].value() == ""
+
+
+def test_a_scene_is_placed_in_python_and_again():
+    scene = Scene.seed()
+    placed = scene.georeferenced((500_000, 5_400_000, 300))
+    np.testing.assert_array_equal(placed.vertices, scene.vertices)
+    assert placed.origin.tolist() == [500_000, 5_400_000, 300]
+    assert placed.georeferenced((1, 2, 3)).origin.tolist() == [1, 2, 3]
+    assert placed.georeferenced((0, 0, 0)).origin.tolist() == [0, 0, 0]
+    with pytest.raises(LidarError, match="must be x, y and z in metres"):
+        scene.georeferenced((1, 2))
+
+
+def test_fields_that_do_not_fit_the_world_are_refused(tmp_path):
+    with pytest.raises(LidarError, match=r"world\.origin"):
+        Scenario.from_data({"world": {"origin": [1]}})
+    with pytest.raises(LidarError, match=r"'epsg' is not a field|epsg is not a field"):
+        Scenario.from_data({"cloud": {"epsg": 25832}})
+    with pytest.raises(LidarError, match=r"world\.epsg .*EPSG:3857.*for maps of the world"):
+        job_of(world={"epsg": 3857, "origin": ORIGIN})
+    track = {"points": [{"time_s": 0, "position": [0, 0, 1]}, {"time_s": 1, "position": [1, 0, 1]}]}
+    with pytest.raises(LidarError, match=r"give world\.epsg in place of navigation\.gnss\.origin"):
+        Scenario.from_data(
+            {
+                "trajectory": track,
+                "world": {"epsg": 25832, "origin": ORIGIN},
+                "navigation": {"gnss": {"origin": [48.7, 9.1, 290.0]}},
+            }
+        )
+
+
+def test_a_raster_that_is_in_the_system_is_not_moved_by_its_origin(tmp_path):
+    write(tmp_path / "hills.tif", SLOPE)
+    world = {"origin": [X0, Y0]}
+
+    def built(*files):
+        data = {"scene": {"files": [*files]}, "world": world}
+        return build(Scenario.from_data(data, folder=tmp_path))
+
+    with pytest.raises(LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\], or leave out"):
+        built("hills.tif")
+    world["epsg"] = 25832
+    scene = built({"file": "hills.tif", "translation": [-X0, -Y0, 0]}).job().scene
+    lower, upper = scene.bounds + scene.origin
+    assert (np.abs(lower[:2] - (X0, Y0)) < 100).all() and (np.abs(upper[:2] - (X0, Y0)) < 100).all()
+
+
+def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
+    far = job_of(world={"epsg": 25832, "origin": ORIGIN}, poses=[[900, 0, 1]])
+    reason = empty_cloud_reason(far.scene, far.survey)
+    assert "the sensor begins at (900.000, 0.000, 1.000)" in reason and "500" not in reason
+    built = build(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
+    assert "500,000" not in " ".join(advice(built))
+
+
+@pytest.mark.extended
+def test_stations_and_check_name_the_system(tmp_path):
+    scenario = tmp_path / "room.yaml"
+    ground = {"height_m": 0, "margin_m": 3}
+    data = {**PLAN, "scene": {**ROOM, "ground": ground}, "world": {"epsg": 25832, "origin": ORIGIN}}
+    scenario.write_text(yaml.safe_dump(data))
+    shown = CliRunner().invoke(cli, ["check", str(scenario)]).output
+    assert "world       EPSG:25832; (500,000, 5,400,000, 0) m is added to the scenario's" in shown
+    assert "x 499,993.00 to 500,007.00" in shown
+    options = ["--sensor", "riegl-vz400", "--count", "1", "--out", f"{tmp_path}/plan", "--json"]
+    outcome = CliRunner().invoke(cli, ["stations", str(scenario), *options])
+    assert outcome.exit_code == 0, outcome.exception
+    figures = json.loads(outcome.stdout)
+    assert np.abs(figures["stations"][0]["position"]).max() < 10
+    assert (figures["epsg"], figures["world_origin"]) == (25832, [500_000, 5_400_000, 0])
+    planned = Scenario.load(Path(tmp_path / "plan/stations.yaml"))
+    assert planned.world.origin == (500_000, 5_400_000, 0) and planned.world.epsg == 25832
+    assert np.abs(planned.poses[0].position).max() < 10
