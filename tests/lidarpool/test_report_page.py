@@ -201,7 +201,9 @@ def test_numbers_are_those_of_the_report(write):
     assert pairs["tasks outside their partition"] == "0"
     assert pairs["shortest possible"] == f"{report['planning']['shortest_possible']:.2f} m"
     lead = page.xpath("//p[@class='lead']")[0].text_content()
-    assert lead.startswith(f"120 scans from 2 positions sent {report['rays']:,} rays at 2 objects")
+    assert lead.startswith(
+        f"120 scans (4 sweeps) from 2 positions sent {report['rays']:,} rays at 2 objects"
+    )
     assert "2,500 hit, and 500 points of them are in the cloud; 3 particle swarms" in lead
     rows = {row.get("data-stage"): row for row in page.xpath("//tr[@data-stage]")}
     assert list(rows) == list(report["stages"])

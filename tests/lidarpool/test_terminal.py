@@ -12,7 +12,7 @@ from rich.console import Console
 
 import lidarpool.cli.commands
 from lidarpool.cli.terminal import PlainLines, Terminal, WrittenLines
-from lidarpool.run.progress import Progress, bars_here
+from lidarpool.run.progress import Progress, bars, bars_here
 
 
 def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
@@ -53,6 +53,22 @@ def test_a_terminal_shows_what_is_written_and_how_far(monkeypatch):
     plain = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]|[━╸╺]", "", console.file.getvalue())
     told = [" ".join(line.split()) for line in plain.splitlines()]
     assert {"cloud.ply 8000/8000 points", "pictures 1/4 pictures"} <= {*told}
+
+
+def test_progress_counts_sweeps_beside_scans(capsys):
+    told = Progress(8.0, 100, 60, 60, 50, 50, 350, sweeps=3, sweeps_done=1)
+    lines = PlainLines(sys.stderr)
+    lines(told)
+    lines(Progress(9.0, 100, 100, 100, 100, 100, 700, sweeps=3, sweeps_done=3))
+    written = [line.partition("  ")[2] for line in capsys.readouterr().err.splitlines()]
+    assert written[0] == "survey  50 of 100 scans (1 of 3 sweeps), 350 points"
+    assert written[1] == "survey  done: 100 scans (3 sweeps), 700 points in 9.0 s"
+    console = Console(file=StringIO(), force_terminal=True, width=120)
+    with bars(console) as show:
+        show(told)
+    plain = re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]|[━╸╺]", "", console.file.getvalue())
+    collected = [line for line in plain.splitlines() if "4 collect" in line]
+    assert collected[-1].rstrip().endswith("1 of 3 sweeps")
 
 
 def test_a_log_has_a_line_on_what_is_written(capsys):

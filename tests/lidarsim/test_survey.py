@@ -14,7 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.shapes import Cart
 
-from lidarpool import Beams, LidarError, Mounted, Pose, Sensor, Spin, Survey, Track, load_trajectory
+from lidarpool import (
+    Beams,
+    LidarError,
+    Mounted,
+    Pose,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+    load_sensor,
+    load_trajectory,
+)
 from lidarpool.base.fingerprint import fingerprint
 from lidarsim.sensor.survey import MAX_STEPS
 from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
@@ -472,3 +483,19 @@ def test_a_turn_of_a_narrow_grid_sweeps_its_field_of_view():
     assert np.degrees(np.arcsin(z))[:3] == pytest.approx([-10, 0, 10])
     with pytest.raises(LidarError, match="horizontal_fov_deg is 361"):
         Sensor.grid(horizontal_fov_deg=361)
+
+
+def test_sweeps_are_counted_beside_scans():
+    """A sweep is a revolution, also one that is not completed, or a frame."""
+    grid = Sensor.grid(layers=2)
+    survey = Survey(grid, poses=[(0, 0, 1), (0, 0, 2)], steps=60)
+    assert (survey.scan_count, survey.sweep_count) == (120, 4)
+    assert survey.sweep_stops.tolist() == [36, 60, 96, 120]
+    assert [survey.sweeps_within(*span) for span in ((0, 35), (0, 36), (36, 97), (0, 120))] == [
+        0, 1, 2, 4,
+    ]  # fmt: skip
+    track = Track([0, 1.05], [[0, 0, 1], [1, 0, 1]])
+    sensors = [Mounted(grid, name="a"), Mounted(load_sensor("livox/avia"), name="b")]
+    drive = Survey(sensors=sensors, trajectory=track)
+    assert [len(sweeps.firsts) for sweeps in drive.sweeps_each] == [11, 11]
+    assert drive.sweep_count == 22

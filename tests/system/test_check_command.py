@@ -115,7 +115,11 @@ def cast(rig: Rig, first: int) -> Iterator[Any]:
 def test_it_tells_what_a_run_would_do_and_starts_nothing(check, tmp_path):
     outcome = check()
     assert outcome.code == 0
-    for said in ("6 objects, 76,800 triangles", "108 scans from 3 poses, 24,000 rays", "4 trials"):
+    for said in (
+        "6 objects, 76,800 triangles",
+        "108 scans (3 sweeps) from 3 poses, 24,000 rays",
+        "4 trials",
+    ):
         assert said in outcome.out
     last = outcome.out.splitlines()[-1]
     assert last == f"it can run: lidarpool run {tmp_path / 's.yaml'} --out {tmp_path / 'out'}"
@@ -307,7 +311,10 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     with_options = ["there/my part.stl", *options, "--no-plan", "--scheduler", cluster]
     outcome = lidarpool("check", *with_options)
     assert outcome.code == 0, outcome.err
-    assert "size        8.00 x 6.00 x 3.00 m" in outcome.out and "72 scans from 2" in outcome.out
+    assert (
+        "size        8.00 x 6.00 x 3.00 m" in outcome.out
+        and "72 scans (2 sweeps) from 2" in outcome.out
+    )
     words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
     assert words[:14] == ["lidarpool", "run", "there/my part.stl", *options[:11]]
     assert lidarpool(*words[1:], "--only", "cloud", "--quiet").code == 0

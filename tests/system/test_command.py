@@ -91,7 +91,7 @@ def test_the_demo_makes_all_files_and_says_so(demo):
     for name in MADE[1:5]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     shown = (Path(__file__).parents[2] / "docs/overview.md").read_text("utf-8")
-    told = re.search(r"108 scans, .* points in the cloud", ended.stdout)
+    told = re.search(r"108 scans .* points in the cloud", ended.stdout)
     assert told and told[0] in shown
     assert f"{len(read_cloud(out / 'cloud.ply')):,} points in the cloud" in ended.stdout
     assert re.search(r"path of 71\.\d\d m, free of collisions; the shortest possible", ended.stdout)

@@ -67,7 +67,7 @@ def town(tmp_path):
 
 def test_what_check_says_of_a_drive(town, lidarpool):
     told = lidarpool("check", town / "drive.yaml", "--out", town / "out").out
-    assert re.search(r"144 scans along a trajectory, .* \(2 sensors\)", told)
+    assert re.search(r"144 scans \(4 sweeps\) along a trajectory, .* \(2 sensors\)", told)
     assert re.search(r"trajectory  1\.\d\d m in 0.200 s", told)
     assert re.search(
         r"roof        Ouster OS1-32, 2,048 firings, 2.00 turns; in one .* moves 0\.\d+ m", told
@@ -124,9 +124,11 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     done = lidarpool("run", town / "drive.yaml", "--out", out, "--scheduler", cluster)
     assert done.code == 0, done.err
     report = json.loads((out / "report.json").read_text())
-    assert report["scans"] == 144
+    assert (report["scans"], report["sweeps"]) == (144, 4)
     assert list(report["parameters"]["sensors"]) == ["roof", "nose"]
-    assert "144 scans along a trajectory of 0.2 s sent" in (out / "report.html").read_text("utf-8")
+    assert "144 scans (4 sweeps) along a trajectory of 0.2 s sent" in (
+        out / "report.html"
+    ).read_text("utf-8")
     points = report["points_by_object"]
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")

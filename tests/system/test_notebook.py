@@ -22,7 +22,7 @@ def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     result = next(
         o.data["text/html"] for o in shown if "survey" in o.get("data", {}).get("text/html", "")
     )
-    assert "180 scans, 144,688 rays" in result
+    assert "180 scans (5 sweeps), 144,688 rays" in result
     assert result.count("data:image/png;base64") == 2
     assert result.count("max-width:800px") == 2  # as drawn: smaller, letters could not be read
     assert "<iframe src=" in shown[-1].data["text/html"]

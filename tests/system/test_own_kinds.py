@@ -95,7 +95,7 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
 @pytest.mark.usefixtures("pictures")
 def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result):
     told = repr(result)
-    assert told.startswith("survey: 60 scans, 28,800 rays")
+    assert told.startswith("survey: 60 scans (60 sweeps), 28,800 rays")
     assert (
         f"cloud: {len(result.cloud):,} points: x, y, z, scan, channel, object, brightness" in told
     )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidarsim.base.notebook import PICTURE_SIZE, cell_display, image_of, table_of
 from lidarsim.base.validation import checked
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, scans_in_words
 
 from ..export.formats import save_cloud
 from ..run.job_source import fields_of
@@ -189,7 +189,8 @@ class Result(RunResult):
         """Yield names and values of the main figures."""
         yield (
             "survey",
-            f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "
+            f"{scans_in_words(self.survey.scan_count, self.survey.sweep_count)}, "
+            f"{self.rays:,} rays, {self.hits:,} hits on "
             f"{plural(len(self.objects), 'object')} ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",
         )

@@ -15,7 +15,7 @@ from distributed import Client
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import listed, plural
+from lidarsim.base.words import listed, plural, scans_in_words
 
 from ..base.job_errors import lines_of_errors
 from ..report.output import SurveyOutput
@@ -33,6 +33,7 @@ from .shared_options import world_lines
 from .terminal import Terminal
 
 FORECAST_JOBS = 5  # of a campaign
+_JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
 
 
 def forecast_scenario(
@@ -137,7 +138,7 @@ def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -
         "name": campaign.name(number),
         "split": campaign.split(number),
         "values": campaign.values(number),
-        **{name: figures[name] for name in ("objects", "triangles", "scans", "rays", "estimate")},
+        **{name: figures[name] for name in _JOB_COUNTS},
     }
 
 
@@ -170,17 +171,19 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         if job["estimate"]:
             points = f", about {job['estimate']['points']:,} points"
         yield (
-            f"            {plural(job['objects'], 'object')}, {plural(job['scans'], 'scan')}, "
-            f"{job['rays']:,} rays{points}"
+            f"            {plural(job['objects'], 'object')}, "
+            f"{scans_in_words(job['scans'], job['sweeps'])}, {job['rays']:,} rays{points}"
         )
     if figures["jobs"]:
         share = campaign.count / len(figures["jobs"])
-        scans = round(share * sum(job["scans"] for job in figures["jobs"]))
-        rays = round(share * sum(job["rays"] for job in figures["jobs"]))
+        scans, sweeps, rays = (
+            round(share * sum(job[name] for job in figures["jobs"]))
+            for name in ("scans", "sweeps", "rays")
+        )
         points = sum((job["estimate"] or {"points": 0})["points"] for job in figures["jobs"])
         yield (
-            f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
-            f"points, estimated from {plural(len(figures['jobs']), 'job')}"
+            f"in all      about {scans_in_words(scans, sweeps)}, {rays:,} rays and "
+            f"{round(share * points):,} points, estimated from {plural(len(figures['jobs']), 'job')}"
         )
     yield from _remarks(figures)
 
@@ -242,7 +245,7 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     path = f"from {plural(figures['poses'], 'pose')}"
     if figures["drive"]:
         path = "along a trajectory"
-    scans = plural(figures["scans"], "scan")
+    scans = scans_in_words(figures["scans"], figures["sweeps"])
     yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
     for name, unseen in figures["unseen"].items():
         by_sensor = f"by {name}, " * bool(name)

@@ -14,7 +14,7 @@ import click
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, scans_in_words
 from lidarsim.simulator.scene_caster import check_backend_here
 
 from ..base import timeline
@@ -210,7 +210,8 @@ def _result_lines(
     yield from terminal.notes(report["notes"])
     surface_hits = report["hits_on_surfaces"]
     yield (
-        f"{plural(job.survey.scan_count, 'scan')}, {plural(result.rays, 'ray')}, "
+        f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
+        f"{plural(result.rays, 'ray')}, "
         f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
         f"{f' and {result.hits - surface_hits:,} on none' if result.hits > surface_hits else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "

@@ -14,6 +14,7 @@ import click
 from distributed import Client
 from rich.console import Console
 
+from lidarsim.base.words import plural
 from lidarsim.base.writing_progress import WritingProgress
 
 from ..base.logs import set_logs
@@ -155,10 +156,13 @@ class PlainLines:
             self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
         scans = progress.scans
         scans_done = min(progress.collected, progress.framed)
-        survey_summary = f"{scans:,} scans, {progress.points:,} points"
+        sweeps = f" ({progress.sweeps_in_words})" if progress.sweeps else ""
+        all_sweeps = f" ({plural(progress.sweeps, 'sweep')})" if progress.sweeps else ""
+        survey_summary = f"{scans:,} scans{all_sweeps}, {progress.points:,} points"
+        unit = f"scans{sweeps}, {progress.points:,} points"
         trials = progress.trials
         for stage, count, total, unit, stage_summary in (
-            ("survey", scans_done, scans, f"scans, {progress.points:,} points", survey_summary),
+            ("survey", scans_done, scans, unit, survey_summary),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):

@@ -46,7 +46,7 @@ _PACKAGES = (
 )  # fmt: skip
 # What `--json` prints of a report.
 _FIGURES = (
-    "backend", "notes", "scans", "rays", "hits", "points", "points_by_object", "seconds",
+    "backend", "notes", "scans", "sweeps", "rays", "hits", "points", "points_by_object", "seconds",
     "placement_violations", "replayed", "resumed_scans",
 )  # fmt: skip
 _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
@@ -81,6 +81,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "notes": list(result.notes),
         "parameters": _parameters(scene, survey),
         "scans": survey.scan_count,
+        "sweeps": survey.sweep_count,
         "rays": result.rays,
         "hits": result.hits,
         # The counts of large scenes are large: without need they are not read.

@@ -137,6 +137,7 @@ def forecast(
         "poses": job.survey.path.stations,
         "drive": _drive(job.survey),
         "scans": job.survey.scan_count,
+        "sweeps": job.survey.sweep_count,
         "rays": job.survey.ray_count,
         "estimate": estimate,
         "precision_m": job.survey.precision_m,

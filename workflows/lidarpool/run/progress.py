@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
 from lidarsim.base.notebook import cell_display
+from lidarsim.base.words import plural
 from lidarsim.base.writing_progress import WritingProgress
 
 # Lines of progress: label, name of the count, and of the total, which is the unit.
@@ -48,6 +49,13 @@ class Progress:
     waits_for: str = ""  # partition whose slots the survey needs and other runs hold
     jobs: int = 0  # of a campaign, whose scans are not counted
     jobs_done: int = 0
+    sweeps: int = 0  # revolutions or frames
+    sweeps_done: int = 0  # sweeps whose scans have passed all stages
+
+    @property
+    def sweeps_in_words(self) -> str:
+        """Number of sweeps that are done, «12 of 100 sweeps»; empty for a campaign."""
+        return f"{self.sweeps_done:,} of {plural(self.sweeps, 'sweep')}" if self.sweeps else ""
 
 
 Show = Callable[[Progress], None]
@@ -131,6 +139,8 @@ def bars(console: Console) -> Iterator[Show]:
                     pace = paces[label].text(progress.seconds, count, total)
                     if total_name == "scans" and count < total:
                         pace = waiting_reason(progress) or pace
+                    if count_name == "collected":
+                        pace = f"{pace}  {progress.sweeps_in_words}".strip()
                     move(label, count, total, total_name, pace)
 
         yield show

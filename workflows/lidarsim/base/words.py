@@ -94,6 +94,11 @@ def plural(number: float, noun: str, plural_noun: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural_noun or noun + 's'}"
 
 
+def scans_in_words(scans: int, sweeps: int) -> str:
+    """Return counts of scans and of sweeps: «36,000 scans (1,000 sweeps)»."""
+    return f"{plural(scans, 'scan')} ({plural(sweeps, 'sweep')})"
+
+
 def natural(name: str) -> list[tuple[int, str]]:
     """Return a sort key by which GPU-2 comes before GPU-10."""
     pieces = re.split(r"(\d+)", name)

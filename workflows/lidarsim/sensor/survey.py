@@ -21,7 +21,7 @@ from ..base.notebook import picture_of, table_of
 from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields, shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
-from ..base.words import listed, plural
+from ..base.words import listed, plural, scans_in_words
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -316,7 +316,7 @@ class Survey(CloudOptions, Weather):
         rows = {
             "survey": f"{plural(len(models), 'sensor')}: {listed(models, 8)}",
             "poses": poses,
-            "scans": f"{self.scan_count:,}",
+            "scans": scans_in_words(self.scan_count, self.sweep_count),
             "rays": f"{self.ray_count:,}",
             "duration": f"{self.duration_ns / 1e9:.6g} s",
             "columns": ", ".join(column.name for column in self.stored_columns),
@@ -584,6 +584,25 @@ class Survey(CloudOptions, Weather):
                 )
             )
         return tuple(sweeps)
+
+    @cached_property
+    def sweep_stops(self) -> Ints:
+        """Scan after the last scan of each sweep, ascending: int64 (sweeps,)."""
+        firsts = np.concatenate([sweeps.firsts for sweeps in self.sweeps_each])
+        return np.append(firsts[1:], self.scan_count)
+
+    @property
+    def sweep_count(self) -> int:
+        """Number of sweeps: revolutions, or frames of sensors whose heads do not rotate.
+
+        The last sweep of a sensor at a station may be a part of a revolution.
+        """
+        return sum(len(sweeps.firsts) for sweeps in self.sweeps_each)
+
+    def sweeps_within(self, start: int, stop: int) -> int:
+        """Return the number of sweeps whose last scan is among scans `start` to `stop` - 1."""
+        before, until = np.searchsorted(self.sweep_stops, (start, stop), "right")
+        return int(until - before)
 
     @property
     def ray_count(self) -> int:

@@ -92,6 +92,7 @@ class JobUnderWay(PipelineJob):
     def progress(self) -> Progress:
         """Return the progress of a resumed run at its start."""
         framed = self.frames - self.scans.start
+        start, stop = self.scans.start, self.scans.stop
         return Progress(
             scans=len(self.scans),
             generated=framed,
@@ -101,6 +102,8 @@ class JobUnderWay(PipelineJob):
             points=self.parts.point_count,
             trials=self.job.trials,
             trials_done=len(self.trials),
+            sweeps=self.survey.sweeps_within(start, stop),
+            sweeps_done=self.survey.sweeps_within(start, min(self.frames, stop)),
         )
 
     def status(self, *, is_writing: bool) -> dict[str, Any]:
