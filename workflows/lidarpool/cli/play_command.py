@@ -63,6 +63,7 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
     default=None,
     help="ros2: a point for each ray, NaN without a return.",
 )
+@options.mesh_reading
 @options.new_file("--lateness", help="packets: how late they were, as JSON.")
 def play(
     source: Path | Storage,
@@ -71,6 +72,7 @@ def play(
     loop: bool,
     rate: float,
     now: bool,
+    of_mesh: dict[str, Any],
     **settings: Any,
 ) -> None:
     """Play a result or scenario as its sensors would send the sweeps, at their own times.
@@ -104,11 +106,13 @@ def play(
     if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() == RECORDING:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
+        options.refuse_mesh_options(of_mesh, source)
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return
     with ExitStack() as stack:
-        with terminal.status("reading the source", logged=False):
-            played = stack.enter_context(open_source(source, kind.format_of(bridge_settings)))
+        with terminal.status("reading the source"):
+            needs = kind.format_of(bridge_settings)
+            played = stack.enter_context(open_source(source, needs, of_mesh, terminal.tell))
         sweeps = played.sweeps
         start_at_ns = 0
         if now:

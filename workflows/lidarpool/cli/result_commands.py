@@ -207,6 +207,11 @@ def export(
                 raise
 
 
+def _tell(note: str) -> None:
+    """Print a note; `Terminal.tell` would import Dask, for which a view does not wait."""
+    click.echo(f"note: {note}", err=True)
+
+
 @click.command()
 @click.argument("results", metavar="RESULT...", type=options.StoragePath(), nargs=-1, required=True)
 @click.option(
@@ -220,6 +225,7 @@ def export(
 @options.new_file("--film", help="Write a .gif or .webp instead: along a drive, or all around.")
 @options.new_file("--export", help="Write the page as one .html instead, of at most 25 MB.")
 @options.flag("--keep-noise", help="Show withheld points and noise of a .las or .laz, too.")
+@options.mesh_reading
 def view(
     results: Sequence[Path | Storage],
     port: int,
@@ -227,6 +233,7 @@ def view(
     film: Path | None,
     export: Path | None,
     keep_noise: bool,
+    of_mesh: dict[str, Any],
 ) -> None:
     """Show a file or folder in the browser, or write a file to share.
 
@@ -239,6 +246,7 @@ def view(
     Examples:
       lidarpool view lidarpool-out
       lidarpool view drive.yaml
+      lidarpool view part.stl --unit mm --up-axis y
       lidarpool view recording.mcap --no-browser
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
@@ -258,10 +266,12 @@ def view(
                 f"{data_sets[0]} is a data set of many jobs: view it alone, without --film and "
                 "--export."
             )
+        options.refuse_mesh_options(of_mesh, data_sets[0])
         from ..live.job_list import JobList, show_jobs
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
+    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _tell}
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
@@ -270,13 +280,13 @@ def view(
 
             from .terminal import Terminal
 
-            shared = open_views(folders, keep_noise=keep_noise)
+            shared = open_views(folders, **reading)
             share(shared, film, export, Terminal().writing)
         else:
             growing = None
-            if len(folders) == 1:
+            if len(folders) == 1 and not of_mesh:
                 growing = growing_view(folders[0], keep_noise=keep_noise)
-            shown = growing or open_views(folders, keep_noise=keep_noise)
+            shown = growing or open_views(folders, **reading)
             show_view(shown, port=port, browser=not no_browser)
 
 

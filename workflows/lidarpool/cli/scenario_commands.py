@@ -559,10 +559,17 @@ def _share(text: str) -> float:
     metavar="FOLDER",
     help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
 )
+@options.mesh_reading
 @overwrite
 @options.as_json
 def stations(
-    scene: Path, model: str, out: Path | None, overwrite: bool, as_json: bool, **settings: Any
+    scene: Path,
+    model: str,
+    out: Path | None,
+    of_mesh: dict[str, Any],
+    overwrite: bool,
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Choose stations for a terrestrial scan.
 
@@ -573,6 +580,7 @@ def stations(
     \b
     Examples:
       lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
+      lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
     """  # noqa: D301 - click wants the character, not its name
     count = settings["count"]
@@ -595,24 +603,27 @@ def stations(
         raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
-    scenario = Scenario.load(scene)
+    scenario = Scenario.load(scene, of_mesh)
     terminal = Terminal(quiet=as_json)
-    with terminal.status("reading the scene", logged=False):
+    with terminal.status("reading the scene"):
         built = build(scenario, plans=False)
-    with terminal.status("looking from all places", logged=False):
+    scene_notes = advice(replace(built, placing=Placing(())))  # stations replace its poses
+    for note in scene_notes:  # before what may take minutes
+        terminal.tell(note)
+    with terminal.status("looking from all places"):
         plan = plan_stations(built.scene, sensor, **settings)
-    with terminal.status("drawing the picture", logged=False):
+    with terminal.status("drawing the picture"):
         page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
-    notes = advice(replace(built, placing=Placing(())))  # stations replace its poses
-    notes += _shortfalls(plan, count, coverage)
-    figures = _plan_figures(plan, built.scene.names, sensor.model, notes)
+    shortfalls = [*_shortfalls(plan, count, coverage)]
+    figures = _plan_figures(plan, built.scene.names, sensor.model, [*scene_notes, *shortfalls])
     figures |= {"epsg": built.survey.epsg, "world_origin": [*scenario.world.origin]}
     lines = [*_plan_lines(plan, built.scene.names)]
     lines += options.world_lines(built.survey.epsg, scenario.world.origin)
+    lines += [f"note: {note}" for note in shortfalls]
     options.show(figures, lines, as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")

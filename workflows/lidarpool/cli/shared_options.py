@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from lidarsim.base.errors import explained
+from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage, is_url
 from lidarsim.base.vocabulary import BACKENDS, UNITS_M
 
@@ -104,10 +104,14 @@ _mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multi
 poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
                      help="Place of the sensor in the scene, metres; or one for each sweep. By "
                      "default that of the recording, or 0,0,0.")  # fmt: skip
-_mesh_options = combine(
-    _mesh_option("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+_MESH_READING = ("unit", "up_axis")  # how a mesh is read, wherever a command takes a mesh
+_mesh_reading_options = combine(
     _mesh_option("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
     _mesh_option("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
+)
+_mesh_options = combine(
+    _mesh_option("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+    _mesh_reading_options,
     _mesh_list_option("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
     _mesh_list_option("columns", "further columns of its points, such as range,intensity"),
     _mesh_list_option("format", "further formats of the cloud, such as las"),
@@ -125,12 +129,33 @@ def mesh_options(command: Command) -> Command:
         format: Any,  # noqa: A002 - the name of the option
         **settings: Any,
     ) -> None:
-        values = {name: settings.pop(name) for name in ("sensor", "unit", "up_axis")}
+        values = {name: settings.pop(name) for name in ("sensor", *_MESH_READING)}
         values |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
         values = {name: value for name, value in values.items() if value not in (None, [])}
         command(*arguments, of_mesh=values, **settings)
 
     return _mesh_options(with_options)
+
+
+def mesh_reading(command: Command) -> Command:
+    """Add --unit and --up-axis, which the command gets as a mapping `of_mesh`."""
+
+    @wraps(command)
+    def with_options(*arguments: Any, **settings: Any) -> None:
+        values = {name: settings.pop(name) for name in _MESH_READING}
+        values = {name: value for name, value in values.items() if value is not None}
+        command(*arguments, of_mesh=values, **settings)
+
+    return _mesh_reading_options(with_options)
+
+
+def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
+    """Raise a LidarError for options of a mesh with a path that is none."""
+    for name in of_mesh:
+        raise LidarError(
+            f"--{name.replace('_', '-')} says how a mesh file is read, and {path} is none: leave "
+            "it out."
+        )
 
 
 def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:

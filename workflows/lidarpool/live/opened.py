@@ -6,9 +6,11 @@ view each; a data set is a list of jobs with a view each (`job_list.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.errors import LidarError, explained
@@ -36,34 +38,48 @@ def is_data_set(place: Path | Storage) -> bool:
     )
 
 
-def open_views(paths: Sequence[Path], *, keep_noise: bool = False) -> View:
+def open_views(paths: Sequence[Path], **options: Any) -> View:
     """Open files and folders of the same place as a view of all their points.
 
-    Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
+    The options are those of `open_view`.
 
     LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
     others.
     """
-    return join_views(paths, [open_view(path, keep_noise=keep_noise) for path in paths])
+    return join_views(paths, [open_view(path, **options) for path in paths])
 
 
-def open_view(path: Path, *, keep_noise: bool = False) -> View:
+def open_view(
+    path: Path,
+    *,
+    keep_noise: bool = False,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> View:
     """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
+
+    Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
+    `of_mesh` are the unit and up axis of a mesh; `tell` is called with each note on a scene.
 
     LidarError if the path has an unfinished run, or nothing that is read.
     """
     if not path.exists():
         raise LidarError(f"{path} does not exist: give a result, a cloud, a mesh or a scenario.")
     title = f"{path.resolve().name} - lidarpool"
+    if _is_previewed(path):
+        return _preview(path, of_mesh, tell)
+    if of_mesh:
+        raise LidarError(
+            f"{path} is not a mesh, and --{next(iter(of_mesh)).replace('_', '-')} says how a mesh "
+            "is read: leave it out."
+        )
     if path.is_dir():
         if (path / CLOUD).exists():
             return open_result(path, downloads())
         refuse_unfinished(path)
         return _recorded(path, title, keep_noise)
     suffix = path.suffix.lower()
-    if suffix in (".yaml", ".yml"):
-        return _preview(path)
-    if suffix == ".ply" and not _has_faces(path):
+    if suffix == ".ply":
         try:
             view = open_result(path, downloads())
         except LidarError:  # text, or of another program
@@ -71,12 +87,23 @@ def open_view(path: Path, *, keep_noise: bool = False) -> View:
         if not len(view.points):
             raise LidarError(f"{path} has no points.")
         return view
-    mesh_format = format_of(path)
-    with explained(f"{path} cannot be read"):
-        is_cloud = suffix == ".asc" and not is_text_raster(path)
-    if suffix in ROBOTS or (mesh_format is not None and not mesh_format.advice and not is_cloud):
-        return _preview(path)
     return _recorded(path, title, keep_noise)
+
+
+def _is_previewed(path: Path) -> bool:
+    """Return True for a scenario or a mesh; LidarError if its file cannot be read."""
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return False
+    if suffix in (".yaml", ".yml", *ROBOTS):
+        return True
+    if suffix == ".ply":
+        return _has_faces(path)
+    with explained(f"{path} cannot be read"):
+        if suffix == ".asc" and not is_text_raster(path):
+            return False
+    mesh_format = format_of(path)
+    return mesh_format is not None and not mesh_format.advice
 
 
 # Modules of recordings, scenarios and runs are imported only when they are needed: the first points
@@ -121,11 +148,11 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> GrowingView | None:
     return GrowingView(sampled, recording.point_count or 0, full)
 
 
-def _preview(path: Path) -> View:
+def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
     """Return the view of a scenario or mesh before its run."""
     from .preview import scenario_view
 
-    return scenario_view(path)
+    return scenario_view(path, of_mesh, tell)
 
 
 def _has_faces(path: Path) -> bool:

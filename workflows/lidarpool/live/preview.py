@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from lidarview.viewer.point_selection import OrderedPoints
 from lidarview.viewer.view import View
 
 from ..report.picture_content import planning_picture
+from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
@@ -27,20 +30,28 @@ MATERIAL = TABLE["material"]
 _PREVIEW = "Preview before a run, with the points of the first sweep of each sensor."
 
 
-def scenario_view(path: Path) -> View:
+def scenario_view(
+    path: Path,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> View:
     """Return the preview of a scenario, of the first job of a campaign, or of a mesh file.
 
-    A mesh is scanned as `lidarpool run` scans it. LidarError if a file cannot be read, or fields of
+    A mesh is scanned as `lidarpool run` scans it, with the options `of_mesh` of `mesh_data`. `tell`
+    is called with each note on the scene. LidarError if a file cannot be read, or fields of
     the scenario contradict each other.
     """
     is_mesh = path.suffix.lower() not in (".yaml", ".yml")
     note = _PREVIEW
-    if not is_mesh and is_campaign(path):
+    if not is_mesh and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)
         job = campaign.job(0)
         note = f"Job {job.name} of {campaign.count:,} of the campaign. {_PREVIEW}"
     else:
-        job = build(_with_materials(Scenario.load(path))).job()
+        built = build(_with_materials(Scenario.load(path, of_mesh)))
+        for line in advice(built):
+            tell(line)
+        job = built.job()
     return preview_of(job, note, f"{path.resolve().name} - lidarpool")
 
 

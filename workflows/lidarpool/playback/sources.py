@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from lidarview.picture_file import PICTURE_FILE, PictureContent
 from ..export.folder import local_result
 from ..export.formats import Format
 from ..export.navigation_files import write_instruments
+from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
@@ -75,11 +78,17 @@ class Played:
 
 
 @contextmanager
-def open_source(source: Path | Storage, needs: Format | None = None) -> Iterator[Played]:
+def open_source(
+    source: Path | Storage,
+    needs: Format | None = None,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> Iterator[Played]:
     """Open a result, scenario, campaign or mesh file to be played.
 
     Of a campaign, the first job is played. The cloud of a scenario has the columns that the format
-    `needs` holds.
+    `needs` holds. `of_mesh` are `mesh_data`'s options of a mesh file; `tell` is called with each
+    note on the scene.
 
     Raises
     ------
@@ -95,8 +104,13 @@ def open_source(source: Path | Storage, needs: Format | None = None) -> Iterator
                     f"{source} holds packets: play it with --as packets, or give a result or "
                     "scenario."
                 )
-            yield _cast(scenario_job(source, needs), stack)
+            yield _cast(scenario_job(source, needs, of_mesh, tell), stack)
             return
+        if of_mesh:
+            raise LidarError(
+                f"unit and up_axis say how a mesh file is read, and {source} is a result: leave "
+                "them out."
+            )
         files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
         folder = stack.enter_context(local_result(source, files))
         yield _recorded(folder, source)
@@ -124,21 +138,29 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
     return Played(sweeps, read, lambda: PictureContent.load_from(folder))
 
 
-def scenario_job(path: Path, needs: Format | None = None) -> Job:
+def scenario_job(
+    path: Path,
+    needs: Format | None = None,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> Job:
     """Return the job of a scenario or mesh file, or the first job of a campaign.
 
     Its cloud has the columns that the format `needs` holds, in place of those of the formats that
-    the scenario writes.
+    the scenario writes. `of_mesh` and `tell` as for `open_source`.
     """
-    if path.suffix.lower() in (".yaml", ".yml") and is_campaign(path):
+    if path.suffix.lower() in (".yaml", ".yml") and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)
         scenario = campaign.scenario(0)
         if scenario is None:
             raise LidarError(f"{path}: its jobs are made by a function: give a scenario.")
     else:
-        scenario = Scenario.load(path)
+        scenario = Scenario.load(path, of_mesh)
     output = OutputSection(write=() if needs is None else (needs,))
-    return build(scenario.model_copy(update={"output": output}), plans=False).job()
+    built = build(scenario.model_copy(update={"output": output}), plans=False)
+    for note in advice(built):
+        tell(note)
+    return built.job()
 
 
 def _cast(job: Job, stack: ExitStack) -> Played:
