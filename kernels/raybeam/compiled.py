@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -39,6 +40,16 @@ def _has_cache() -> bool:
     return True
 
 
+_log = logging.getLogger(__name__)
+# Of all loops together: a first `lidarpool check` took 24 s of processor time, a later check 4 s,
+# and 30 and 5 s while the machine was busy.
+COMPILING = "compiling, once: some 20 s"
+COMPILING_EACH_TIME = (
+    "compiling, some 20 s in each process: set NUMBA_CACHE_DIR to a folder that can be written"
+)
+_TOLD_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
+_compiling_s = [0.0]  # what this process has waited for loops that were not compiled
+_waits = [False]  # whether the loop at hand is compiled, here or in another process
 HAS_CACHE = _has_cache()  # whether compiled loops are kept for later processes
 
 
@@ -105,6 +116,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
                         _locked[0] = folder
                         break
                     except BlockingIOError:
+                        _waits[0] = True
                         time.sleep(_STEP_S)
                         _patience[0] -= _STEP_S
         except OSError:  # a file system without locks
@@ -122,9 +134,25 @@ def _compile_lock(folder: str) -> Iterator[None]:
                 file.close()
 
 
+def _tell_if_long(seconds: float) -> None:
+    """Count the time that a loop has taken, and log once that loops are being compiled.
+
+    Loops are compiled when modules are imported, one after the other: after the first second it is
+    certain that many of them are.
+    """
+    if not _waits[0]:
+        return
+    _waits[0] = False
+    before_s = _compiling_s[0]
+    _compiling_s[0] += seconds
+    if before_s < _TOLD_AFTER_S <= _compiling_s[0]:
+        _log.info(COMPILING if HAS_CACHE else COMPILING_EACH_TIME)
+
+
 def _cached(dispatcher: Any, function: Any) -> Any:
     """Cache compiled code on disk, for processes with the same sources of the package."""
     if not HAS_CACHE:
+        dispatcher.compile = _timed(dispatcher.compile)
         return dispatcher
     dispatcher.enable_caching()
     cache = dispatcher._cache
@@ -139,8 +167,23 @@ def _cached(dispatcher: Any, function: Any) -> Any:
         with _compile_lock(folder):
             return compile_now(*signature)
 
-    dispatcher.compile = compile_in_turn
+    dispatcher.compile = _timed(compile_in_turn)
     return dispatcher
+
+
+def _timed(compile_now: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that compiles or loads a loop, and counts the time."""
+
+    def compile_and_count(*signature: Any) -> Any:
+        if _held[0]:  # a loop that the loop at hand calls
+            return compile_now(*signature)
+        started_s = time.perf_counter()
+        _waits[0] = not HAS_CACHE
+        code = compile_now(*signature)
+        _tell_if_long(time.perf_counter() - started_s)
+        return code
+
+    return compile_and_count
 
 
 def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
@@ -151,7 +194,10 @@ def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
     it compiles.
     """
     rtsys.initialize(target_context)  # compiled code may allocate memory
-    return cache._load_overload(signature, target_context)
+    code = cache._load_overload(signature, target_context)
+    if code is None:
+        _waits[0] = True
+    return code
 
 
 def _save_compiled(cache: Any, signature: Any, code: Any) -> None:

@@ -192,3 +192,16 @@ def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
         return number
 
     assert count(3) == 3 and len(more.overloads) == 1
+
+
+def test_compiling_is_told_once_and_not_when_loops_are_loaded(package):
+    tell = (
+        "import logging, sys; import raybeam.compiled as c; c._TOLD_AFTER_S = 1e-9; "
+        "logging.basicConfig(level=logging.INFO, stream=sys.stdout, format='%(message)s'); "
+        "import loops.more"
+    )
+    path = {**os.environ, "PYTHONPATH": str(Path(compiled.__file__).parents[1])}
+    command = [sys.executable, "-c", tell]
+    options = {"cwd": package.parent, "env": path, "capture_output": True, "text": True}
+    told = [subprocess.run(command, check=True, **options).stdout for _ in range(2)]
+    assert told == [f"{compiled.COMPILING}\n", ""]

@@ -32,6 +32,7 @@ from ..base.logs import set_logs
 from ..base.shard import ALL
 from ..viewers.table import VIEWERS
 from . import shared_options as shared
+from .first_step import begin
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
@@ -108,6 +109,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
         settings["extent"] = "pictures" if pictures else only
+        begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 

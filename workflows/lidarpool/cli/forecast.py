@@ -183,7 +183,8 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         points = sum((job["estimate"] or {"points": 0})["points"] for job in figures["jobs"])
         yield (
             f"in all      about {scans_in_words(scans, sweeps)}, {rays:,} rays and "
-            f"{round(share * points):,} points, estimated from {plural(len(figures['jobs']), 'job')}"
+            f"{round(share * points):,} points, estimated from "
+            f"{plural(len(figures['jobs']), 'job')}"
         )
     yield from _remarks(figures)
 

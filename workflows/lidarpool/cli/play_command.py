@@ -15,6 +15,7 @@ from lidarsim.base.storage import Storage
 
 from ..export.format_table import LAYOUTS
 from . import shared_options as options
+from .first_step import begin
 
 _PACKETS = "packets"
 _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: time to prepare
@@ -89,6 +90,7 @@ def play(
       lidarpool play drive.yaml --as ros2 --layout ouster --organized
       lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - click wants the character, not its name
+    begin("reading the source")
     from ..base.fork_server import keep_freed_memory
     from ..playback.bridge import BridgeOptions, bridge_class
     from ..playback.player import play_sweeps
@@ -110,7 +112,7 @@ def play(
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return
     with ExitStack() as stack:
-        with terminal.status("reading the source"):
+        with terminal.status("reading the source", logged=False):
             needs = kind.format_of(bridge_settings)
             played = stack.enter_context(open_source(source, needs, of_mesh, terminal.tell))
         sweeps = played.sweeps

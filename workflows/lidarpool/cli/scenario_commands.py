@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, without_common_prefix
 
 from . import shared_options as options
+from .first_step import begin
 from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
 
     from ..base.tls_files import TlsFiles
     from ..plan.stations import StationPlan
+    from ..scenario.build import Built
     from ..scenario.scenario import Scenario
+    from .terminal import Terminal
 
 MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles
 PLAN_FILE = "stations.yaml"
@@ -210,6 +213,7 @@ def check(
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - click wants the character, not its name
+    begin("reading the scene", quiet=as_json)
     from ..run.cluster.cluster_file import ClusterFile
     from ..run.cluster.connection import connected
     from ..run.options import RunOptions
@@ -583,17 +587,13 @@ def stations(
       lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
     """  # noqa: D301 - click wants the character, not its name
-    count = settings["count"]
-    coverage = settings["coverage"]
-    if count is not None and coverage is not None:
+    if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
+    begin("reading the scene", quiet=as_json)
     from lidarsim.sensor.models import full_name, load_sensor
 
     from ..plan.stations import plan_stations
     from ..report.result_pictures import draw_stations
-    from ..scenario.advice import advice
-    from ..scenario.build import build
-    from ..scenario.placing import Placing
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
@@ -605,11 +605,7 @@ def stations(
     sensor = load_sensor(model)
     scenario = Scenario.load(scene, of_mesh)
     terminal = Terminal(quiet=as_json)
-    with terminal.status("reading the scene"):
-        built = build(scenario, plans=False)
-    scene_notes = advice(replace(built, placing=Placing(())))  # stations replace its poses
-    for note in scene_notes:  # before what may take minutes
-        terminal.tell(note)
+    built, notes = _built_with_notes(scenario, terminal)
     with terminal.status("looking from all places"):
         plan = plan_stations(built.scene, sensor, **settings)
     with terminal.status("drawing the picture"):
@@ -618,16 +614,27 @@ def stations(
     file = folder / PLAN_FILE
     file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
-    shortfalls = [*_shortfalls(plan, count, coverage)]
-    figures = _plan_figures(plan, built.scene.names, sensor.model, [*scene_notes, *shortfalls])
-    figures |= {"epsg": built.survey.epsg, "world_origin": [*scenario.world.origin]}
-    lines = [*_plan_lines(plan, built.scene.names)]
-    lines += options.world_lines(built.survey.epsg, scenario.world.origin)
-    lines += [f"note: {note}" for note in shortfalls]
-    options.show(figures, lines, as_json)
+    shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
+    figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
+    note_lines = map("note: {}".format, shortfalls)
+    options.show(figures, chain(_plan_lines(plan, built), note_lines), as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
+
+
+def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
+    """Build a scenario whose poses do not matter; return its notes, which are printed at once."""
+    from ..scenario.advice import advice
+    from ..scenario.build import build
+    from ..scenario.placing import Placing
+
+    with terminal.status("reading the scene", logged=False):
+        built = build(scenario, plans=False)
+    notes = advice(replace(built, placing=Placing(())))
+    for note in notes:
+        terminal.tell(note)
+    return built, notes
 
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
@@ -674,10 +681,9 @@ def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: Stati
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def _plan_figures(
-    plan: StationPlan, names: tuple[str, ...], sensor: str, notes: list[str]
-) -> dict[str, Any]:
+def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
     """Return the figures of a plan for --json."""
+    names = built.scene.names
     return {
         "sensor": sensor,
         "places": len(plan.candidates),
@@ -690,12 +696,15 @@ def _plan_figures(
             name: {"visible_m2": float(visible), "covered_m2": float(covered)}
             for name, visible, covered in zip(names, plan.visible_m2, plan.covered_m2, strict=True)
         },
+        "epsg": built.survey.epsg,
+        "world_origin": [*built.scenario.world.origin],
         "notes": notes,
     }
 
 
-def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
+def _plan_lines(plan: StationPlan, built: Built) -> Iterator[str]:
     """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
+    names = built.scene.names
     yield (
         f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
         f"{plan.visible_m2.sum():,.0f} m²"
@@ -723,3 +732,4 @@ def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     blind = len(names) - len(order)
     if blind:
         yield f"out of sight from all places: {plural(blind, 'object')}"
+    yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)

@@ -159,10 +159,10 @@ class PlainLines:
         sweeps = f" ({progress.sweeps_in_words})" if progress.sweeps else ""
         all_sweeps = f" ({plural(progress.sweeps, 'sweep')})" if progress.sweeps else ""
         survey_summary = f"{scans:,} scans{all_sweeps}, {progress.points:,} points"
-        unit = f"scans{sweeps}, {progress.points:,} points"
+        survey_unit = f"scans{sweeps}, {progress.points:,} points"
         trials = progress.trials
         for stage, count, total, unit, stage_summary in (
-            ("survey", scans_done, scans, unit, survey_summary),
+            ("survey", scans_done, scans, survey_unit, survey_summary),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
             ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):

@@ -96,9 +96,9 @@ class Scenario(Section):
     planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin (default
-        objects), 1, 2 and 3 metres above the ground; in mesh files chosen by `place_sensor`: in the
-        middle of a room or landscape, or around an object.
+        Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin
+        (default objects), 1, 2 and 3 metres above the ground; in mesh files chosen by
+        `place_sensor`: in the middle of a room or landscape, or around an object.
     steps, classes
         Time steps from each pose, and names of semantic classes, {number: name}.
 

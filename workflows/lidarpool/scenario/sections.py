@@ -38,8 +38,8 @@ from lidarsim.sensor.beams import Rate, Step
 from lidarsim.sensor.materials import SemanticClass
 from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor
 from lidarsim.sensor.packet_settings import Identifier
-from lidarsim.sensor.survey import EpsgCode
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
+from lidarsim.sensor.survey import EpsgCode
 
 from ..export.formats import Format
 from ..plan.planning import Search
