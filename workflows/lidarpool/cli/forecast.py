@@ -85,6 +85,7 @@ def forecast_scenario(
             file_format = campaign.keep.of_jobs
             figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
             figures["notes"] += file_format.renamed([*scenario.sensors])
+            figures["notes"] += file_format.unlabelled(job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 

@@ -72,6 +72,8 @@ class FormatRow:
         In data sets: path of a job's file or folder, if it has one, by `Entry`.
     boxes
         In data sets: whether its pieces are sweeps, and each comes with its boxes of actors.
+    actor_boxes
+        Whether its files have the boxes of actors.
     raw
         In data sets: whether a sweep has files of its own, which hold rows of numbers.
     plugin
@@ -99,8 +101,18 @@ class FormatRow:
     data_set: str = ""
     of_job: str = ""
     boxes: bool = False
+    actor_boxes: bool = False
     raw: bool = False
     plugin: Plugin | None = field(default=None, compare=False)
+
+    def holds_column(self, name: str, *, classes_have_names: bool = False) -> bool:
+        """Return True if the format holds a column of any layout.
+
+        Some formats hold classes only if the classes have names.
+        """
+        if self.holds is None or name in self.holds:
+            return True
+        return classes_have_names and name in self.named
 
     @property
     def missing_packages(self) -> list[str]:
@@ -176,6 +188,7 @@ def _osi(name: str, file: str) -> FormatRow:
         needs=("scan", *_OSI[:3]),
         holds=_OSI,
         compensates=True,
+        actor_boxes=True,
     )
 
 
@@ -193,6 +206,7 @@ def _bag(name: str, file: str, **fields: Any) -> FormatRow:
         organized_layouts=_ORGANIZED_LAYOUTS,
         raw_or_compensated=True,
         laser_scans=True,
+        actor_boxes=True,
         **fields,
     )
 
@@ -259,6 +273,7 @@ FORMATS = {
         inside=_KITTI_FILES,
         data_set="kitti",
         boxes=True,
+        actor_boxes=True,
         raw=True,
     ),
     "nuscenes": FormatRow(
@@ -274,6 +289,7 @@ FORMATS = {
         inside=_NUSCENES_FILES,
         data_set="nuscenes",
         boxes=True,
+        actor_boxes=True,
         raw=True,
     ),
     "webdataset": FormatRow(
@@ -285,6 +301,7 @@ FORMATS = {
         inside=r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz",
         data_set="webdataset",
         boxes=True,
+        actor_boxes=True,
     ),
     "pcap": FormatRow(
         "packets",
@@ -303,6 +320,7 @@ FORMATS = {
         needs=("scan", "object"),
         compensates=True,
         with_scene=True,
+        actor_boxes=True,
     ),
     # Readers take the type of messages from the part «sd» of the file's name.
     "osi": _osi("osi", "cloud_sd.osi"),

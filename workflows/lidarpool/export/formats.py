@@ -17,6 +17,7 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.sensor import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
@@ -123,9 +124,28 @@ class Format:
 
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return notes for the user on the cloud in this format."""
-        left_out = ", ".join(self.left_out(cloud, sweeps))
-        notes = [f"{self.format} does not hold {left_out}"] if left_out else []
+        left_out = self.left_out(cloud, sweeps)
+        unnamed = [name for name in left_out if name in self.row.named]
+        never_held = ", ".join(name for name in left_out if name not in unnamed)
+        notes = [f"{self.format} does not hold {never_held}"] if never_held else []
+        notes += [
+            f"{self.format} holds {name} only if classes have names: give classes: "
+            "{1: ground, …} (docs/how-to/labels.md)"
+            for name in unnamed
+        ]
         return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
+
+    def unlabelled(self, survey: Survey) -> list[str]:
+        """Return a note if the format labels points by class, and nothing in a survey has one."""
+        if "class" not in self.row.needs:
+            return []
+        if any(material.semantic_class for material in survey.materials):
+            return []
+        return [
+            f"{self.format} labels points by class, and all have class 0: give class: in "
+            "materials, copies, actors or traffic, and the names in classes: "
+            "(docs/how-to/labels.md)"
+        ]
 
     def renamed(self, sensors: Sequence[str]) -> list[str]:
         """Return a note if sensors of these names, "" without one, have others in the format."""

@@ -53,7 +53,10 @@ def advice(built: Built) -> list[str]:
         f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
         "cloud.precision_m in a scenario"
     ] * (side < MIN_STEPS * step)
-    settings = (*coarse, *scanners, *_without_effect(built.scenario))
+    unlabelled = [
+        note for entry in built.scenario.output.write for note in entry.unlabelled(built.survey)
+    ]
+    settings = (*coarse, *scanners, *unlabelled, *_without_effect(built.scenario))
     lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
 

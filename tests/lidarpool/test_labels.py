@@ -1,0 +1,91 @@
+"""The page on labels: its tables are those of the registry of formats, and its scenario labels."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from tests.drives import points_of, the_scene, the_sweeps
+
+from lidarpool.export.format_table import FORMATS
+from lidarpool.export.formats import Format
+from lidarpool.live.preview import first_sweeps
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+
+PAGE = (Path(__file__).parents[2] / "docs/how-to/labels.md").read_text("utf-8")
+
+
+def table_below(heading):
+    """Rows of the first table below a heading: {format: further cells}, a row for each format."""
+    section = PAGE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    return {name: cells for first, *cells in rows[2:] for name in re.findall(r"`([\w.]+)`", first)}
+
+
+def test_the_table_of_labels_is_that_of_the_registry():
+    page = table_below("What each format holds")
+    assert page.keys() == FORMATS.keys()
+    for name, row in FORMATS.items():
+        thing, semantic_class, boxes = page[name]
+        assert (thing != "no") == row.holds_column("object"), name
+        assert (semantic_class != "no") == row.holds_column("class", classes_have_names=True), name
+        only_named = not row.holds_column("class") and semantic_class != "no"
+        assert ("if classes have names" in semantic_class) == only_named, name
+        assert (boxes != "no") == row.actor_boxes, name
+
+
+def test_names_of_classes_are_in_the_formats_that_the_page_says(tmp_path):
+    scene = the_scene()
+    sweeps = replace(the_sweeps(scene), classes={3: "cobblestone"})
+    holding = set()
+    for name, row in FORMATS.items():
+        if name in ("pcap", "rrd", "images") or row.missing_packages:
+            continue  # of a maker's sensors, of a large package, of all rays
+        Format(name).write(tmp_path / row.file, points_of(scene, 0), sweeps)
+        files = [tmp_path / row.file, *(tmp_path / row.file).rglob("*")]
+        if any(b"cobblestone" in file.read_bytes() for file in files if file.is_file()):
+            holding.add(name)
+    listed = {*table_below("Names of classes")}
+    files = {Path(row.file).name: name for name, row in FORMATS.items()}
+    assert {files.get(name, name) for name in listed} & {*FORMATS} - {"rrd"} == holding
+
+
+def test_the_scenario_of_the_page_labels_its_points():
+    code = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1]
+    job = build(Scenario.from_data(yaml.safe_load(code))).job()
+    (cloud,) = first_sweeps(job)
+    assert {*cloud["class"].tolist()} == {40, 70}
+    assert job.survey.classes == {40: "road", 70: "vegetation"}
+
+
+@pytest.mark.parametrize(
+    ("materials", "notes"),
+    [
+        ([], ["kitti labels points by class, and all have class 0: give class: in "]),
+        ([{"objects": "*", "class": 4}], []),
+    ],
+)
+def test_labelled_formats_without_classes_are_noted(materials, notes):
+    data = {"output": {"write": ["kitti", "las"]}, "materials": materials}
+    told = [note for note in advice(build(Scenario.from_data(data))) if "class" in note]
+    assert len(told) == len(notes) and all(map(str.startswith, told, notes))
+
+
+def test_the_note_on_classes_without_names_says_what_to_give():
+    scene = the_scene()
+    sweeps = the_sweeps(scene)
+    cloud = points_of(scene, 0)
+    assert "class" in {column.name for column in cloud.table}
+    for name in ("mcap", "nuscenes"):
+        told = [note for note in Format(name).notes(cloud, sweeps) if "class" in note]
+        assert told == [
+            f"{name} holds class only if classes have names: give classes: {{1: ground, …}} "
+            "(docs/how-to/labels.md)"
+        ]
+        named = replace(sweeps, classes={1: "ground"})
+        assert not [note for note in Format(name).notes(cloud, named) if "class" in note]
+    (note,) = [note for note in Format("e57").notes(cloud, sweeps) if "class" in note]
+    assert note.startswith("e57 does not hold ") and "classes:" not in note
