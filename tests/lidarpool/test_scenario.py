@@ -355,15 +355,15 @@ def test_a_file_that_is_lost_is_told_beside_other_faults_and_a_similar_name(scen
 
 def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario):
     read = scenario("cloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}")
-    las, kitti = advice(build(read))
+    las, kitti = (note for note in advice(build(read)) if "class" not in note)
     assert "expect points in one coordinate system" in las and "use world" in las
     assert "kitti holds points compensated for motion" in kitti
-    assert advice(build(scenario("output: {write: [laz, kitti]}"))) == []
+    assert advice(build(scenario("output: {write: [laz, pcd]}"))) == []
 
 
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
-    (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, kitti]}")))
+    (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
     assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
     assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
 

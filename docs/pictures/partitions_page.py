@@ -1,0 +1,117 @@
+"""The page of partitions, as a browser shows it while two partitions work.
+
+`python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a cluster of this
+machine, sends items from a task of IO through a pipe to tasks of GPU, and has Chromium draw the
+page. Workers of this machine stand for machines with GPUs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+
+from distributed import Client, LocalCluster
+
+from poolpart import Partition, Pipe, PipeFailed, Pool, n_workers, rest
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+SIZE = (760, 720)  # pixels
+CLUSTER = {
+    "n_workers": 5,
+    "threads_per_worker": 1,
+    "dashboard_address": "127.0.0.1:0",
+    "silence_logs": "ERROR",
+}
+ITEM_S = 0.5  # of a task for an item
+ITEMS = 2000  # more than are done before the picture is taken
+DONE = 6  # tasks of GPU before the picture is taken
+
+
+def load(pipe: Pipe, count: int) -> None:
+    """Put numbers into a pipe, which waits while the pipe is full."""
+    for number in range(count):
+        pipe.put(number)
+
+
+def shrink(number: int) -> int:
+    """Stand for a task on a GPU."""
+    time.sleep(ITEM_S)
+    return number
+
+
+def index(number: int) -> int:
+    """Stand for a task of the remaining workers."""
+    time.sleep(4 * ITEM_S)
+    return number
+
+
+@contextmanager
+def page_at_work(client: Client) -> Iterator[str]:
+    """Divide a cluster, give the partitions work, and yield the address of the page."""
+    pool = Pool.from_client(client)
+    rules = {"GPU": n_workers(2), "IO": n_workers(1), "OTHER": rest()}
+    gpu, io, other = pool.divide(rules).values()
+    with Pipe("pictures", 8, client) as pipe:
+        url = pool.page()
+        loading = io.submit(load, pipe, ITEMS)
+        indexing = [other.submit(index, number) for number in range(40)]
+        shrinking = Thread(target=_until_it_fails, args=(gpu, pipe))
+        shrinking.start()
+        while gpu.stats().done < DONE:
+            time.sleep(ITEM_S)
+        yield url
+        pipe.fail("the picture is taken")
+        shrinking.join()
+        client.cancel([loading, *indexing])
+
+
+def _until_it_fails(gpu: Partition, pipe: Pipe) -> None:
+    """Run a task for each item of a pipe."""
+    with suppress(PipeFailed):
+        gpu.for_each(pipe, shrink)
+
+
+def draw(url: str, picture: Path) -> None:
+    """Have a browser draw a page into a PNG; RuntimeError without a browser, or if it fails."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        raise RuntimeError(f"The picture needs a browser, one of {', '.join(BROWSERS)}.")
+    with tempfile.TemporaryDirectory() as profile:
+        options = [
+            "--headless=new",
+            "--no-sandbox",
+            "--hide-scrollbars",
+            "--disable-dev-shm-usage",
+            f"--user-data-dir={profile}",
+            f"--window-size={SIZE[0]},{SIZE[1]}",
+            f"--screenshot={picture.absolute()}",
+        ]
+        ended = subprocess.run([program, *options, url], capture_output=True, timeout=120)
+    if ended.returncode or not picture.exists():
+        raise RuntimeError(f"{program} drew no picture: {ended.stderr.decode()[-500:]}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw the picture, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("picture", type=Path, help="a .png file")
+    chosen = parser.parse_args(arguments)
+    with (
+        LocalCluster(**CLUSTER) as cluster,
+        Client(cluster) as client,
+        page_at_work(client) as url,
+    ):
+        draw(url, chosen.picture)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
