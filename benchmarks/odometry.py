@@ -7,7 +7,7 @@ sensor's axes at its firing, as drivers publish it; KISS-ICP (Vizzo et al., 2023
 motion and moves the points of a sweep to its end. The table has the distances of these points from
 their true positions. With deskewing they are small only if the bag's points are not compensated.
 
-It needs KISS-ICP (pip install kiss-icp) and lidarpool[ros].
+It needs KISS-ICP (pip install kiss-icp) and the extra ros of lidarpool.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements, such as ``lidarpool[las]``, here.
+    """Return the command that installs requirements, such as ``pye57>=0.4``, here.
 
     Environments of uv have no pip, and those of conda may lack it.
     """

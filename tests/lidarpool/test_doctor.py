@@ -7,6 +7,8 @@ from contextlib import closing
 import pytest
 
 from lidarpool.cli import doctor
+from lidarsim.base.extras import install_command
+from raybeam import installation
 
 SOUND = {
     "machine": {"available_memory_gib": 8.0, "disk_gib": {"/tmp": 9.0}},
@@ -56,6 +58,15 @@ def test_a_port_that_is_in_use(monkeypatch):
         assert any(f"{port} " in line and "in use, for a test" in line for line in lines)
 
 
+def test_extras_are_added_in_the_checkout(monkeypatch):
+    monkeypatch.setattr(installation, "find_spec", lambda name: "a spec")
+    at = "in lidarpool's checkout (docs/install.md#extras)"
+    assert install_command("lidarpool[las]") == f'pip install ".[las]" {at}'
+    assert install_command("lidarpool") == f"pip install . {at}"
+    assert install_command("torch") == "pip install torch"
+    assert f"extras, which are added {at}" in doctor.in_words(doctor.examine())
+
+
 def test_an_extra_that_is_missing_names_its_command(monkeypatch):
     monkeypatch.setattr(
         doctor,
@@ -63,5 +74,5 @@ def test_an_extra_that_is_missing_names_its_command(monkeypatch):
         lambda name: ["laspy>=2.5; extra == 'las'", "nowhere>=1; extra == 's3'", "numpy>=2"],
     )
     states = doctor._extras()
-    assert states["las"] == "ready" and states["s3"] == 'pip install "lidarpool[s3]"'
+    assert states["las"] == "ready" and states["s3"] == 'pip install ".[s3]"'
     assert "dev" not in states

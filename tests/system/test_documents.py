@@ -476,13 +476,23 @@ EXTRAS = {
 }
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [path for path in DOCUMENTS if path.name != "install.md"], ids=lambda path: path.name
+)
 def test_pages_name_the_extras_that_their_examples_need(path):
     code = "\n".join(block.code for block in blocks_of(path))
     text = path.read_text("utf-8")
-    named = {extra for names in re.findall(r"\[([\w,]+)\]", text) for extra in names.split(",")}
+    named = {*re.findall(r"\[`(\w+)`\]\([./]*install\.md#extras\)", text)}
     needed = {extra for extra, pattern in EXTRAS.items() if re.search(pattern, code)}
     assert needed - named == set()
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_one_page_says_how_extras_are_added(path):
+    """The distribution is on no index: `pip install "lidarpool[las]"` fails."""
+    text = path.read_text("utf-8")
+    assert "lidarpool[" not in text
+    assert (re.search(r"pip install \"?\.\[(?!bench)", text) is None) or path.name == "install.md"
 
 
 def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:

@@ -17,10 +17,11 @@ from distributed.system import MEMORY_LIMIT
 from packaging.requirements import Requirement
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
+from lidarsim.base.extras import CHECKOUT
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 from raybeam.compiled import HAS_CACHE
+from raybeam.installation import install_command
 
 from ..base.open3d_module import load_open3d
 from ..report.report import versions
@@ -73,7 +74,7 @@ def _open3d_state() -> str:
 
 
 def _extras() -> dict[str, str]:
-    """Return the state of each extra by its name: `READY`, or the command that installs it."""
+    """Return the state of each extra by its name: `READY`, or the command of the checkout."""
     try:
         names = metadata("lidarpool").get_all("Provides-Extra") or []
     except PackageNotFoundError:  # a checkout that is not installed
@@ -89,7 +90,7 @@ def _extras() -> dict[str, str]:
             and not requirement.marker.evaluate({"extra": ""})
         ]
         is_ready = all(map(_is_installed, requirements_of_extra))
-        states[name] = READY if is_ready else install_command(f"lidarpool[{name}]")
+        states[name] = READY if is_ready else install_command(f".[{name}]")
     return states
 
 
@@ -158,7 +159,8 @@ def in_words(figures: dict[str, Any]) -> list[str]:
         "writing clouds": figures["open3d"],
     }
     lines = [f"{name:<14} {value}" for name, value in rows.items()]
-    for title, states in (("backends", figures["backends"]), ("extras", figures["extras"])):
+    extras = f"extras, which are added in {CHECKOUT}"
+    for title, states in (("backends", figures["backends"]), (extras, figures["extras"])):
         lines.append(title)
         lines += [f"  {name:<12} {state}" for name, state in states.items()]
     lines.append("ports of 127.0.0.1")

@@ -145,7 +145,7 @@ class Foxglove(_InViewer):
     Raises
     ------
     LidarError
-        If foxglove-sdk is missing (`pip install "lidarpool[live]"`), the address cannot be used, or
+        If foxglove-sdk is missing (the extra `live`), the address cannot be used, or
         others than this machine can reach the address.
     """
 
@@ -158,7 +158,7 @@ class Rerun(_InViewer):
     """Shows the sweeps of a scanner in Rerun, in real time; see `Foxglove`.
 
     It prints the link of the viewer in the browser. By default it listens on 127.0.0.1:9876, with
-    the page on the next port. It needs rerun-sdk (`pip install "lidarpool[rerun]"`).
+    the page on the next port. It needs rerun-sdk (the extra `rerun`).
     """
 
     @checked

@@ -8,12 +8,22 @@ from importlib.util import find_spec
 
 from .errors import LidarError, prefixed, unreadable
 
+CHECKOUT = "lidarpool's checkout (docs/install.md#extras)"
+
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements, such as ``lidarpool[las]``, here."""
+    """Return the command that installs requirements, such as ``lidarpool[las]``, here.
+
+    lidarpool is on no package index: its extras are added from a checkout.
+    """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
-    return install_command(*requirements)
+    local = [
+        f".{name.removeprefix('lidarpool')}" if name.partition("[")[0] == "lidarpool" else name
+        for name in requirements
+    ]
+    command = install_command(*local)
+    return command if local == [*requirements] else f"{command} in {CHECKOUT}"
 
 
 def need(package: str, extra: str, purpose: str) -> None:

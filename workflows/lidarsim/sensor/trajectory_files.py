@@ -92,7 +92,7 @@ def load_trajectory(
         TUM (rows of time, x, y, z, qx, qy, qz, qw); KITTI (rows of a 3 x 4 matrix); a table with
         a header, separated by commas, semicolons, tabs or spaces, as EuRoC's data.csv; a folder
         «oxts» of KITTI; or a bag of ROS 2 (.mcap, .db3 or its folder), which needs
-        ``lidarpool[ros]``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
+        the extra ``ros``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
         yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg; without rotations
         the carrier faces its direction of travel.
     format

@@ -92,7 +92,8 @@ class JobUnderWay(PipelineJob):
     def progress(self) -> Progress:
         """Return the progress of a resumed run at its start."""
         framed = self.frames - self.scans.start
-        start, stop = self.scans.start, self.scans.stop
+        start = self.scans.start
+        stop = self.scans.stop
         return Progress(
             scans=len(self.scans),
             generated=framed,
