@@ -487,6 +487,23 @@ def test_pages_name_the_extras_that_their_examples_need(path):
     assert needed - named == set()
 
 
+def test_the_readme_has_the_commands_of_a_bare_machine_in_their_order():
+    """As they are typed; the system packages are those that .ci/setup installs."""
+    text = (ROOT / "README.md").read_text("utf-8")
+    places = [
+        text.index(command)
+        for command in (
+            "\napt-get update\n", "\napt-get install ", "\ngit clone ", "\nmake demo ",
+            "\nmake test ", "\nlidarpool scene ",
+        )
+    ]  # fmt: skip
+    assert places == sorted(places)
+    packages = re.search(r"apt-get install -y (.*)", text)[1].split()
+    setup = (ROOT / ".ci/setup").read_text("utf-8")
+    assert [name for name in packages if name not in setup] == ["git"]
+    assert len(text.split()) <= 601
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_one_page_says_how_extras_are_added(path):
     """The distribution is on no index: `pip install "lidarpool[las]"` fails."""
