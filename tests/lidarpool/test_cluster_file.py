@@ -85,7 +85,7 @@ WRONG = {
     "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
     "no such package": (
         GOOD.replace("distributed.", "dask_jobqueues."),
-        r"is not installed.*lidarpool\[clusters\]",
+        r"is not installed.*\.\[clusters\]",
     ),
     "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "cannot be started by partition"),
     "another class": (

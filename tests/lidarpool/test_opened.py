@@ -349,7 +349,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         assert len(str(raised.value).splitlines()) == 1
     monkeypatch.setattr("lidarsim.base.extras.find_spec", lambda name: None)
     for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet")):
-        with pytest.raises(LidarError, match=rf"lidarpool\[{extra}\]"):
+        with pytest.raises(LidarError, match=rf"\.\[{extra}\]"):
             open_view(folder / name)
 
 

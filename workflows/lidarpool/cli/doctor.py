@@ -159,7 +159,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
         "writing clouds": figures["open3d"],
     }
     lines = [f"{name:<14} {value}" for name, value in rows.items()]
-    extras = f"extras, which are added in {CHECKOUT}"
+    extras = f"{'extras':<14} added in {CHECKOUT}"
     for title, states in (("backends", figures["backends"]), (extras, figures["extras"])):
         lines.append(title)
         lines += [f"  {name:<12} {state}" for name, state in states.items()]
