@@ -140,7 +140,7 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
     if "dask_jobqueue" in block.code:
         import_jobqueue()
     if "Foxglove" in block.code:
-        pytest.importorskip("foxglove", reason='needs foxglove-sdk: the extra live')
+        pytest.importorskip("foxglove", reason="needs foxglove-sdk: the extra live")
     if "import mujoco" in block.code:
         pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
     folder = tmp_path / "lidarpool-out"
