@@ -27,6 +27,7 @@ _SECTIONS = {
     "scene: copies: table": "CopyTable",
     "scene: copies: scatter": "Scatter",
     "scene: ground": "Ground",
+    "world": "WorldSection",
     "sensor": "SensorSection",
     "sensor: packets": "PacketSection",
     "poses": "Pose",
