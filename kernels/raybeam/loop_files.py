@@ -125,10 +125,10 @@ def remove_unfinished(folder: str, is_locked: bool) -> None:
     `is_locked` says that no other process writes in the folder; otherwise only old files are
     removed.
     """
-    last_s = time.time() - (0.0 if is_locked else _ABANDONED_S)
+    abandoned_s = time.time() - _ABANDONED_S
     for path in Path(folder).glob(_UNFINISHED):
         with suppress(OSError):
-            if path.stat().st_mtime <= last_s:
+            if is_locked or path.stat().st_mtime <= abandoned_s:
                 path.unlink()
 
 

@@ -123,6 +123,11 @@ def replaced(content):
     return pickle.dumps(Trap())
 
 
+def notes(caplog):
+    """What raybeam has logged; clients of earlier tests may log that they have lost a scheduler."""
+    return [record.getMessage() for record in caplog.records if record.name.startswith("raybeam")]
+
+
 @pytest.mark.extended
 @pytest.mark.parametrize("damage", [cut, emptied, flipped, replaced])
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
@@ -130,9 +135,9 @@ def test_a_damaged_loop_is_compiled_again_with_a_note(package, function, caplog,
     assert compilations(function) == 1
     file = file_of(package, kind)
     file.write_bytes(damage(file.read_bytes()))
-    assert not caplog.messages
+    assert not notes(caplog)
     assert compilations(function) == 1
-    assert caplog.messages == [
+    assert notes(caplog) == [
         f"Compiled loops in {file.parent} are damaged and are compiled again. The first is "
         f"{file.name}."
     ]
