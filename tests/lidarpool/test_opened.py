@@ -188,6 +188,14 @@ def test_files_of_other_programs(tmp_path):
     assert [label[0] for label in legend["labels"]] == ["ground", "high vegetation", "building"]
 
 
+@pytest.mark.parametrize(("comment", "epsg"), [("comment crs: EPSG:25832\n", 25832), ("", None)])
+def test_the_coordinate_system_of_a_file_is_told(tmp_path, comment, epsg):
+    head = f"ply\nformat ascii 1.0\n{comment}element vertex 1\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(f"{head}end_header\n500000 5400000 3\n")
+    assert state_of(open_view(tmp_path / "a.ply"))["epsg"] == epsg
+
+
 def test_a_mesh_and_a_scenario_are_previews_of_their_run(tmp_path):
     (tmp_path / "wall.obj").write_text("v 5 -5 0\nv 5 5 0\nv 5 5 4\nv 5 -5 4\nf 1 2 3 4\n")
     (tmp_path / "drive.yaml").write_text(
