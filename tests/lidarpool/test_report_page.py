@@ -363,6 +363,21 @@ def test_what_is_unusual_is_told(write, changes, words):
     assert words in write(**changes)[0]
 
 
+@pytest.mark.parametrize(
+    ("note", "shown"),
+    [
+        ("all points are of class 0", "All points are of class 0"),
+        ("KITTI does not hold time", "KITTI does not hold time"),
+        ("nuScenes does not hold time", "nuScenes does not hold time"),
+        ("rosbag2 does not hold time", "rosbag2 does not hold time"),
+        ("wall.obj has no faces", "wall.obj has no faces"),
+    ],
+)
+def test_notes_begin_with_a_capital_unless_with_a_name(write, note, shown):
+    page = html.fromstring(write(notes=(note,))[0])
+    assert page.xpath("//section[@class='notes']//li/text()") == [shown]
+
+
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
     assert "The path" not in text and "swarm" not in text and text.count(" hidden>") == 1

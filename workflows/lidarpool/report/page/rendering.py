@@ -90,11 +90,15 @@ def put_picture(page: Path, name: str, svg: str) -> None:
 
 
 def from_above(counts: Ints) -> str:
-    """Draw numbers of points (rows, columns), the first row in the south, as SVG."""
+    """Draw numbers of points (rows, columns), the first row in the south, as SVG.
+
+    The page inverts its lightness where the page is dark.
+    """
     rows, columns = counts.shape
-    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
     shade = np.log1p(counts[::-1])
-    pixels[..., 3] = 255 * shade / max(shade.max(), 1)
+    weakest = np.where(counts[::-1] > 0, 40, 0)  # of 255: single points are visible, too
+    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
+    pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "PNG")
     source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
@@ -145,6 +149,7 @@ def _template(name: str) -> Template:
         markdown,
         millimetres,
         ratio,
+        sentence,
         plural,
     ):
         environment.filters[filter_.__name__] = filter_
@@ -261,6 +266,18 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
         detail = f"{STAGES[stage]}, {plural(len(records), 'task')}, {work}"
         rows.append(axis.row(worker, stage, detail, ((task.start, task.stop) for task in records)))
     return rows
+
+
+def sentence(note: str) -> str:
+    """Return a note that begins with a capital, unless its first word is a name: wall.obj, rosbag2.
+
+    Examples
+    --------
+    >>> sentence("all points are in rain"), sentence("wall.obj has no faces")
+    ('All points are in rain', 'wall.obj has no faces')
+    """
+    first = note.partition(" ")[0].rstrip(",:;")
+    return f"{note[:1].upper()}{note[1:]}" if first.isalpha() and first.islower() else note
 
 
 def printable(text: str) -> str:
