@@ -361,14 +361,18 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             open_view(folder / name)
 
 
-@pytest.mark.parametrize("kind", ["folder", "kitti", "mcap", "webdataset"])
-def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind):
+@pytest.mark.parametrize(
+    ("kind", "title"),
+    [("folder", "PLY"), ("kitti", "KITTI"), ("mcap", "MCAP"), ("webdataset", "WebDataset")],
+)
+def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind, title):
     scene = the_scene()
     write_set(tmp_path / "set", kind, scene, the_sweeps(scene))
     assert is_data_set(tmp_path / "set") and not is_data_set(tmp_path)
     jobs = JobList(tmp_path / "set")
     told, _ = jobs.answer("jobs", {}, bool)
     assert (told["count"], told["done"], told["failed"], told["over"]) == (6, 5, 1, True)
+    assert told["state"] == f"data set in the format {title}"
     assert [job["name"] for job in told["ended"]] == ["00", "01", "02", "04", "05"]
     assert [job["error"] for job in told["failures"]] == ["failed"]
     assert told["ended"][1]["values"] == ["0.5"] and told["names"] == ["rain"]

@@ -253,7 +253,7 @@ FORMATS = {
         "images",
         "lidarpool.export.images",
         "Pieces",
-        "a range image",
+        "range images",
         in_pieces=True,
         needs=("scan", *_ALL_RAYS),
         inside=r"[^/]+/\d+\.npz",
@@ -345,6 +345,11 @@ FORMATS = {
 }
 DATA_SETS = {row.data_set: name for name, row in FORMATS.items() if row.data_set}  # {its: of jobs}
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
+
+
+def data_set_title(data_set: str) -> str:
+    """Return the proper name of the format of a data set's jobs, such as KITTI."""
+    return FORMATS[DATA_SETS[data_set]].title if data_set in DATA_SETS else data_set
 
 
 def row_of(name: str) -> FormatRow:

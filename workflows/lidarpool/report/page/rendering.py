@@ -29,6 +29,7 @@ from lidarsim.sensor import Noise, Returns
 from lidarsim.sensor.weather import Weather
 from lidarview.render.stage import nice_step
 
+from ...export.format_table import data_set_title
 from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult
@@ -150,6 +151,7 @@ def _template(name: str) -> Template:
         millimetres,
         ratio,
         sentence,
+        data_set_title,
         plural,
     ):
         environment.filters[filter_.__name__] = filter_

@@ -6,7 +6,7 @@ THREE.ColorManagement.enabled = false; // colours are those of the legends
 
 const THEMES = {
   light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
-  dark: { back: 0x14171c, grid: 0x2a3038, surface: 0x3c434d, rays: 0x8f3c48 },
+  dark: { back: 0x14171c, grid: 0x363e48, surface: 0x3c434d, rays: 0x8f3c48 },
 };
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
 const FOV = 45; // degrees, from the upper to the lower edge
@@ -113,7 +113,7 @@ function bend({ mesh, poses, faces }, frame) {
 function stationsOf({ name, labels, places, at }) {
   const distinct = new Map(labels.map((label, k) => [label, places.subarray(3 * k, 3 * k + 3)]));
   if (distinct.size < 2) return [[name || "sensor", at]];
-  return [...distinct].map(([label, place]) => [label, place, "station"]);
+  return [...distinct].map(([label, place]) => [label, place, at.every((value, axis) => value === place[axis]) ? "station now" : "station"]);
 }
 
 export class Picture {
@@ -646,10 +646,12 @@ export class Picture {
     for (const [text, place, kind = ""] of this.labelled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
-      const wide = 7 * text.length + 14, y = ((1 - at.y) / 2) * height - 24;
-      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + 8, width - wide));
-      if (taken.some(([a, b, c]) => x < a + c && a < x + wide && Math.abs(y - b) < 22)) continue;
-      taken.push([x, y, wide]);
+      // Stations have their number on their mark, other things their name beside it.
+      const on = kind.startsWith("station"), wide = 7 * text.length + (on ? 11 : 14), tall = on ? 18 : 22;
+      const y = ((1 - at.y) / 2) * height - (on ? 9 : 24);
+      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + (on ? -wide / 2 : 8), width - wide));
+      if (taken.some(([a, b, c, d]) => x < a + c && a < x + wide && y < b + d && b < y + tall)) continue;
+      taken.push([x, y, wide, tall]);
       shown.push([text, x, y, kind]);
     }
     while (this.labels.children.length < shown.length) this.labels.append(element("span"));
