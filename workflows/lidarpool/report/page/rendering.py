@@ -270,8 +270,10 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
     return rows
 
 
-def sentence(note: str) -> str:
-    """Return a note that begins with a capital, unless its first word is a name: wall.obj, rosbag2.
+def sentence(note: str, names: Iterable[str] = ()) -> str:
+    """Return a note that begins with a capital, unless it begins with a name: wall.obj, rosbag2.
+
+    `names` are names that look like words.
 
     Examples
     --------
@@ -279,7 +281,8 @@ def sentence(note: str) -> str:
     ('All points are in rain', 'wall.obj has no faces')
     """
     first = note.partition(" ")[0].rstrip(",:;")
-    return f"{note[:1].upper()}{note[1:]}" if first.isalpha() and first.islower() else note
+    is_name = not (first.isalpha() and first.islower()) or note.startswith((*filter(None, names),))
+    return note if is_name else f"{note[:1].upper()}{note[1:]}"
 
 
 def printable(text: str) -> str:
