@@ -34,4 +34,17 @@ def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):
     assert low < 60 and middle > 235 and high > 250, "dark letters on a light page"
     low, middle, high = spread["dark"]
     assert low < 40 and middle < 60 and high > 190, "light letters on a dark page"
+    # The points from above are light on dark, and the page has more than them in its window.
+    pixels = "document.querySelector('figure[data-picture=above] svg').getBoundingClientRect()"
+    shown = (
+        f"(({{left, top, width, height}}) => [left, top, width, height].map(Math.round))({pixels})"
+    )
+    tab.value("scrollTo(0, 0)")
+    left, top, width, height = tab.value(shown)
+    assert height <= 0.6 * tab.value("innerHeight")
+    tab.value(f"scrollTo(0, {top})")
+    left, top, width, height = tab.value(shown)
+    page = tab.picture(tmp_path / "above.png")
+    picture = page[top : top + height, left : left + width].mean(axis=2)
+    assert np.median(picture) < 60 and picture.max() > 140
     assert tab.errors == []

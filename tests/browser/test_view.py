@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
-from lidarpool import Scene, Sensor, Survey, Track
+from lidarpool import Pose, Scene, Sensor, Survey, Track
 from lidarpool.live.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
+from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import page_of
@@ -72,6 +73,66 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     tab.choose("colour", "not shown")
     tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
+
+
+def test_stations_are_numbered_and_a_place_is_told_in_the_coordinate_system(new_tab, tmp_path):
+    scene = Scene.from_meshes([box("Room", (20, 20, 0.1))])
+    survey = Survey(
+        Sensor.grid(layers=4, rays_per_revolution=36),
+        [Pose((-5, 0, 2)), Pose((5, 0, 2)), Pose((0, 6, 2))],
+        epsg=25832,
+    )
+    rays = np.zeros((0, 2, 3), np.float32)
+    hits = np.zeros(scene.triangles, np.int64)
+    pictured = PictureContent(scene, sensor_positions(survey), hits, rays)
+    sweeps = Sweeps.from_survey(survey, scene)
+    view = View(CloudFile(spiral(tmp_path / "cloud.ply", WET), [WET]), pictured, sweeps)
+    with page_server(view.answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.wait_for(lambda _: drawn(tab) == COUNT)
+        shown = "[...document.querySelectorAll('#labels .station')].map(label => label.textContent)"
+        tab.wait_for(lambda _: tab.value(shown) == ["1", "2", "3"])
+        tab.wait_for(lambda _: tab.value(f"!!{PICTURE}.surface"))
+        place = "document.getElementById('place').textContent"
+        assert tab.value(place) == "EPSG:25832"
+        # On a point, then on the floor where no point is.
+        for is_point in (True, False):
+            found = "({ place: [1, 2, 3] })" if is_point else "null"
+            tab.value(f"{PICTURE}.pick = () => {found}")
+            tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=480 + is_point, y=250)
+            tab.wait_for(lambda _: "x " in tab.value(place))
+            told = tab.value(place)
+            numbers = [float(number) for number in re.findall(r"-?[\d.]+(?= m)", told)]
+            assert told.startswith("EPSG:25832")
+            if is_point:
+                assert numbers == [1, 2, 3]
+                tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=1200, y=600)
+                tab.wait_for(lambda _: tab.value(place) == "EPSG:25832")
+            else:
+                assert numbers[2] == 0.1 and max(map(abs, numbers[:2])) < 11
+        assert tab.errors == []
+
+
+def test_a_page_that_loads_says_so_and_its_heading_is_whole(view, new_tab):
+    name = "a survey of the long hall, the yard behind it and the road to the harbour"
+    asked = threading.Event()
+
+    def answer(question, *arguments):
+        if question == "points":
+            assert asked.wait(60)
+        return view.answer(question, *arguments)
+
+    view.title = f"{name} - lidarpool"
+    with page_server(answer, port=0) as page:
+        tab = new_tab("about:blank")
+        tab.resize(1280)
+        tab.open(page.url)
+        tab.wait_for(lambda text: "Reading the points …" in text)
+        asked.set()
+        tab.wait_for(lambda text: "30,000 points" in text and "Reading" not in text)
+    heading = "document.querySelector('#panel h1')"
+    assert tab.value(f"{heading}.textContent") == name
+    assert tab.value(f"{heading}.scrollWidth <= {heading}.clientWidth")
 
 
 def test_points_in_their_own_colours(new_tab, tmp_path):

@@ -515,3 +515,13 @@ def test_a_ring_that_only_one_sees_is_noted():
     there[3] = False
     notes = compare(cloud(there=there), cloud()).figures["notes"]
     assert "only one of the two has returns of 1 ring" in str(notes)
+
+
+def test_the_axis_of_small_distances_has_numbers_that_can_be_read():
+    positions = np.random.default_rng(6).uniform(0, 9, (50, 3))
+    page = comparison.draw_distances(compare(Cloud(positions, {}), Cloud(positions, {})))
+    page.figure.draw_without_rendering()
+    axis = page.figure.axes[0].xaxis
+    texts = [text.get_text() for text in axis.get_ticklabels(which="both") if text.get_text()]
+    assert {"0.001", "0.002", "0.005", "0.01"} <= {*texts}
+    assert not [text for text in texts if "times" in text]

@@ -30,10 +30,11 @@ from lidarpool.export.formats import Format
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
+from lidarsim.base.model_names import model_names
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Mirror
-from lidarsim.sensor.models import model_names, read_model
+from lidarsim.sensor.models import read_model
 from lidarsim.sensor.plain_data import from_plain_data, to_plain_data
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.sensor.sensor import LineSensor

@@ -64,7 +64,7 @@ def test_the_scenario_of_the_page_labels_its_points():
 @pytest.mark.parametrize(
     ("materials", "notes"),
     [
-        ([], ["kitti labels points by class, and all have class 0: give class: in "]),
+        ([], ["KITTI labels points by class, and all have class 0: give class: in "]),
         ([{"objects": "*", "class": 4}], []),
     ],
 )
@@ -79,13 +79,13 @@ def test_the_note_on_classes_without_names_says_what_to_give():
     sweeps = the_sweeps(scene)
     cloud = points_of(scene, 0)
     assert "class" in {column.name for column in cloud.table}
-    for name in ("mcap", "nuscenes"):
+    for name, title in (("mcap", "MCAP"), ("nuscenes", "nuScenes")):
         told = [note for note in Format(name).notes(cloud, sweeps) if "class" in note]
         assert told == [
-            f"{name} holds class only if classes have names: give classes: {{1: ground, …}} "
+            f"{title} holds class only if classes have names: give classes: {{1: ground, …}} "
             "(docs/how-to/labels.md)"
         ]
         named = replace(sweeps, classes={1: "ground"})
         assert not [note for note in Format(name).notes(cloud, named) if "class" in note]
     (note,) = [note for note in Format("e57").notes(cloud, sweeps) if "class" in note]
-    assert note.startswith("e57 does not hold ") and "classes:" not in note
+    assert note.startswith("E57 does not hold ") and "classes:" not in note

@@ -188,6 +188,14 @@ def test_files_of_other_programs(tmp_path):
     assert [label[0] for label in legend["labels"]] == ["ground", "high vegetation", "building"]
 
 
+@pytest.mark.parametrize(("comment", "epsg"), [("comment crs: EPSG:25832\n", 25832), ("", None)])
+def test_the_coordinate_system_of_a_file_is_told(tmp_path, comment, epsg):
+    head = f"ply\nformat ascii 1.0\n{comment}element vertex 1\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(f"{head}end_header\n500000 5400000 3\n")
+    assert state_of(open_view(tmp_path / "a.ply"))["epsg"] == epsg
+
+
 def test_a_mesh_and_a_scenario_are_previews_of_their_run(tmp_path):
     (tmp_path / "wall.obj").write_text("v 5 -5 0\nv 5 5 0\nv 5 5 4\nv 5 -5 4\nf 1 2 3 4\n")
     (tmp_path / "drive.yaml").write_text(
@@ -353,14 +361,18 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             open_view(folder / name)
 
 
-@pytest.mark.parametrize("kind", ["folder", "kitti", "mcap", "webdataset"])
-def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind):
+@pytest.mark.parametrize(
+    ("kind", "title"),
+    [("folder", "PLY"), ("kitti", "KITTI"), ("mcap", "MCAP"), ("webdataset", "WebDataset")],
+)
+def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind, title):
     scene = the_scene()
     write_set(tmp_path / "set", kind, scene, the_sweeps(scene))
     assert is_data_set(tmp_path / "set") and not is_data_set(tmp_path)
     jobs = JobList(tmp_path / "set")
     told, _ = jobs.answer("jobs", {}, bool)
     assert (told["count"], told["done"], told["failed"], told["over"]) == (6, 5, 1, True)
+    assert told["state"] == f"data set in the format {title}"
     assert [job["name"] for job in told["ended"]] == ["00", "01", "02", "04", "05"]
     assert [job["error"] for job in told["failures"]] == ["failed"]
     assert told["ended"][1]["values"] == ["0.5"] and told["names"] == ["rain"]

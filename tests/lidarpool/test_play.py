@@ -15,7 +15,8 @@ from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.export.formats import Format
 from lidarpool.playback import bridge as bridges
-from lidarpool.playback.bridge import Bridge, BridgeEntry
+from lidarpool.playback.bridge import Bridge
+from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry
 from lidarpool.playback.schedule import MadeAhead
 from lidarpool.playback.sources import open_source
 
@@ -49,7 +50,7 @@ class Kept(Bridge):
 
 @pytest.fixture
 def kept(monkeypatch):
-    monkeypatch.setitem(bridges.BRIDGES, "kept", BridgeEntry(f"{__name__}:Kept"))
+    monkeypatch.setitem(BRIDGES, "kept", BridgeEntry(f"{__name__}:Kept"))
     monkeypatch.setattr(Kept, "sent", [])
     return Kept.sent
 

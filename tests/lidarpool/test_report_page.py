@@ -20,7 +20,7 @@ from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, S
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_counts import CloudCounts
-from lidarpool.report.page.rendering import MAX_ROWS, put_picture, write_page
+from lidarpool.report.page.rendering import MAX_ROWS, put_picture, sentence, write_page
 from lidarpool.report.report import make_report
 from lidarpool.run.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.placement import TaskRecord
@@ -361,6 +361,26 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
 )
 def test_what_is_unusual_is_told(write, changes, words):
     assert words in write(**changes)[0]
+
+
+@pytest.mark.parametrize(
+    ("note", "shown"),
+    [
+        ("all points are of class 0", "All points are of class 0"),
+        ("KITTI does not hold time", "KITTI does not hold time"),
+        ("nuScenes does not hold time", "nuScenes does not hold time"),
+        ("rosbag2 does not hold time", "rosbag2 does not hold time"),
+        ("wall.obj has no faces", "wall.obj has no faces"),
+    ],
+)
+def test_notes_begin_with_a_capital_unless_with_a_name(write, note, shown):
+    page = html.fromstring(write(notes=(note,))[0])
+    assert page.xpath("//section[@class='notes']//li/text()") == [shown]
+
+
+def test_a_name_that_looks_like_a_word_keeps_its_first_letter():
+    note = "out keeps one of 5 hits"
+    assert sentence(note) == "Out keeps one of 5 hits" and sentence(note, ["out"]) == note
 
 
 def test_without_planning(write):

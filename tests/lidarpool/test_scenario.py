@@ -357,14 +357,14 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     read = scenario("cloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}")
     las, kitti = (note for note in advice(build(read)) if "class" not in note)
     assert "expect points in one coordinate system" in las and "use world" in las
-    assert "kitti holds points compensated for motion" in kitti
+    assert "KITTI holds points compensated for motion" in kitti
     assert advice(build(scenario("output: {write: [laz, pcd]}"))) == []
 
 
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
     (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
-    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuscenes")
+    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuScenes")
     assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
 
 

@@ -24,7 +24,8 @@ from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.sensor.models import Detection, model_names, read_model
+from lidarsim.base.model_names import model_names
+from lidarsim.sensor.models import Detection, read_model
 
 RAYS = 20_000
 STATED = [name for name in model_names() if read_model(name).performance]

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
+from lidarsim.base.model_names import model_names
 from lidarsim.sensor.beams import Spin
-from lidarsim.sensor.models import load_sensor, model_names, read_model
+from lidarsim.sensor.models import load_sensor, read_model
 from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
 from lidarsim.sensor.sensor import Sensor
 from raybeam import Pattern

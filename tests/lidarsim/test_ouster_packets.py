@@ -31,12 +31,12 @@ from lidarpool import (
 )
 from lidarpool.export.navigation_files import write_instruments
 from lidarpool.recordings.recordings import open_recording
+from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.ouster import PROFILES
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
-from lidarsim.sensor.models import model_names
 from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

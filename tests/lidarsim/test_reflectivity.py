@@ -9,7 +9,8 @@ import pytest
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import LidarError, Material, Noise, load_sensor
-from lidarsim.sensor.models import model_names, read_model
+from lidarsim.base.model_names import model_names
+from lidarsim.sensor.models import read_model
 from lidarsim.sensor.reflectivity import SCALES
 
 COLUMNS = ("range", "intensity", "reflectivity", "signal")

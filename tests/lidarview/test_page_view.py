@@ -298,6 +298,40 @@ def test_without_pictures_sensors_and_sweeps_are_still_shown(tmp_path, spun):
         told(view, "range", sweep=len(spun))
 
 
+@pytest.mark.parametrize(
+    ("name", "places", "labels"),
+    [
+        ("", [(0, 0, 1), (2, 0, 1), (0, 3, 1)], ["1", "2", "3"]),
+        ("", [(0, 0, 1), (2, 0, 1), (0, 0, 1), (1, 1, 1)], ["1", "2", "1", "3"]),  # it returns
+        ("roof", [(0, 0, 1), (-2, 0, 1)], ["roof 1", "roof 2"]),
+        ("roof", [(0, 0, 1)], ["roof"]),
+    ],
+)
+def test_stations_have_the_numbers_of_the_picture_of_stations(name, places, labels, cloud):
+    scene = Scene.from_meshes([box("Room", (6, 8, 3))])
+    content = seen(scene, places)
+    content = replace(content, sensors=[replace(content.sensors[0], name=name)])
+    (sensor,) = told(View(CloudFile(cloud), content), "state")[0]["sensors"]
+    assert sensor["labels"] == labels
+    (moving,) = told(View(CloudFile(cloud), seen(scene, places, moves=True)), "state")[0]["sensors"]
+    assert moving["labels"] == []
+
+
+def test_the_page_is_told_of_the_coordinate_system(tmp_path, spun):
+    of_zone = replace(spun, epsg=25832)
+    one = open_result(result_in(tmp_path / "one", of_zone))
+    two = open_result(result_in(tmp_path / "two", of_zone))
+    assert told(one, "state")[0]["epsg"] == 25832
+    assert told(open_results([tmp_path / "one", tmp_path / "two"]), "state")[0]["epsg"] == 25832
+    later = replace(spun, begins_ns=spun.begins_ns + 1, epsg=25833)
+    result_in(tmp_path / "three", later)
+    of_both = open_results([tmp_path / "one", tmp_path / "three"])
+    assert told(of_both, "state")[0]["epsg"] is None  # of which one?
+    local = replace(two, sweeps=replace(of_zone, coordinates="sensor"))
+    assert told(local, "state")[0]["epsg"] is None
+    assert told(replace(one, sweeps=spun), "state")[0]["epsg"] is None
+
+
 def result_in(folder, sweeps):
     """Write a result without pictures."""
     folder.mkdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -273,6 +274,16 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(planned):
     offset = int(re.sub(r"\D", "", axes.get_xlabel()))  # x − 499 970 (m)
     labels = [offset + float(text.get_text()) for text in axes.get_xticklabels()]
     assert labels == (500_003 + axes.get_xticks()).tolist()
+
+
+@pytest.mark.parametrize(("aside_m", "names"), [(0.0, 0), (0.01, 0), (8.0, 1)])
+def test_only_paths_that_can_be_seen_beside_the_best_are_in_the_legend(planned, aside_m, names):
+    best_corners = planned.best.corners
+    trials = [best_corners[1:-1], best_corners[1:-1] + np.array([0, aside_m])]
+    path = replace(planned.best, trials=trials)
+    page = draw_path(planned, path, np.zeros(2), (1600, 1000))
+    texts = [text.get_text() for text in page.figure.legends[0].get_texts()]
+    assert texts == ["Best path", *["1 other trial"] * names, "Obstacle"]
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):

@@ -49,9 +49,10 @@ from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings
-from lidarsim.sensor.models import SensorModel, model_names, read_model
+from lidarsim.sensor.models import SensorModel, read_model
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]

@@ -40,7 +40,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     report = json.loads((out / "report.json").read_text())
     assert {*report["files"]} == made
     left = [note for note in report["notes"] if "does not hold" in note]
-    assert [note.split()[0] for note in left] == ["mcap", "kitti"]
+    assert [note.split()[0] for note in left] == ["MCAP", "KITTI"]
     assert left[1] in done.out and "channel" in left[1]
     assert report["stages"]["export"]["items"] == 6  # sweeps, written by workers
     assert report["tasks"]["LIDAR"]["export"] == 1 and report["placement_violations"] == 0
@@ -57,7 +57,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert not (tmp_path / "no").exists()
     mixed = ("export", out, "-f", "pcd", "-f", "kitti", "--compensated", "--out", tmp_path / "mix")
     mixed = lidarpool(*mixed)
-    assert mixed.code == 0 and "note: pcd does not hold time" in mixed.err
+    assert mixed.code == 0 and "note: PCD does not hold time" in mixed.err
     assert b"start of the sweep" in (tmp_path / "mix/pcd/000000.pcd").read_bytes()[:100]
     refused = lidarpool("export", out, "-f", "kitti", "--compensated", "--out", tmp_path / "no")
     assert refused.code == 2 and "compensated is an option of pcd" in refused.err
@@ -75,7 +75,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
         refused = lidarpool("export", out, "-f", "las")
     assert refused.code == 2 and "Another run or export is using the folder" in refused.err
     elsewhere = lidarpool("export", out, "-f", "nuscenes", "--out", tmp_path / "other")
-    assert elsewhere.code == 0 and "nuscenes does not hold" in elsewhere.err
+    assert elsewhere.code == 0 and "nuScenes does not hold" in elsewhere.err
     assert len(list((tmp_path / "other/nuscenes/samples/rear").iterdir())) == 3
 
     # What the earlier run left would pass for this one's; an export is in no report, and stays.

@@ -49,6 +49,22 @@ class SensorPositions:
     name: str = ""  # "" for a single sensor
     model: str = ""
 
+    @property
+    def labels(self) -> list[str]:
+        """Name of each position, (k,), as the picture of stations has them: 1, 2, … in order.
+
+        A position that the sensor returns to has its first number. A sensor that stays at one
+        position, or moves, has its own name.
+        """
+        if self.moves or not len(self.positions):
+            return []
+        _, first, group = np.unique(self.positions, axis=0, return_index=True, return_inverse=True)
+        if len(first) == 1:
+            return [self.name] * len(self.positions)
+        number = np.empty(len(first), np.int64)
+        number[np.argsort(first)] = np.arange(1, len(first) + 1)
+        return [f"{self.name} {n}".strip() for n in number[group.ravel()].tolist()]
+
     def position_at(self, time_ns: float) -> Floats:
         """Return the position at a time, (3,)."""
         if self.moves:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
+from click.shell_completion import CompletionItem
 
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
@@ -30,7 +31,8 @@ from lidarsim.base.words import plural
 
 from ..base.logs import set_logs
 from ..base.shard import ALL
-from ..viewers.table import VIEWERS
+from ..viewers.table import PAGE, VIEWERS
+from . import completion
 from . import shared_options as shared
 from .first_step import begin
 from .play_command import play
@@ -45,14 +47,13 @@ if TYPE_CHECKING:
 PROGRAM = "lidarpool"
 PLUGINS = "lidarpool.commands"  # each is a click.Command
 
-_PAGE = "page"  # what --live without a value shows
-
 # Common options of `demo` and `run`; each is a field of RunOptions.
 _common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
     click.option(
         "--live",
-        type=click.Choice([_PAGE, *VIEWERS]),
+        type=click.Choice([PAGE, *VIEWERS]),
+        shell_complete=completion.live,
         help="Show the run until Ctrl-C: on its page in the browser, in Foxglove or in Rerun; "
         "--live alone shows the page.",
     ),
@@ -153,13 +154,15 @@ class _LiveCommand(click.Command):
     """A command whose option --live may stand alone, also before an argument."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the words of the command line."""
-        values = {_PAGE, *VIEWERS}
+        """Parse the words of the command line, or for completion the words before the last."""
+        if ctx.resilient_parsing and args[-1:] == ["--live"]:  # the last may be its value
+            args = args[:-1]
+        values = {PAGE, *VIEWERS}
         followers = [*args[1:], ""][: len(args)]
         return super().parse_args(
             ctx,
             [
-                f"--live={_PAGE}" if word == "--live" and follower not in values else word
+                f"--live={PAGE}" if word == "--live" and follower not in values else word
                 for word, follower in zip(args, followers, strict=True)
             ],
         )
@@ -174,6 +177,11 @@ class _Commands(click.Group):
         if command is None and (plugin := find_plugin(PLUGINS, cmd_name)) is not None:
             return plugin.load(click.Command)
         return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete the name of a command or option; plug-ins are named, and not imported."""
+        items = super().shell_complete(ctx, incomplete)
+        return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands for the help; plug-ins are named, and not imported."""

@@ -14,6 +14,7 @@ import click
 from lidarsim.base.storage import Storage
 
 from ..export.format_table import LAYOUTS
+from . import completion
 from . import shared_options as options
 from .first_step import begin
 
@@ -27,6 +28,7 @@ _NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: 
     "--as",
     "bridge_name",
     metavar="BRIDGE",
+    shell_complete=completion.bridges,
     required=True,
     help="packets: as the sensor sends; ros2: topics of ROS 2; foxglove, rerun: for viewers.",
 )

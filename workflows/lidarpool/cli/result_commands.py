@@ -16,6 +16,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
 from ..export.format_table import EXPORTS, LAYOUTS, row_of
+from . import completion
 from . import shared_options as options
 
 
@@ -62,6 +63,7 @@ class _FormatName(click.Choice[str]):
 @click.option(
     "--colour",
     metavar="COLUMN",
+    shell_complete=completion.colours,
     default="z",
     show_default=True,
     help="Column to colour the points of the cloud by; rgb for red, green and blue.",
@@ -104,6 +106,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     "-f",
     "formats",
     type=_FormatName(),
+    shell_complete=completion.format_name,
     multiple=True,
     required=True,
     help="Format to write, also one of a plug-in; may be given several times.",
@@ -365,7 +368,12 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 @click.command()
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
 @options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
-@click.option("--model", metavar="MODEL|FILE", help="The sensor, for what the recording hides.")
+@click.option(
+    "--model",
+    metavar="MODEL|FILE",
+    shell_complete=completion.sensors,
+    help="The sensor, for what the recording hides.",
+)
 @options.path("--scene", help="The place, a mesh.")
 @options.poses
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")

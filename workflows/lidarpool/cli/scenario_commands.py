@@ -19,6 +19,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, without_common_prefix
 
+from . import completion
 from . import shared_options as options
 from .first_step import begin
 from .shared_options import WARNED, Command, combine, overwrite
@@ -427,7 +428,9 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 
 
 @click.command()
-@click.argument("model", required=False, metavar="[MODEL|FILE.yaml]")
+@click.argument(
+    "model", required=False, metavar="[MODEL|FILE.yaml]", shell_complete=completion.sensors
+)
 @options.path("--out", metavar="FILE.png", help="Draw the model's beams into this file.")
 def sensors(model: str | None, out: Path | None) -> None:
     """List sensor models, or show the figures of a model and draw its beams.
@@ -438,13 +441,8 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.sensor.models import (
-        load_sensor,
-        model_names,
-        plugin_model_names,
-        read_model,
-        shown_noise,
-    )
+    from lidarsim.base.model_names import model_names, plugin_model_names
+    from lidarsim.sensor.models import load_sensor, read_model, shown_noise
 
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
@@ -533,6 +531,7 @@ def _share(text: str) -> float:
     "--sensor",
     "model",
     metavar="MODEL|FILE.yaml",
+    shell_complete=completion.sensors,
     required=True,
     help="The instrument: a model of lidarpool sensors, with or without its maker.",
 )
@@ -590,7 +589,8 @@ def stations(
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     begin("reading the scene", quiet=as_json)
-    from lidarsim.sensor.models import full_name, load_sensor
+    from lidarsim.base.model_names import full_name
+    from lidarsim.sensor.models import load_sensor
 
     from ..plan.stations import plan_stations
     from ..report.result_pictures import draw_stations

@@ -17,6 +17,7 @@ from lidarsim.base.vocabulary import BACKENDS, UNITS_M
 
 from ..base.shard import Shard
 from ..base.tls_files import TlsFiles
+from . import completion
 
 Command = Callable[..., None]
 
@@ -110,11 +111,22 @@ _mesh_reading_options = combine(
     _mesh_option("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
 )
 _mesh_options = combine(
-    _mesh_option("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+    _mesh_option(
+        "sensor",
+        "sensor, one of lidarpool sensors or a file",
+        metavar="MODEL|FILE.yaml",
+        shell_complete=completion.sensors,
+    ),
     _mesh_reading_options,
     _mesh_list_option("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
-    _mesh_list_option("columns", "further columns of its points, such as range,intensity"),
-    _mesh_list_option("format", "further formats of the cloud, such as las"),
+    _mesh_list_option(
+        "columns",
+        "further columns of its points, such as range,intensity",
+        shell_complete=completion.columns,
+    ),
+    _mesh_list_option(
+        "format", "further formats of the cloud, such as las", shell_complete=completion.formats
+    ),
 )
 
 

@@ -23,7 +23,7 @@ from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarview.render import theme
-from lidarview.render.picture_page import Page
+from lidarview.render.picture_page import Page, label_logarithms
 
 from ..base.open3d_module import load_open3d
 from ..columns.parts import StoredCloud
@@ -710,8 +710,9 @@ def draw_distances(comparison: Comparison) -> Page:
         quantiles = np.quantile(values, shares).clip(MIN_DISTANCE_M)
         axes.plot(quantiles, 100 * shares, color=colour, lw=1.4 * page.unit, label=label)
     max_m = max(float(np.quantile(values, 0.999)) for values in comparison.distances)
-    axes.set_xlim(MIN_DISTANCE_M, max(2 * max_m, 0.01))
-    axes.xaxis.set_major_formatter("{x:g}")
+    right_m = max(2 * max_m, 0.01)
+    axes.set_xlim(MIN_DISTANCE_M, right_m)
+    label_logarithms(axes.xaxis, right_m < 1000 * MIN_DISTANCE_M)
     for score in distances["f_scores"]:
         axes.axvline(score["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
     _draw_legend(page, axes)

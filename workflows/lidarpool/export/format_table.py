@@ -32,6 +32,8 @@ class FormatRow:
     module
         Dotted name of the module that writes it. A class `Reader` there (`export/reading.py`) reads
         single sweeps of data sets.
+    title
+        Proper name in sentences, such as KITTI; by default the name of the format.
     write
         Name of the function of the module that writes it, `write(path, cloud, sweeps)`, or with
         `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which defines the content of
@@ -83,6 +85,7 @@ class FormatRow:
     file: str
     module: str
     write: str
+    title: str = ""
     in_pieces: bool = False
     packages: tuple[str, ...] = ()
     extra: str = ""
@@ -172,17 +175,19 @@ def _las(name: str) -> FormatRow:
         f"cloud.{name}",
         "lidarpool.export.las",
         f"write_{name}",
+        name.upper(),
         packages=("laspy", "lazrs"),
         extra="las",
         one_system=True,
     )
 
 
-def _osi(name: str, file: str) -> FormatRow:
+def _osi(name: str, file: str, title: str) -> FormatRow:
     return FormatRow(
         file,
         "lidarpool.export.osi",
         f"write_{name}",
+        title,
         packages=("betterosi",),
         extra="osi",
         needs=("scan", *_OSI[:3]),
@@ -216,6 +221,7 @@ FORMATS = {
         "cloud.ply",
         "lidarpool.export.ply",
         "write_ply",
+        "PLY",
         data_set="folder",
         of_job="jobs/{name}/cloud.ply",
     ),
@@ -225,6 +231,7 @@ FORMATS = {
         "cloud.parquet",
         "lidarpool.export.parquet",
         "Pieces",
+        "Parquet",
         in_pieces=True,
         packages=("pyarrow",),
         extra="parquet",
@@ -236,6 +243,7 @@ FORMATS = {
         "pcd",
         "lidarpool.export.pcd",
         "Pieces",
+        "PCD",
         in_pieces=True,
         needs=("scan",),
         raw_or_compensated=True,
@@ -245,6 +253,7 @@ FORMATS = {
         "images",
         "lidarpool.export.images",
         "Pieces",
+        "range images",
         in_pieces=True,
         needs=("scan", *_ALL_RAYS),
         inside=r"[^/]+/\d+\.npz",
@@ -256,6 +265,7 @@ FORMATS = {
         "cloud.e57",
         "lidarpool.export.e57",
         "write_e57",
+        "E57",
         packages=("pye57",),
         extra="e57",
         needs=("scan",),
@@ -266,6 +276,7 @@ FORMATS = {
         "kitti",
         "lidarpool.export.kitti",
         "Pieces",
+        "KITTI",
         in_pieces=True,
         needs=("scan", *_KITTI_COLUMNS),
         holds=_KITTI_COLUMNS,
@@ -280,6 +291,7 @@ FORMATS = {
         "nuscenes",
         "lidarpool.export.nuscenes",
         "Pieces",
+        "nuScenes",
         in_pieces=True,
         needs=("scan", "object", *_RINGS),
         holds=_RINGS,
@@ -296,6 +308,7 @@ FORMATS = {
         "webdataset",
         "lidarpool.export.webdataset",
         "Pieces",
+        "WebDataset",
         in_pieces=True,
         needs=("scan", *_LABELS),
         inside=r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz",
@@ -307,6 +320,7 @@ FORMATS = {
         "packets",
         "lidarpool.export.packets",
         "write_pcap",
+        "PCAP",
         needs=("scan", *_ALL_RAYS),
         holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
@@ -315,6 +329,7 @@ FORMATS = {
         "cloud.rrd",
         "lidarpool.export.rrd",
         "write_rrd",
+        "RRD",
         packages=("rerun",),
         extra="rerun",
         needs=("scan", "object"),
@@ -323,13 +338,18 @@ FORMATS = {
         actor_boxes=True,
     ),
     # Readers take the type of messages from the part «sd» of the file's name.
-    "osi": _osi("osi", "cloud_sd.osi"),
-    "osi_mcap": _osi("osi_mcap", "cloud_osi.mcap"),
-    "mcap": _bag("mcap", "cloud.mcap", data_set="mcap", of_job="bags/{name}.mcap"),
+    "osi": _osi("osi", "cloud_sd.osi", "OSI"),
+    "osi_mcap": _osi("osi_mcap", "cloud_osi.mcap", "OSI in MCAP"),
+    "mcap": _bag("mcap", "cloud.mcap", title="MCAP", data_set="mcap", of_job="bags/{name}.mcap"),
     "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
 }
 DATA_SETS = {row.data_set: name for name, row in FORMATS.items() if row.data_set}  # {its: of jobs}
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
+
+
+def data_set_title(data_set: str) -> str:
+    """Return the proper name of the format of a data set's jobs, such as KITTI."""
+    return FORMATS[DATA_SETS[data_set]].title if data_set in DATA_SETS else data_set
 
 
 def row_of(name: str) -> FormatRow:

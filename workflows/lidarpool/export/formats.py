@@ -100,6 +100,11 @@ class Format:
         return row_of(self.format)
 
     @property
+    def title(self) -> str:
+        """Proper name of the format in sentences."""
+        return self.row.title or self.format
+
+    @property
     def _laid_out(self) -> tuple[str, ...]:
         columns = self.row.layouts.get(self.layout, ())
         if self.organized and "ray" not in columns:
@@ -127,9 +132,9 @@ class Format:
         left_out = self.left_out(cloud, sweeps)
         unnamed = [name for name in left_out if name in self.row.named]
         never_held = ", ".join(name for name in left_out if name not in unnamed)
-        notes = [f"{self.format} does not hold {never_held}"] if never_held else []
+        notes = [f"{self.title} does not hold {never_held}"] if never_held else []
         notes += [
-            f"{self.format} holds {name} only if classes have names: give classes: "
+            f"{self.title} holds {name} only if classes have names: give classes: "
             "{1: ground, …} (docs/how-to/labels.md)"
             for name in unnamed
         ]
@@ -142,7 +147,7 @@ class Format:
         if any(material.semantic_class for material in survey.materials):
             return []
         return [
-            f"{self.format} labels points by class, and all have class 0: give class: in "
+            f"{self.title} labels points by class, and all have class 0: give class: in "
             "materials, copies, actors or traffic, and the names in classes: "
             "(docs/how-to/labels.md)"
         ]
@@ -152,7 +157,7 @@ class Format:
         expected = self.row.first_sensor
         if not expected or not sensors or sensors[0] in ("", expected):
             return []
-        note = f"the first sensor, {sensors[0]!r}, is {expected} in {self.format}"
+        note = f"the first sensor, {sensors[0]!r}, is {expected} in {self.title}"
         if expected in sensors[1:]:
             note += f", and {expected!r} is {expected}_2"
         return [f"{note}: its readers expect this name of the first"]
@@ -168,7 +173,7 @@ class Format:
             ]
         if self.compensated or self.row.compensates:
             return [
-                f"{self.format} holds points compensated for motion, although cloud.coordinates is "
+                f"{self.title} holds points compensated for motion, although cloud.coordinates is "
                 "sensor: they are brought to the start of the sweep"
             ]
         return []

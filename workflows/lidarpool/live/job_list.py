@@ -25,6 +25,7 @@ from ..datasets.dataset import job_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import JobRow, Value, read_table
 from ..datasets.loader import read_index, sweeps
+from ..export.format_table import data_set_title
 from .downloads import downloads
 from .recorded import Pieces
 
@@ -71,7 +72,7 @@ class JobList:
         return {
             "title": self.title,
             "names": self._names,
-            "state": f"data set in the format {self._index['format']}",
+            "state": f"data set in the format {data_set_title(self._index['format'])}",
             "over": True,
             "still": True,
             "count": len(self.rows),

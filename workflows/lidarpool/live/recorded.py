@@ -139,7 +139,14 @@ def recorded_view(
         raise LidarError(f"{first.name} has no points.{left_out}")
     names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
     return View(
-        OrderedPoints(cloud), None, sweeps, " ".join(notes), title, downloads=downloads, names=names
+        OrderedPoints(cloud),
+        None,
+        sweeps,
+        " ".join(notes),
+        title,
+        downloads=downloads,
+        names=names,
+        stated_epsg=first.epsg,
     )
 
 
@@ -152,7 +159,11 @@ def sampled_view(recording: Recording, title: str) -> View:
         pieces.add(positions * recording.metres, columns)
     names = {"class": ASPRS_CLASSES}
     return View(
-        OrderedPoints(pieces.cloud()), note=" ".join(recording.notes), title=title, names=names
+        OrderedPoints(pieces.cloud()),
+        note=" ".join(recording.notes),
+        title=title,
+        names=names,
+        stated_epsg=recording.epsg,
     )
 
 

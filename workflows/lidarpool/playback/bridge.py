@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
@@ -16,6 +16,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from ..export.formats import Format
+from .bridge_table import BRIDGES
 from .schedule import Schedule
 
 
@@ -113,22 +114,6 @@ class Bridge(ABC):
     @abstractmethod
     def __exit__(self, *error: object) -> None:
         """Close all connections, and end all threads and processes."""
-
-
-class BridgeEntry(NamedTuple):
-    """Where a bridge is implemented, and the extra that installs its packages."""
-
-    target: str  # module and class
-    extra: str = ""
-
-
-# {name for --as: the bridge}
-BRIDGES = {
-    "packets": BridgeEntry("lidarpool.playback.packets:PacketsBridge"),
-    "ros2": BridgeEntry("lidarpool.playback.ros2:Ros2Bridge", "ros2"),
-    "foxglove": BridgeEntry("lidarpool.playback.viewer_bridges:FoxgloveBridge", "live"),
-    "rerun": BridgeEntry("lidarpool.playback.viewer_bridges:RerunBridge", "rerun"),
-}
 
 
 def bridge_class(name: str) -> type[Bridge]:

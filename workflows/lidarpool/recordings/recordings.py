@@ -192,6 +192,7 @@ class Recording:
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
     metres: Metres = _METRES  # of the units of x, y and z
+    epsg: int | None = None  # of the system that the file states, if that is in metres
     sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
     # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
     # None if they are unknown; None if the recording has no frames.
@@ -574,8 +575,14 @@ def _open_foreign_ply(path: Path, name: str, intensity: str | None, unit: str | 
         is_cloud=True,
         notes=tuple(f"{name} {note}" for note in notes),
         metres=metres,
+        epsg=_epsg_in_metres(system, metres, unit),
         noise_filter=NoiseFilter(),
     )
+
+
+def _epsg_in_metres(system: StatedSystem | None, metres: Metres, unit: str | None) -> int | None:
+    """Return the EPSG code of a stated system; None if `unit` replaces its units, or in feet."""
+    return None if system is None or unit is not None or metres != _METRES else system.epsg
 
 
 def _open_ply_cloud(
@@ -697,6 +704,7 @@ def _open_las(path: Path, name: str, intensity: str | None, unit: str | None) ->
         count,
         notes=tuple(f"{name} {note}" for note in notes),
         metres=metres,
+        epsg=_epsg_in_metres(system, metres, unit),
         sample=sample,
         noise_filter=NoiseFilter(classes),
     )

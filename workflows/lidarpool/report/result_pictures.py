@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -28,7 +29,7 @@ from lidarsim.scene.scene import Scene
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.colouring import with_composed
-from lidarview.render.picture_page import FONT, Page
+from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
 from lidarview.render.stage import make_axis, nice_step
@@ -43,6 +44,7 @@ _LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, b
 MAX_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MAX_TRIALS = 1000
+_BEST_WIDTH = 2.0  # line of the best path, points
 PATH_COLOUR = "#d6336c"
 TRIAL_COLOUR = "#5b8fd0"
 COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
@@ -167,18 +169,22 @@ def _picture_makers(
 def draw_path(
     planning: PlanningPicture, path: PlannedPath, origin: Floats, size: tuple[int, int]
 ) -> Page:
-    """Draw a planned path from above, with obstacles, both ends and the paths of the trials.
+    """Draw a planned path from above, with obstacles, both ends and the paths of other trials.
 
-    The paths of the trials are faint, the best path is bold. Of more than 1000 trials, an evenly
-    spaced sample is drawn. `origin` (2,) is x and y of the local origin: the axes have world
-    coordinates.
+    The best path is bold. Trials whose paths differ visibly are faint, and named in the legend;
+    others are below the best path. Of more than 1000 trials, an evenly spaced sample is drawn.
+    `origin` (2,) is x and y of the local origin: the axes have world coordinates.
     """
     page = Page(size)
     unit = page.unit
     best = path.corners
     trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
-    axes = _path_axes(page, _limits(best, drawn_trials, planning, size), origin)
+    limits = _limits(best, drawn_trials, planning, size)
+    axes = _path_axes(page, limits, origin)
+    pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
+    width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # of the line of the best path
+    drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
     circles = zip(planning.centres, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
@@ -191,12 +197,32 @@ def draw_path(
     axes.add_collection(
         LineCollection(drawn_trials, colors=TRIAL_COLOUR, linewidths=0.8 * unit, alpha=alpha)
     )
-    axes.plot(*best.T, color=PATH_COLOUR, lw=2.0 * unit, solid_joinstyle="round", zorder=4)
+    axes.plot(*best.T, color=PATH_COLOUR, lw=_BEST_WIDTH * unit, solid_joinstyle="round", zorder=4)
     axes.plot(*best[1:-1].T, "o", color=PATH_COLOUR, ms=2.6 * unit, zorder=5)
     _draw_ends(axes, page, planning)
     page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
     page.title("Planned path", _verdict(path, trials))
     return page
+
+
+def farthest(path: Floats, other: Floats) -> float:
+    """Return the largest distance of a path's points from another path, both (w, 2) corners.
+
+    Points are taken at most a hundredth of the other path apart.
+    """
+    spacing = max(float(np.linalg.norm(np.diff(other, axis=0), axis=1).sum()) / 100, 1e-12)
+    points = [path[-1:]]
+    for start, stop in itertools.pairwise(path):
+        count = min(int(np.linalg.norm(stop - start) / spacing) + 1, 100)
+        points.append(start + np.linspace(0, 1, count, endpoint=False)[:, None] * (stop - start))
+    positions = np.concatenate(points)
+    distances = np.full(len(positions), np.inf)
+    for start, stop in itertools.pairwise(other):
+        way = stop - start
+        share = ((positions - start) @ way / max(float(way @ way), 1e-300)).clip(0, 1)
+        nearest = start + share[:, None] * way
+        distances = np.minimum(distances, np.linalg.norm(positions - nearest, axis=1))
+    return float(distances.max())
 
 
 def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
@@ -216,9 +242,9 @@ def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
     """Return the handles of the legend of a planned path."""
-    handles = [Line2D([], [], color=PATH_COLOUR, lw=2 * unit, label="Best path")]
+    handles = [Line2D([], [], color=PATH_COLOUR, lw=_BEST_WIDTH * unit, label="Best path")]
     if trial_count:
-        label = plural(trial_count, "trial")
+        label = plural(trial_count, "other trial")
         handles.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
     if obstacle_count:
         handles.append(

@@ -14,6 +14,7 @@ class ViewerRow(NamedTuple):
     extra: str  # of lidarpool that installs the distribution
 
 
+PAGE = "page"  # the run's own page, in place of a viewer
 VIEWERS = {
     "foxglove": ViewerRow(
         "lidarpool.viewers.foxglove_server:FoxgloveServer", "foxglove", "foxglove-sdk", "live"

@@ -8,6 +8,41 @@ from __future__ import annotations
 BACKENDS = ("auto", "cuda", "embree", "numpy")
 PICTURES = ("scene", "hits", "intensity", "cloud", "path")  # drawn pictures
 
+# Names of the columns of `lidarsim.columns.table.TABLE`, in its order; a test compares both.
+ALWAYS_COLUMNS = ("scan", "x", "y", "z", "channel", "object")
+OPTIONAL_COLUMNS = (
+    "ray",
+    "time",
+    "azimuth",
+    "elevation",
+    "range",
+    "intensity",
+    "reflectance",
+    "reflectivity",
+    "signal",
+    "radial_velocity",
+    "amplitude",
+    "pulse_width",
+    "return_number",
+    "returns",
+    "class",
+    "material",
+    "cause",
+    "sensor",
+    "triangle",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "incidence_deg",
+    "origin_x",
+    "origin_y",
+    "origin_z",
+    "red",
+    "green",
+    "blue",
+)
+COMPOSED_COLUMNS = ("rgb", "normals")  # colours that pictures make of several columns
+
 # Metres in each unit.
 UNITS_M = {
     "um": 1e-6,

@@ -202,6 +202,7 @@ class CarryOver:
 
 def with_packets() -> tuple[str, ...]:
     """Return the names of the models of the package that have packets, in order."""
-    from ..sensor.models import model_names, read_model
+    from ..base.model_names import model_names
+    from ..sensor.models import read_model
 
     return tuple(name for name in model_names() if read_model(name).packets is not None)

@@ -6,11 +6,9 @@ import math
 from dataclasses import fields, replace
 from fractions import Fraction
 from functools import cache
-from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from statistics import NormalDist
-from types import ModuleType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,7 +19,8 @@ from ..base.declared import UnitShare
 from ..base.elementary import log1p, sin_cos
 from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
-from ..base.plugins import Plugin, find_plugin, plugins_of
+from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
+from ..base.plugins import Plugin, find_plugin
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
@@ -33,9 +32,6 @@ from .packet_settings import Identifier, PacketSettings, laser_order
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
-_BUILT_IN = files("lidarsim.sensor") / "data"
-# Plug-ins are packages with data files, as MAKER/MODEL.yaml; the maker is the plug-in's name.
-GROUP = "lidarsim.sensors"
 MODEL_FILES = (".yaml", ".yml")
 Sheet = Literal["ideal", "datasheet"]
 
@@ -300,36 +296,6 @@ class SensorModel(_ModelSection):
         return self.firings_per_turn if columns is None else columns, rate
 
 
-@cache
-def model_names() -> tuple[str, ...]:
-    """Return the names of the models that come with the package, in order."""
-    makers = (entry for entry in _BUILT_IN.iterdir() if entry.is_dir())
-    return tuple(sorted(name for maker in makers for name in _names_in(maker)))
-
-
-def _names_in(maker: Traversable) -> list[str]:
-    """Return the names of the models in the folder of a maker, in order."""
-    file_names = sorted(entry.name for entry in maker.iterdir())
-    return [
-        f"{maker.name}/{file.removesuffix('.yaml')}"
-        for file in file_names
-        if file.endswith(".yaml")
-    ]
-
-
-def plugin_model_names() -> tuple[str, ...]:
-    """Return the names of the models of plug-ins, in order, except models of the package.
-
-    Raises
-    ------
-    LidarError
-        If a plug-in cannot be used, or two have the same maker.
-    """
-    plugins = [find_plugin(GROUP, maker) for maker in plugins_of(GROUP)]
-    names = [name for plugin in plugins if plugin for name in _names_in(_maker_folder(plugin))]
-    return tuple(name for name in names if name not in model_names())
-
-
 def plugin_of_model(name: str | None) -> Plugin | None:
     """Return the plug-in with a model of a name, or None.
 
@@ -354,23 +320,8 @@ def plugin_model_file(name: str | None) -> Path | None:
     plugin = plugin_of_model(name)
     if plugin is None or name is None:
         return None
-    file = _maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
+    file = maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
     return file if isinstance(file, Path) else None  # the package may be in an archive
-
-
-def _maker_folder(plugin: Plugin) -> Traversable:
-    """Return the folder with the data files of a plug-in."""
-    package = plugin.load(ModuleType)
-    folder = files(package) / plugin.name if hasattr(package, "__path__") else None
-    if folder is None or not folder.is_dir():
-        raise plugin.lacks(f"the folder {plugin.name} in {plugin.module}")
-    return folder
-
-
-def full_name(name: str) -> str:
-    """Return the name of a model with its maker, if the name alone is unambiguous: riegl-vz400."""
-    matches = [model for model in model_names() if model.partition("/")[2] == name]
-    return matches[0] if len(matches) == 1 else name
 
 
 def read_model(name: str | Path) -> SensorModel:
@@ -391,8 +342,8 @@ def read_model(name: str | Path) -> SensorModel:
         return _built_in(name)
     plugin = plugin_of_model(name)
     if plugin is not None:
-        folder = _maker_folder(plugin)
-        models = (*models, *_names_in(folder))
+        folder = maker_folder(plugin)
+        models = (*models, *names_in(folder))
         if name in models:
             return _read(folder / f"{name.partition('/')[2]}.yaml")
     similar = [model for model in models if _plain(name) in _plain(model)][:3]
@@ -412,7 +363,7 @@ def _plain(name: str) -> str:
 @cache
 def _built_in(name: str) -> SensorModel:
     """Read a model that comes with the package."""
-    return _read(_BUILT_IN / f"{name}.yaml")
+    return _read(BUILT_IN / f"{name}.yaml")
 
 
 def _read(path: Path | Traversable) -> SensorModel:

@@ -134,6 +134,7 @@ class View:
     # {column: names of the values 0, 1, 2, …}, beside those of the scene and the sweeps.
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     preview: bool = False  # whether the points are those of first sweeps, before a run
+    stated_epsg: int | None = None  # EPSG code that the file of a cloud states
 
     def __post_init__(self) -> None:
         self.version = 0  # counts the replacements of the points by `show`
@@ -192,6 +193,14 @@ class View:
             moves = len(np.unique(local, axis=0)) > len(local) / 2 > 1
             sensors.append(SensorPositions(sweeps.begins_ns[of_sensor], local, moves, name))
         return sensors
+
+    @property
+    def epsg(self) -> int | None:
+        """EPSG code of the system of the coordinates: of the survey, else of the file, or None."""
+        sweeps = self.sweeps
+        if sweeps is None:
+            return self.stated_epsg
+        return sweeps.epsg if sweeps.coordinates == "world" else None
 
     @property
     def actors(self) -> Sequence[Actor]:
@@ -309,13 +318,19 @@ class View:
             ],
             "colours": [*self._coloured],
             "origin": self.origin.tolist(),
+            "epsg": self.epsg,
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if shown_box is None else float(shown_box[1, 2]),
             "scene": pictured
             and colours_for(pictured.scene, pictured.reflectance, pictured.face_materials),
             "sensors": [
-                {"name": sensor.name, "model": sensor.model, "moves": sensor.moves}
+                {
+                    "name": sensor.name,
+                    "model": sensor.model,
+                    "moves": sensor.moves,
+                    "labels": sensor.labels,
+                }
                 for sensor in self.sensors
             ],
             "actors": [
@@ -1001,6 +1016,7 @@ def join_views(
     starts = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
     sweeps = first.sweeps if all(np.array_equal(starts[0], times) for times in starts) else None
     points = JoinedPoints([view.points for view in views])
+    codes = {view.epsg for view in views}
     title = f"{' and '.join(names)} - lidarpool"
     return View(
         points,
@@ -1010,6 +1026,7 @@ def join_views(
         title,
         results=names,
         downloads=downloads,
+        stated_epsg=codes.pop() if len(codes) == 1 else None,
     )
 
 

@@ -29,6 +29,7 @@ from lidarsim.sensor import Noise, Returns
 from lidarsim.sensor.weather import Weather
 from lidarview.render.stage import nice_step
 
+from ...export.format_table import data_set_title
 from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult
@@ -90,11 +91,15 @@ def put_picture(page: Path, name: str, svg: str) -> None:
 
 
 def from_above(counts: Ints) -> str:
-    """Draw numbers of points (rows, columns), the first row in the south, as SVG."""
+    """Draw numbers of points (rows, columns), the first row in the south, as SVG.
+
+    The page inverts its lightness where the page is dark.
+    """
     rows, columns = counts.shape
-    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
     shade = np.log1p(counts[::-1])
-    pixels[..., 3] = 255 * shade / max(shade.max(), 1)
+    weakest = np.where(counts[::-1] > 0, 40, 0)  # of 255: single points are visible, too
+    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
+    pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "PNG")
     source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
@@ -145,6 +150,8 @@ def _template(name: str) -> Template:
         markdown,
         millimetres,
         ratio,
+        sentence,
+        data_set_title,
         plural,
     ):
         environment.filters[filter_.__name__] = filter_
@@ -261,6 +268,21 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
         detail = f"{STAGES[stage]}, {plural(len(records), 'task')}, {work}"
         rows.append(axis.row(worker, stage, detail, ((task.start, task.stop) for task in records)))
     return rows
+
+
+def sentence(note: str, names: Iterable[str] = ()) -> str:
+    """Return a note that begins with a capital, unless it begins with a name: wall.obj, rosbag2.
+
+    `names` are names that look like words.
+
+    Examples
+    --------
+    >>> sentence("all points are in rain"), sentence("wall.obj has no faces")
+    ('All points are in rain', 'wall.obj has no faces')
+    """
+    first = note.partition(" ")[0].rstrip(",:;")
+    is_name = not (first.isalpha() and first.islower()) or note.startswith((*filter(None, names),))
+    return note if is_name else f"{note[:1].upper()}{note[1:]}"
 
 
 def printable(text: str) -> str:

@@ -59,7 +59,7 @@ from .las_units import (
 )
 
 WKT_RECORD = 2112  # of LASF_Projection, by ASPRS LAS 1.4
-_CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:[\d.]*:?(\d{4,6})")
+_CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:(?:[\d.]*:)?(\d{4,6})")
 _COMMENT = re.compile(
     r"(?i)(?:(?:crs|srs|projection|coordinate system|spatial reference)(?: wkt)?\s*[:=]?\s*)?"
     r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
@@ -134,6 +134,11 @@ class StatedSystem:
                 return None
         code = int(self._keys.get(PROJECTED_CRS, 0))
         return None if code in (0, USER_DEFINED) else code
+
+    @property
+    def epsg(self) -> int | None:
+        """EPSG code of the system, or None if the file states none."""
+        return self._code
 
     def units(self) -> CoordinateUnits | None:
         """Return the units of the coordinates; None if the file says nothing of a projection.

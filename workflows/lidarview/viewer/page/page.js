@@ -5,6 +5,7 @@ import { Picture, lastNotAbove } from "./picture.js";
 import { count, follow, replace, slots, stop } from "./run.js";
 
 const FIRST_LOOK = 200_000; // points that are asked for first
+const POINTER_MS = 60; // for which the mouse rests before its place is looked for
 const REST_MS = 250; // for which the camera stands still before points are asked for
 const NEWS_MS = 500;
 const CACHED = 300e6; // bytes of points of single sweeps
@@ -15,6 +16,7 @@ const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
 const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
 const HIDDEN = "not shown";
 const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
+const READING = "Reading the points …"; // until the first are there
 const FAINT = 0.2; // opacity of grey surfaces before points, so that these come first
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
@@ -44,6 +46,10 @@ function failed(error) {
     setPlaying(false);
     say("The server of this page has ended.", true);
   }
+}
+
+function sayRead() {
+  if ($("hint").textContent === READING) say("");
 }
 
 function say(words, bad = false) {
@@ -95,6 +101,7 @@ function refresh() {
   if (!state) return true;
   const asked = questionAt(chosen.time), key = keyOf(asked);
   if (chosen.colour === HIDDEN) {
+    sayRead();
     for (const layer of ["base", "detail"]) picture.setPoints(layer, null);
     shownKey = null;
     tellFacts();
@@ -131,6 +138,7 @@ async function loadBase(asked) {
   const told = await load("base", { ...asked, most: Math.min(FIRST_LOOK, chosen.budget) });
   picture.setPoints("detail", null);
   picture.setPoints("base", told);
+  sayRead();
   complete = told.arrays.rows.length >= told.count;
   showLegend(told.legend);
   tellFacts();
@@ -197,6 +205,7 @@ function showSweeps(asked, key) {
   complete = true;
   picture.setPoints("base", null);
   picture.setPoints("detail", told);
+  sayRead();
   showLegend(told.legend);
   tellFacts();
   return true;
@@ -378,7 +387,7 @@ function buildPanel() {
   const columns = state.columns.map((column) => column.name);
   panel.facts = element("div", { id: "facts" });
   const head = element(
-    "header", {}, element("h1", { textContent: document.title, title: document.title }),
+    "header", {}, element("h1", { textContent: document.title.replace(/ - lidarpool$/, "") }),
     iconButton("link", "Copy the link to this view", copyLink),
     iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
     iconButton("help", "Keys and mouse (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
@@ -1098,6 +1107,31 @@ function mouse() {
     if (pressed && Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) < 4) pick(event.offsetX, event.offsetY, event.shiftKey).catch(failed);
     pressed = null;
   });
+  canvas.addEventListener("pointermove", tellPlace);
+  canvas.addEventListener("pointerleave", () => { clearTimeout(restingTimer); showPlace(); });
+}
+
+// The coordinates under the mouse, once it rests: to look among all points takes up to 0.2 s.
+let restingTimer = 0;
+function tellPlace(event) {
+  clearTimeout(restingTimer);
+  if (event.pointerType === "touch" || event.buttons) return;
+  const { offsetX: x, offsetY: y } = event;
+  restingTimer = setTimeout(() => {
+    const point = picture.pick(x, y)?.place, place = point ?? picture.surfaceAt(x, y);
+    showPlace(place?.map((value, axis) => value + state.origin[axis]), point ? 3 : surfacePlaces());
+  }, POINTER_MS);
+}
+
+// Digits after the point that hold on surfaces, which are drawn up to 2 cm further inwards.
+function surfacePlaces() {
+  const inwards = Math.min(1e-4 * length(less(state.bounds[1], state.bounds[0])), 0.02);
+  return Math.min(3, Math.max(0, Math.floor(-Math.log10(inwards || 1))));
+}
+
+function showPlace(place = [], places = 3) {
+  const words = [...(state.epsg ? [`EPSG:${state.epsg}`] : []), ...place.map((value, k) => `${"xyz"[k]} ${digits(value, "m", places)}`)];
+  $("place").replaceChildren(...words.map((text) => element("span", { textContent: text })));
 }
 
 async function begin() {
@@ -1110,11 +1144,12 @@ async function begin() {
   const told = await follow("state", () => ({}), NEWS_MS, (it) => {
     if (it.columns) return true;
     $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
+    say("");
     tellRun(it);
     if (it.failures[0]) say(it.failures[0].error, true);
     return false;
   });
-  say("Reading …");
+  say(READING);
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
   drives = !told.live && told.sensors.some((sensor) => sensor.moves);
@@ -1142,8 +1177,8 @@ async function begin() {
   showPicked();
   if (chosen.clipBox) showClipBox(true);
   setInterval(keepLink, 500);
-  say("");
   mouse();
+  showPlace();
   addEventListener("keydown", keys);
   addEventListener("keyup", releaseKey);
   addEventListener("hashchange", () => location.reload()); // another link was entered

@@ -6,7 +6,7 @@ THREE.ColorManagement.enabled = false; // colours are those of the legends
 
 const THEMES = {
   light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
-  dark: { back: 0x14171c, grid: 0x2a3038, surface: 0x3c434d, rays: 0x8f3c48 },
+  dark: { back: 0x14171c, grid: 0x363e48, surface: 0x3c434d, rays: 0x8f3c48 },
 };
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
 const FOV = 45; // degrees, from the upper to the lower edge
@@ -107,6 +107,13 @@ function bend({ mesh, poses, faces }, frame) {
   const here = (k) => 3 * (vertices * Math.floor(at) + faces[Math.floor(k / 3)]) + (k % 3);
   corners.array.forEach((_, k, all) => { all[k] = lerp(poses[here(k)], poses[here(k) + 3 * vertices], at % 1); });
   corners.needsUpdate = true;
+}
+
+// Names of the stations of a sensor that does not move, each once: [text, place, class].
+function stationsOf({ name, labels, places, at }) {
+  const distinct = new Map(labels.map((label, k) => [label, places.subarray(3 * k, 3 * k + 3)]));
+  if (distinct.size < 2) return [[name || "sensor", at]];
+  return [...distinct].map(([label, place]) => [label, place, at.every((value, axis) => value === place[axis]) ? "station now" : "station"]);
 }
 
 export class Picture {
@@ -487,8 +494,7 @@ export class Picture {
     const names = this.marks.filter((mark) => mark.text).map((mark) => [mark.text, mark.place]);
     const moving = this.sensors.filter((sensor) => sensor.moves && sensor.shown && sensor.at);
     if (moving.length) names.push([moving.map((sensor) => sensor.name).filter(Boolean).join(", ") || "sensor", moving[0].at]);
-    for (const sensor of this.sensors)
-      if (!sensor.moves && sensor.shown && sensor.at) names.push([sensor.name || "sensor", sensor.at]);
+    for (const sensor of this.sensors) if (!sensor.moves && sensor.shown && sensor.at) names.push(...stationsOf(sensor));
     for (const actor of this.actors)
       if (this.boxes && actor.mesh.visible && actor.at) names.push([actor.label, [actor.at[0], actor.at[1], actor.at[2] + actor.top]]);
     return [...names, ...(this.path?.ends ?? [])].slice(0, 100);
@@ -637,20 +643,23 @@ export class Picture {
   drawLabels() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const taken = [], shown = [];
-    for (const [text, place] of this.labelled) {
+    for (const [text, place, kind = ""] of this.labelled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
-      const wide = 7 * text.length + 14, y = ((1 - at.y) / 2) * height - 24;
-      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + 8, width - wide));
-      if (taken.some(([a, b, c]) => x < a + c && a < x + wide && Math.abs(y - b) < 22)) continue;
-      taken.push([x, y, wide]);
-      shown.push([text, x, y]);
+      // Stations have their number on their mark, other things their name beside it.
+      const on = kind.startsWith("station"), wide = 7 * text.length + (on ? 11 : 14), tall = on ? 18 : 22;
+      const y = ((1 - at.y) / 2) * height - (on ? 9 : 24);
+      const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + (on ? -wide / 2 : 8), width - wide));
+      if (taken.some(([a, b, c, d]) => x < a + c && a < x + wide && y < b + d && b < y + tall)) continue;
+      taken.push([x, y, wide, tall]);
+      shown.push([text, x, y, kind]);
     }
     while (this.labels.children.length < shown.length) this.labels.append(element("span"));
     [...this.labels.children].forEach((label, k) => {
       label.hidden = k >= shown.length;
       if (label.hidden) return;
-      const [text, x, y] = shown[k];
+      const [text, x, y, kind] = shown[k];
+      if (label.className !== kind) label.className = kind;
       if (label.textContent !== text) label.textContent = text;
       label.style.transform = `translate(${Math.round(x)}px, ${Math.round(y)}px)`;
     });
@@ -711,6 +720,33 @@ export class Picture {
     const nearest = found.reduce((a, b) => (b.depth < a.depth ? b : a)).depth;
     const first = this.isParallel ? found.filter((one) => one.depth <= nearest + 0.01) : found.filter((one) => one.depth <= SAME_SURFACE * nearest);
     return first.reduce((a, b) => (b.away < a.away ? b : a));
+  }
+
+  // The place on a surface under the mouse, [x, y, z], or null.
+  surfaceAt(x, y) {
+    if (!this.surface || !this.opacity) return null;
+    const { clientWidth: width, clientHeight: height } = this.canvas, { low, high } = this.pointMaterial.uniforms;
+    const [start, end] = [-1, 1].map((depth) => new THREE.Vector3((2 * x) / width - 1, 1 - (2 * y) / height, depth).unproject(this.camera));
+    const way = end.sub(start), { geometry } = this.surface, p = geometry.attributes.position.array, index = geometry.index?.array;
+    const [dx, dy, dz] = way.toArray(), [ox, oy, oz] = start.toArray();
+    let nearest = Infinity;
+    for (let k = 0, count = index?.length ?? p.length / 3; k < count; k += 3) { // by Möller and Trumbore, 1997
+      const a = 3 * (index ? index[k] : k), b = a + 3, c = a + 6;
+      const e1x = p[b] - p[a], e1y = p[b + 1] - p[a + 1], e1z = p[b + 2] - p[a + 2];
+      const e2x = p[c] - p[a], e2y = p[c + 1] - p[a + 1], e2z = p[c + 2] - p[a + 2];
+      const hx = dy * e2z - dz * e2y, hy = dz * e2x - dx * e2z, hz = dx * e2y - dy * e2x;
+      const det = e1x * hx + e1y * hy + e1z * hz;
+      if (det === 0) continue;
+      const sx = ox - p[a], sy = oy - p[a + 1], sz = oz - p[a + 2], u = (sx * hx + sy * hy + sz * hz) / det;
+      if (!(u >= 0 && u <= 1)) continue;
+      const qx = sy * e1z - sz * e1y, qy = sz * e1x - sx * e1z, qz = sx * e1y - sy * e1x, v = (dx * qx + dy * qy + dz * qz) / det;
+      if (!(v >= 0 && u + v <= 1)) continue;
+      const t = (e2x * qx + e2y * qy + e2z * qz) / det;
+      if (!(t >= 0 && t < nearest)) continue;
+      const inside = [ox + t * dx, oy + t * dy, oz + t * dz].every((value, axis) => value >= low.value.getComponent(axis) && value <= high.value.getComponent(axis));
+      if (inside) nearest = t;
+    }
+    return nearest < Infinity ? start.addScaledVector(way, nearest).toArray() : null;
   }
 
   // places: of points that are marked, with lines between them; text: of what they measure; closed:

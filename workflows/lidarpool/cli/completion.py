@@ -1,0 +1,97 @@
+"""Completion of the values of options and arguments by the shell.
+
+Values are from tables that are quick to import. Plug-ins are looked up only for words that no table
+completes, because a look-up takes as long as half of a completion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+
+import click
+from click.shell_completion import CompletionItem
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
+
+from ..export.format_table import EXPORTS, GROUP
+from ..playback.bridge_table import BRIDGES
+from ..viewers.table import PAGE, VIEWERS
+
+Items = list[CompletionItem]
+
+
+def starting_with(incomplete: str, names: Iterable[str]) -> Items:
+    """Return the names that begin with a word."""
+    return [CompletionItem(name) for name in names if name.startswith(incomplete)]
+
+
+def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a sensor model, with or without its maker, or the name of a file."""
+    del ctx, param
+    from lidarsim.base.model_names import model_names, plugin_model_names
+
+    names = model_names()
+    matches = starting_with(incomplete, names)
+    if not matches:
+        matches = starting_with(incomplete, (name.partition("/")[2] for name in names))
+    if not matches:
+        with suppress(LidarError):
+            matches = starting_with(incomplete, plugin_model_names(incomplete))
+    # The shell completes names of files itself. bash does so only if nothing else matches, and
+    # forgets the items before.
+    return [CompletionItem(incomplete, type="file"), *matches]
+
+
+def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete the last of several columns that commas separate."""
+    del ctx, param
+    return _in_list(incomplete, OPTIONAL_COLUMNS)
+
+
+def colours(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a column by which points are coloured."""
+    del ctx, param
+    return starting_with(incomplete, (*ALWAYS_COLUMNS, *OPTIONAL_COLUMNS, *COMPOSED_COLUMNS))
+
+
+def formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete the last of several formats of clouds that commas separate."""
+    del ctx, param
+    return _in_list(incomplete, EXPORTS) or _in_list(incomplete, _plugin_formats())
+
+
+def format_name(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a format of clouds."""
+    del ctx, param
+    return starting_with(incomplete, EXPORTS) or starting_with(incomplete, _plugin_formats())
+
+
+def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a bridge of `play`."""
+    del ctx, param
+    return starting_with(incomplete, BRIDGES)
+
+
+def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete what --live shows, or the argument that follows if --live stands alone."""
+    del param
+    items = starting_with(incomplete, [PAGE, *VIEWERS])
+    takes_file = any(isinstance(param, click.Argument) for param in ctx.command.params)
+    return [CompletionItem(incomplete, type="file"), *items] if takes_file else items
+
+
+def _in_list(incomplete: str, names: Iterable[str]) -> Items:
+    """Complete the last of several names, with the names before it."""
+    before, comma, last = incomplete.rpartition(",")
+    used = before.split(",")
+    unused = [name for name in names if name not in used]
+    return [CompletionItem(f"{before}{comma}{item.value}") for item in starting_with(last, unused)]
+
+
+def _plugin_formats() -> Iterator[str]:
+    """Yield the formats of plug-ins."""
+    from lidarsim.base.plugins import plugins_of
+
+    yield from plugins_of(GROUP)
