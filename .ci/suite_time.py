@@ -9,8 +9,8 @@ Usage: python .ci/suite_time.py TEST_SECONDS DEMO_SECONDS    (files that .ci/tim
 import sys
 from pathlib import Path
 
-QUIET_RATIO = 6.0
-ALLOWED = 1.4 * QUIET_RATIO
+MEASURED_RATIO = 5.25  # 834 s to 159 s, beside lint on a busy machine, 2026-11-27
+ALLOWED = 1.4 * MEASURED_RATIO
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
     ratio = test_s / demo_s
     print(
         f"processor time: make test {test_s:.0f} s, make demo {demo_s:.0f} s, ratio {ratio:.2f} "
-        f"({QUIET_RATIO:.2f} on a quiet machine, at most {ALLOWED:.2f})"
+        f"(measured before {MEASURED_RATIO:.2f}, at most {ALLOWED:.2f})"
     )
     if ratio > ALLOWED:
         sys.exit("make test takes too long: see the slowest tests above; leave some to test-all")
