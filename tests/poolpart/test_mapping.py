@@ -290,7 +290,7 @@ def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, o
     monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.05)
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
-    results = part.map(twice, itertools.count(), ordered=ordered, chunk=1, window=4)
+    results = part.map(twice, itertools.count(), ordered=ordered, chunk=1, window=4, empty_s=1.0)
     assert next(results) == 0
     with Client(client.cluster) as other:
         Pool(other if by_another else client, []).dissolve()
