@@ -650,8 +650,10 @@ export class Picture {
       const on = kind.startsWith("station"), wide = 7 * text.length + (on ? 11 : 14), tall = on ? 18 : 22;
       const y = ((1 - at.y) / 2) * height - (on ? 9 : 24);
       const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + (on ? -wide / 2 : 8), width - wide));
-      if (taken.some(([a, b, c, d]) => x < a + c && a < x + wide && y < b + d && b < y + tall)) continue;
-      taken.push([x, y, wide, tall]);
+      const over = on ? 5 : 0; // pixels by which marks may overlap each other
+      const [left, top, right, bottom] = [x + over, y + over, x + wide - over, y + tall - over];
+      if (taken.some((box) => left < box[2] && box[0] < right && top < box[3] && box[1] < bottom)) continue;
+      taken.push([left, top, right, bottom]);
       shown.push([text, x, y, kind]);
     }
     while (this.labels.children.length < shown.length) this.labels.append(element("span"));
