@@ -212,18 +212,16 @@ def test_far_origins_lose_nothing(caster, shapes):
         np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
 
 
-@pytest.mark.parametrize("far", [1e20, 1e200])
-def test_rays_from_absurdly_far_away_give_neither_warnings_nor_what_is_no_number(
-    caster, shapes, far
-):
-    """Float64 cannot aim from there: a ray towards the cube may meet it or not."""
+def test_rays_from_absurdly_far_give_no_warning(caster, shapes):
+    """Float64 cannot aim at the cube from there: a ray misses, or hits at its distance."""
     cube = caster(*shapes["cube"]())
-    axes = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1]]])
-    assert not cube.cast(far * axes, axes).hit.any()
-    assert not np.isnan(cube.cast(far * axes, -axes).distance).any()
+    far = 1e100 * np.random.default_rng(3).normal(size=(300, 3))
+    assert not cube.cast(far, far).hit.any()
+    hits = cube.cast(far, -far)
+    distance = np.where(hits.hit, np.linalg.norm(far, axis=1), np.inf)
+    np.testing.assert_allclose(hits.distance, distance)
 
 
-@pytest.mark.extended
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
 def test_any_unit_of_length(caster, shapes, size):
