@@ -40,7 +40,7 @@ durations: dev  ## seconds of each file of tests, into tests/durations.json; on 
 	$(PYTEST) -m "not slow" --junitxml=build/junit.xml
 	$(BIN)/python .ci/durations.py build/junit.xml >tests/durations.json
 
-slow: dev  ## the tests that take minutes
+slow: dev  ## the tests that take seconds to minutes each
 	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
 

@@ -171,7 +171,7 @@ def test_letters_of_users_are_escaped(tmp_path):
     assert "[a](b)" not in card.replace(r"\[", "").replace(r"\]", "")
 
 
-@pytest.mark.extended(every=9)
+@pytest.mark.slow(every=9)
 @pytest.mark.parametrize(
     "rows",
     [

@@ -489,7 +489,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
 # -- the page -------------------------------------------------------------------------------------
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_page_by_itself_with_all_figures(tmp_path):
     rng = np.random.default_rng(5)
     light = rng.uniform(size=RANGES.shape)

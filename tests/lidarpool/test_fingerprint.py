@@ -237,7 +237,7 @@ def asked(folder: Path) -> str:
     ).stdout.strip()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_not(packages):
     ours = sources()
     assert asked(packages) == ours

@@ -60,7 +60,7 @@ def test_intervals_hold_what_was_put_in():
     assert len(held) > 45 and np.mean(held) > 0.85
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
     written = fitted.save(tmp_path / "mine.yaml")
     assert [path.name for path in written] == ["mine.yaml", "mine.html"]
@@ -118,7 +118,7 @@ def test_range_noise_of_a_model_stays_if_none_was_fitted():
     assert fitted.detection == model.performance.detection
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_bias_of_channels_against_planes_and_against_the_scene():
     bias = 0.005 * (-1.0) ** np.arange(16)
     made = recorded(Noise(range_m=0.01, seed=2), bias)
@@ -471,7 +471,7 @@ def test_bias_of_rings_is_as_uncertain_as_the_planes_are():
     assert len(held) > 10 and np.mean(held) > 0.85
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("street", "forest"))
 @pytest.mark.parametrize("where", PLACES)
 def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
@@ -485,7 +485,7 @@ def test_intervals_hold_in_rooms_streets_halls_and_forests(where):
                 assert abs(fitted[name]["value"] - true) < 2 * half, (number, name)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_where_only_the_ground_is_smooth_noise_is_not_determined():
     noise = Noise(range_m=0.02, range_per_m=0.0005, angle_deg=0.1, dropout=0.02, seed=3)
     scene, at = place("forest", 3)

@@ -434,7 +434,7 @@ def vectors_of(fields, prefix=""):
     return np.stack([fields[f"{prefix}{axis}"] for axis in "xyz"], axis=1).astype(float)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("compensated", [False, True])

@@ -306,7 +306,7 @@ def test_busy_slots_are_a_share_over_the_last_seconds():
     assert busy_slots([(0.0, load(0, 0, 0))])[0][1:] == [0.0, 0]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_campaign_is_watched_to_its_end(tmp_path):
     states = set()
     with (

@@ -39,7 +39,7 @@ scene = st.lists(
 )
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @settings(max_examples=8, derandomize=True)
 @given(discs=scene)
 def test_random_scenes(discs):

@@ -43,7 +43,7 @@ def areas(plan, scene):
     }
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_hall_with_a_column_and_a_door():
     column = placed("Column", (0.6, 0.6, 3), (3, 0, 0))
     scene = Scene.from_meshes([*rooms((0, -3, -0.5), (0, 0.5, 3)), column])
@@ -96,7 +96,7 @@ def test_a_hall_may_be_modelled_by_its_outside_alone():
     assert (np.abs(plan.candidates[:, :2] - (2.1, 1.1)).max(axis=1) > 0.5).all()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_range_field_of_view_and_slant_limit_what_is_seen():
     far = placed("Far", (2, 2, 5), (60, 0, 0))
     scene = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2)), far])

@@ -14,7 +14,7 @@ import struct
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,7 +79,7 @@ def bound():
     """Return a socket at a port that leaves room for those of other packets."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
-    opened.settimeout(20)
+    opened.settimeout(200)  # the command may compile its loops before the first packet
     for port in random.sample(range(20_000, 30_000), 100):
         with suppress(OSError):
             opened.bind(("127.0.0.1", port))
@@ -216,16 +216,21 @@ def test_a_killed_sender_ends_the_command_in_a_line(receiver, tmp_path):
     assert "Traceback" not in errors
 
 
+@contextmanager
 def playing(source, *options):
-    """Start the command in a process of its own."""
+    """Run the command in a process of its own, which does not outlive the block."""
     code = "from lidarpool.__main__ import main; main()"
-    return subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-c", code, "play", str(source), "--as", "packets", *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-    )
+    ) as run:
+        try:
+            yield run
+        finally:
+            run.kill()
 
 
 def children_of(pid):

@@ -231,7 +231,7 @@ def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, dis
     assert names == ["a.job", "job-mesh"]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_hash_of_a_plugin_is_that_of_its_package(tmp_path):
     code = (
         "from lidarsim.base.plugins import find_plugin\n"

@@ -447,7 +447,7 @@ def rover_at(name, time_ns):
     return at
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground):
     robot = load_robot(EXAMPLES / "rover.urdf")
     actors = robot.actors(DRIVE, MOTION, without=["lidar"])

@@ -142,7 +142,7 @@ def test_commands(arguments, words):
     assert len(Scene.load(arguments[1]).faces) > 700
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path):
     arguments = ["terrain", "out.obj", "--triangles", "800", "--side", "1000", "--trees", "5000"]
     with pytest.raises(LidarError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):

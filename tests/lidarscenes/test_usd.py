@@ -471,7 +471,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, 
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_person_of_a_scenario_moves(tmp_path):
     """Each point is on the surface that UsdSkel gives at its time."""
     path = person(tmp_path / "man.usda")

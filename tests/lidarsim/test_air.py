@@ -237,7 +237,7 @@ def sprayed(actor, meshes=(NOTHING,), backend="numpy", sensor=None, **options):
     return made(survey_of(sensor, **{**WET, **options}), scene, backend)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_numbers_of_returns_from_spray():
     """Two boxes of a tenth of a second behind the car, 2 m wide, are crossed in one of them."""
     count = 25_000

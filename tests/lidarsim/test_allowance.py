@@ -172,7 +172,7 @@ def bombs(tmp_path):
     return [tmp_path / name for name in BOMBS]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 def test_bombs_take_little_memory_and_say_what_they_are(bombs):
     pytest.importorskip("DracoPy", reason="the decoder of packed glTF is an extra")

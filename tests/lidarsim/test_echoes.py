@@ -285,7 +285,7 @@ BEAMS = Beams(
 TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("options", [ALL_ON, NOISE_ONLY], ids=["all on", "noise"])
 @pytest.mark.parametrize("path", [TURNED, {"trajectory": Cart()}], ids=["standing", "moving"])

@@ -220,7 +220,7 @@ def test_a_section_that_dies_is_named(tmp_path, monkeypatch):
     assert gpu.apart("moving", ["--quick"], 30)["error"] == "its process ended with -9"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_what_a_device_is_tested_with_needs_no_dask():
     """Machines with a GPU often have few packages and no network."""
     script = (

@@ -61,7 +61,7 @@ def test_importing_lidarsim_imports_neither_dask_nor_open3d_and_shows_tables_alo
     assert run(LOADED) == "[]\n"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_sweep_of_a_city_model_needs_none_of_them(tmp_path):
     surface = {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2, 3]]]}
     model = {

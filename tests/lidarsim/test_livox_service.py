@@ -84,7 +84,7 @@ class Live:
         self.destinations = []
         self.client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.client.bind(("127.0.0.1", 0))
-        self.client.settimeout(5)
+        self.client.settimeout(60)
         self.port = 56_100
 
     def ask(self, content, port=None):
@@ -138,7 +138,7 @@ def test_the_host_is_told_of_the_sensor_and_its_state():
     ):
         for receiver, port in ((search, 56_000), (states, 56_201)):
             receiver.bind((HOST, port))
-            receiver.settimeout(5)
+            receiver.settimeout(60)
         with live():
             content, peer = search.recvfrom(2000)
             assert peer == (SENSOR, 56_000)
@@ -268,7 +268,7 @@ def test_a_flood_is_answered_in_part():
                 sensor.client.recv(2000)
                 answers += 1
         assert 0 < answers < 1000 and time.process_time() - start_s < 2
-        sensor.client.settimeout(5)
+        sensor.client.settimeout(60)
         # A second later the sensor answers again; what the flood left in its buffer comes first.
         assert sensor.ask(frame(SEARCH))[0] == SEARCH
 
@@ -299,7 +299,7 @@ def test_the_port_of_the_points_is_the_sensors():
     (group,) = encoder_of(PacketSource(load_sensor("mid360"), "strongest")).encode(shots)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver, Sender() as sender:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5)
+        receiver.settimeout(60)
         port = receiver.getsockname()[1]
         sender.redirect(0, Destination("127.0.0.1", {56_301: port}), SENSOR)
         sender.send(0, [group], lambda due_ns: due_ns * 0)

@@ -81,7 +81,7 @@ SURVEYS = {
 }
 
 
-@pytest.mark.extended(keep=("positions",))
+@pytest.mark.slow(keep=("positions",))
 @pytest.mark.slow(keep=("positions", "one beam, on the move", "lost returns", "crosstalk", "rain"))
 @pytest.mark.parametrize("name", SURVEYS)
 def test_the_estimate_is_safe_and_near(name):

@@ -95,7 +95,7 @@ SURVEYS = {
 }
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("standing-*", "driving-*"))
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 @pytest.mark.parametrize("name", SURVEYS)

@@ -455,7 +455,7 @@ def test_other_wavelengths_and_hidden_spots_are_not_seen():
     assert (ahead["cause"] == CROSSTALK).sum() > 200, "a little apart, most spots are in view"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_counts_of_sensors_that_turn_against_each_other_are_those_of_all_pairs():
     turns = 7
     f = 20_000
@@ -536,7 +536,7 @@ def drive(subrays=1, backend="numpy", **noise):
     ), survey
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("7",))
 @pytest.mark.parametrize("subrays", (1, 7))
 def test_batches_do_not_matter(subrays):

@@ -26,7 +26,7 @@ def receiver():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         opened.bind(("127.0.0.1", 0))
-        opened.settimeout(10)
+        opened.settimeout(60)
         yield opened
 
 
@@ -79,7 +79,7 @@ def test_late_datagrams_keep_half_of_their_distances(receiver):
 def test_what_a_service_redirects_goes_elsewhere(receiver):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, Sender() as sender:
         other.bind(("127.0.0.2", 0))
-        other.settimeout(10)
+        other.settimeout(60)
         sender.redirect(0, to(receiver), "127.0.0.1")
         begin = time.monotonic_ns()
         sender.send(0, [numbered(1, 0, 0)], lambda times_ns: times_ns + begin)

@@ -154,7 +154,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("waves", [False, True])
 @pytest.mark.parametrize("full", [0.01, 0.1])
 def test_saturation_is_that_of_the_twin(full, waves):

@@ -131,7 +131,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     assert cone["returns"].max() > 2
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_moved_and_turned_crowns_hold_the_same_leaves():
     """Instances, mirrored ones too, and actors; and meshes whose triangles wind inwards."""
     crown = ball("Crown", 1.0)

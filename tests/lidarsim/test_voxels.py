@@ -236,7 +236,7 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     assert counts[[1, 4]].tolist() == [0, 0]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_random_grids_stop_what_the_integral_says(tmp_path):
     """From outside and within, in all directions: the mean gap within three standard deviations."""
     draw = np.random.default_rng(4)
@@ -286,7 +286,7 @@ def test_turned_scaled_and_mirrored_copies_are_where_they_stand(tmp_path):
         assert found["range"] == pytest.approx(first["range"], abs=1e-4)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_crowns_and_grids_that_overlap_add_up(tmp_path):
     """Leaves belong to each in proportion; two grids, and a crown of one density."""
     one = tree(tmp_path / "One.vox", np.full((4, 8, 8), 0.2), low=(5, -4, -4))
@@ -314,7 +314,7 @@ STANDS = {"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}
 MOVES = {"trajectory": Cart()}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("path1",))
 @pytest.mark.parametrize("path", (STANDS, MOVES))
 def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch):

@@ -104,7 +104,7 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
         assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     """Along x, the sensor at 10 m/s and an actor towards it."""
     scene = replace(

@@ -228,7 +228,7 @@ def test_words_of_a_column_are_within_the_picture(name, scene, shot):
         assert figure.bbox.y0 <= box_px.y0 and box_px.y1 <= figure.bbox.y1, text.get_text()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("corners", "poses"),
     [

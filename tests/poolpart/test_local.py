@@ -198,7 +198,7 @@ LATE = """
 """
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_workers_that_close_while_the_scheduler_owes_an_answer_say_nothing(tmp_path):
     """As the schedulers of busy machines do at the end of a run."""
     running = script(tmp_path, LATE)

@@ -51,7 +51,7 @@ def printed(process):
     return process.communicate()[0].split()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_only_a_change_of_imported_files_compiles_again(package):
     """A loop depends on what its file imports, also indirectly, and not on all of its package.
 

@@ -59,7 +59,7 @@ def report(nvcc, folder, card, kind):
     return {name: tuple(map(int, numbers)) for name, *numbers in rows}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("120-*",))
 @pytest.mark.parametrize("kind", FLAGS)
 @pytest.mark.parametrize("card", CARDS)

@@ -155,7 +155,7 @@ def listed(hits):
     return [*zip(*(column[rays_of(hits)].tolist() for column in columns), strict=True)]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(every=5)
 @pytest.mark.parametrize("kind", ["fan", "any", "apart", "moving", "far", "paused"])
 def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
@@ -249,7 +249,7 @@ def test_no_loop_is_compiled_with_fast_mathematics():
     assert len(sources) > 20 and not any("fastmath" in source for source in sources)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     """Each ray, body and triangle compared by itself: the same bits, and of ties the lowest."""
     bodies = Bodies(9, seed=4, around=(6.0, 0, 3), speed=3.0)

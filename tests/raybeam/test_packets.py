@@ -124,7 +124,7 @@ def ties(backend):
     return found.hexdigest()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("AVX2",))
 @pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
 def test_the_lowest_of_equals_wins_with_every_instruction_set(isa):

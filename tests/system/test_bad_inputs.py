@@ -218,7 +218,7 @@ TOO_LARGE: dict[str, str] = {
 }
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("steps: 100000*",))
 @pytest.mark.parametrize("scenario", TOO_LARGE)
 def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):

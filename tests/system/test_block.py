@@ -38,7 +38,7 @@ def of(job, columns, name):
     return columns["object"] == job.scene.all_names.index(name)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_all_sources_are_in_one_scene_and_meshes_are_kept_once(scanned):
     built, job, _ = scanned
     assert [*built.findings.sources] == [

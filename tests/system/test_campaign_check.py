@@ -95,7 +95,7 @@ def test_a_job_that_is_not_there(campaign, lidarpool, name, job, says):
     assert says in outcome.err
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_example_can_run(lidarpool, tmp_path):
     for file in EXAMPLES.iterdir():
         if file.is_file() and file.suffix in (".yaml", ".csv", ".glb", ".obj"):

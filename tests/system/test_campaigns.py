@@ -126,7 +126,7 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     return Job(Scene.seed(), what, values={"x": number})
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("kitti",))
 @pytest.mark.parametrize("keep", ["kitti", "nuscenes"])
 def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, keep):
@@ -162,7 +162,7 @@ def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
 # -- each job alone -------------------------------------------------------------------------------
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
     out = files / "job-5"
@@ -475,7 +475,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
@@ -503,7 +503,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     assert "bit for bit" in lidarpool(*run, "--job", 1).out
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds", "--resume"]
     for count in (2, 6):
@@ -627,7 +627,7 @@ def three(slots, full_disk, tmp_path_factory):
     return bytes_of(folder)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("run", "jobs/0001"))
 @pytest.mark.parametrize("where", ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
 def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
@@ -764,7 +764,7 @@ def test_options_that_do_not_go_together(files, lidarpool, options, words, slots
     assert not (files / "ds").exists()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_several_scenarios_are_a_campaign(files, lidarpool, slots):
     (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
     two = [files / "base.yaml", files / "other.yaml"]
@@ -817,7 +817,7 @@ def test_killed_drivers_leave_the_same_bytes_and_no_remains(
     assert left_over(client) == ([], [], [])
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
     (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 100"))
     command = ["run", "c.yaml", "-q", "--scheduler", slots, "--out", "ds"]

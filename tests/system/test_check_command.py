@@ -301,7 +301,7 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     )
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     mesh = trimesh.creation.box((8000, 3000, 6000))
     (tmp_path / "there").mkdir()
@@ -348,7 +348,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     assert "holds an unfinished run: --resume continues it" in outcome.out
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_command_that_is_named_runs_where_another_result_is(
     check, cluster, tmp_path, lidarpool
 ):

@@ -82,7 +82,7 @@ def listened_on(pid: int) -> list[str]:
     return found
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_demo_makes_all_files_and_says_so(demo):
     out = demo.out
     ended = demo.ended
@@ -237,7 +237,7 @@ def test_doctor_tells_what_is_here(lidarpool):
     assert lidarpool("--version").out.startswith("lidarpool, version ")
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.usefixtures("pictures")
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
     out = demo.out
@@ -315,7 +315,7 @@ def processes_with(variable: str) -> list[str]:
     return commands
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
     mark = f"LIDARPOOL_TEST_{os.getpid()}"
     (tmp_path / "scenario.yaml").write_text(SHORT)

@@ -25,7 +25,7 @@ def surveys(tmp_path_factory, cluster):
     return folder
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
     out = surveys / "out"
     done = lidarpool("compare", surveys / "noisy", surveys / "clean", "--out", out)

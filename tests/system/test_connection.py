@@ -61,7 +61,7 @@ def waiting_run(tmp_path, address):
     run.close()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_path):
     workers = {name: {"resources": {name: slots}} for name, slots in (("GPU", 1), ("LIDAR", 4))}
     with cluster_of(workers, {"port": int(address.rpartition(":")[2])}, host="127.0.0.1"):
@@ -69,7 +69,7 @@ def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_p
     assert (tmp_path / "out" / "cloud.ply").exists()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_waiting_for_a_scheduler_ends_with_an_interrupt(waiting_run):
     assert waiting_run.signal(signal.SIGINT) == 130
     assert waiting_run.said.splitlines()[-1].startswith("lidarpool: interrupted")

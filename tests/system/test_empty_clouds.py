@@ -56,7 +56,7 @@ def warnings(outcome: Any) -> list[str]:
     return [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_warning_is_on_stderr_and_strict_exits_with_1(run):
     outcome = run("--quiet")
     assert outcome.code == 0
@@ -157,7 +157,7 @@ def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tm
     assert outcome.code == 1 and [warning] == warnings(outcome)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, slots, tmp_path):
     for number, jobs in ((1, ""), (2, "2 jobs have no points: 0001, 0003; in job 0001 no ray hit")):
         out = tmp_path / f"part-{number}"

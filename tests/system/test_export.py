@@ -84,7 +84,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert {path.name for path in out.iterdir()} == (made | {"pcd"}) - {"cloud.laz"}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpool, tmp_path):
     out = tmp_path / "out"
     scenario = tmp_path / "s.yaml"
@@ -163,7 +163,7 @@ def many_files(lidarpool, tmp_path, address):
     return lambda *more: lidarpool(*run, "--scheduler", address, *more)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
     cluster, lidarpool, tmp_path, monkeypatch
 ):

@@ -24,7 +24,7 @@ def slots() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-@pytest.mark.extended(every=5)
+@pytest.mark.slow(every=5)
 @pytest.mark.parametrize(
     ("file", "options", "begins"),
     [

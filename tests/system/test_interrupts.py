@@ -251,7 +251,7 @@ def test_a_signal_does_what_it_should(where):
     assert (ended.returncode, ended.stdout, ended.stderr[: len(err)]) == (code, out, err)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_workers_follow_a_driver_that_was_killed(start, untouched):
     run = start(LONG).wait_for(SURVEYING)
     assert len(run.processes) >= 4

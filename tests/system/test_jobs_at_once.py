@@ -106,7 +106,7 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     check(tmp_path, range(4), JOBS, client)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_tiny_jobs_share_casting_tasks_and_give_the_points_of_each_alone(
     client, tmp_path, left_over
 ):

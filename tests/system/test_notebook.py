@@ -9,7 +9,7 @@ from nbclient import NotebookClient
 EXAMPLE = Path(__file__).parents[2] / "examples/drive.ipynb"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     notebook = nbformat.read(EXAMPLE, 4)
     assert not any(cell.get("outputs") for cell in notebook.cells)  # they would grow old

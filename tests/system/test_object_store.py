@@ -193,7 +193,7 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
         package.sweeps(url)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("parquet",))
 @pytest.mark.parametrize("format", ("kitti", "parquet"))  # pyarrow reads it
 def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format):  # noqa: A002

@@ -50,7 +50,7 @@ def test_the_page_shows_the_package():
     assert max(text.count("\n") for text in shown.values()) <= 30
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
     """Mesh, sensor, importer, cloud format and command; processes of a cluster write the cloud."""
     environment = os.environ | {"PYTHONPATH": f"{installed}:{os.environ['PYTHONPATH']}"}

@@ -95,7 +95,7 @@ EVERY_EFFECT = Survey(
 )
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "survey",
     [SURVEY, pytest.param(EVERY_EFFECT, marks=pytest.mark.slow)],

@@ -17,7 +17,7 @@ from poolpart import Pool
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
     """If each had some of the slots, all would wait for each other for ever."""
     results: list[Result] = []

@@ -445,7 +445,7 @@ def test_shards_are_added_later(parts, campaigns, tmp_path):
     assert content(out) == whole
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path, slots):
     out = tmp_path / "ds"
     file = parts[0].parent / "c.yaml"
@@ -583,7 +583,7 @@ def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     assert times == {path: path.stat().st_ctime_ns for path in times}  # they were not taken again
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("finish",))
 @pytest.mark.parametrize("moment", ("write_table", "finish"))
 def test_seconds_of_shards_outlast_a_killed_merge(parts, tmp_path, moment):

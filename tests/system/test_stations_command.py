@@ -36,7 +36,7 @@ def hall(tmp_path):
     return tmp_path
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     arguments = ("stations", "hall.yaml", "--sensor", "vlp16", "--coverage", "90%")
     arguments += ("--slant", "85", "--spacing", "1.5")
@@ -99,7 +99,7 @@ def test_what_cannot_be_planned_writes_nothing(arguments, says, hall, lidarpool)
     assert not (hall / "hall-stations").exists()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
     (hall / "crate.stl").write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="stl"))
     (hall / "crates.csv").write_text("x,y,z\n-3,1,0.5\n-3,-1,0.5\n")

@@ -62,7 +62,7 @@ def expected(local_client: Client) -> list[Sweep]:
     return list(campaign().stream(client=local_client))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("kitti",))
 @pytest.mark.parametrize("keep", ["parquet", "kitti", "webdataset"])
 def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, torch, keep):
