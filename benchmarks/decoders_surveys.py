@@ -18,7 +18,7 @@ from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

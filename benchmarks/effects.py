@@ -18,7 +18,7 @@ from docs.pictures.effects._catalogue import load_effects
 from docs.pictures.effects._street import survey_without
 
 from lidarscenes.procedural.city import city
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 ROUNDS = 5

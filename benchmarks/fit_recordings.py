@@ -25,9 +25,9 @@ from lidarpool.compare.fit.stack import SweepStack
 from lidarpool.compare.fit.surfaces import find_surfaces, select_smooth_rays
 from lidarpool.recordings.recordings import Recording, open_recording
 from lidarsim.sensor.models import read_model
-from lidarsim.simulator.angle_noise import angle_errors
-from lidarsim.simulator.detection import detected
-from lidarsim.simulator.range_noise import noisy_ranges
+from lidarsim.simulator.steps.angle_noise import angle_errors
+from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.range_noise import noisy_ranges
 
 COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 

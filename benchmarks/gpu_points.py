@@ -20,14 +20,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-import lidarsim.simulator.device
+import lidarsim.simulator.points.device
 from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.actors import Actor, box
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import Outbox
 
@@ -93,7 +93,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
     split = Split(cupy)
     engine = rig.scene_casters[0].caster.engine
     run = engine._run  # type: ignore[attr-defined]
-    kernel = lidarsim.simulator.device._kernel
+    kernel = lidarsim.simulator.points.device._kernel
     send = Outbox.send
 
     def running(name: str, *arguments: Any) -> None:
@@ -114,7 +114,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
     with (
         patch.object(engine, "_run", running),
-        patch.object(lidarsim.simulator.device, "_kernel", columns),
+        patch.object(lidarsim.simulator.points.device, "_kernel", columns),
         patch.object(Outbox, "send", sending),
     ):
         yield split

@@ -26,7 +26,7 @@ from lidarpool import Mounted, Pose, Scene, Survey, Track, load_sensor, save_clo
 from lidarscenes.procedural.city import city
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

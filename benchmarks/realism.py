@@ -35,7 +35,7 @@ from lidarscenes.procedural.city import city
 from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 

@@ -32,7 +32,7 @@ import numpy as np
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
 from lidarscenes.procedural.city import city
 from lidarsim.scene.actors import Actor, box
-from lidarsim.simulator.points import BatchPoints
+from lidarsim.simulator.points.batch_points import BatchPoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 

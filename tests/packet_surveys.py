@@ -11,7 +11,7 @@ from lidarpool import Scene
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -41,7 +41,7 @@ from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Beams, Mirror
 from lidarsim.sensor.sensor import LineSensor
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

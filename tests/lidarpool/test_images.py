@@ -38,7 +38,7 @@ from lidarsim.sensor.models import read_model
 from lidarsim.sensor.plain_data import from_plain_data, to_plain_data
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.sensor.sensor import LineSensor
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

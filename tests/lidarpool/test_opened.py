@@ -30,7 +30,7 @@ from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.viewer.sharing import page_of

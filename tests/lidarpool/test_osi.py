@@ -14,7 +14,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import Actor, box
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

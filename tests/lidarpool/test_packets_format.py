@@ -18,7 +18,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN, TABLE
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -45,7 +45,7 @@ from lidarpool.playback.transmitter import Transmitter, sensor_streams
 from lidarsim.columns.cloud import Cloud
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.sweeps.instruments import IMU_FILE, Instrument
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 

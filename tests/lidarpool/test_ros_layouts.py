@@ -35,7 +35,7 @@ from lidarpool.export.ros.livox import CUSTOM_DEFINITION
 from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import SCAN
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -20,8 +20,8 @@ from lidarpool.scenario.scenario import Scenario
 from lidarsim.base import allowance
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import Actor, box
+from lidarsim.simulator.casting.surfaces import Surfaces
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.surfaces import Surfaces
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 

@@ -16,7 +16,7 @@ from lidarpool.cli.scenario_commands import import_
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.files.meshfile import load_objects
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 BOX = "<geometry><box><size>1 1 1</size></box></geometry>"

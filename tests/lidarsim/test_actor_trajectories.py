@@ -5,7 +5,7 @@ import pytest
 
 from lidarpool import LidarError, Pose, Track
 from lidarsim.sensor import Stations
-from lidarsim.simulator.actor_trajectories import ActorTrajectories
+from lidarsim.simulator.casting.actor_trajectories import ActorTrajectories
 
 
 class Circle:

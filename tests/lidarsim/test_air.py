@@ -29,8 +29,8 @@ from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.materials import extinction
 from lidarsim.sensor.weather import EXIT_M, dust, rain, snow, spray
-from lidarsim.simulator.air import highest_probabilities
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.steps.air import highest_probabilities
 
 SEEN = Noise(detection_range_m=100)
 THRESHOLD = 0.1 * (10 / 100) ** 2

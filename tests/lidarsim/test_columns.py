@@ -30,7 +30,7 @@ from lidarpool import (
     simulate,
 )
 from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, optional_columns, stored
-from lidarsim.simulator.points import BatchPoints
+from lidarsim.simulator.points.batch_points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
 

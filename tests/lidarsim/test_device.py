@@ -37,9 +37,9 @@ from lidarsim.sensor.materials import Material
 from lidarsim.sensor.models import load_sensor
 from lidarsim.sensor.optics import Returns
 from lidarsim.sensor.trajectory import Stations
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.device import OPTIONS, DevicePoints
 from lidarsim.simulator.memory import cast_bytes
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.points.device import OPTIONS, DevicePoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 
@@ -305,7 +305,7 @@ def test_the_kernel_compiles_without_spills(card, tmp_path):
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
     if f"compute_{card}" not in known.split():
         pytest.skip(f"this nvcc does not know sm_{card}")
-    source = importlib.resources.files("lidarsim.simulator") / "columns.cu"
+    source = importlib.resources.files("lidarsim.simulator.points") / "columns.cu"
     done = subprocess.run(
         [nvcc, *OPTIONS, f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v", "-o",
          str(tmp_path / "out"), str(source)],

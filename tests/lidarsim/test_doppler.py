@@ -23,11 +23,11 @@ from lidarpool import (
 from lidarscenes.robots.robot import Hinge, LinkPath
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarsim.simulator.air import AIR
-from lidarsim.simulator.false_alarms import FALSE_ALARM
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.separation import separated
+from lidarsim.simulator.steps.air import AIR
+from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
+from lidarsim.simulator.steps.separation import separated
 
 # of the train
 SPEED = 25.0

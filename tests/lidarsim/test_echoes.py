@@ -42,11 +42,11 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.sensor.materials import extinction, fresnel
 from lidarsim.sensor.random_numbers import raw
-from lidarsim.simulator.angle_noise import ACROSS
-from lidarsim.simulator.range_noise import RANGE
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.separation import chosen, separated
+from lidarsim.simulator.steps.angle_noise import ACROSS
+from lidarsim.simulator.steps.range_noise import RANGE
+from lidarsim.simulator.steps.separation import chosen, separated
 
 # -- random numbers ------------------------------------------------------------------------------
 

@@ -35,9 +35,9 @@ from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import Cutout
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.stray_light import BLOOMING
+from lidarsim.simulator.steps.stray_light import BLOOMING
 from raybeam import available_backends, registry
 
 CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]

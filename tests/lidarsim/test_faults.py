@@ -36,7 +36,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -11,7 +11,7 @@ from tests.shapes import wall
 from lidarpool import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 CHANNELS = 100

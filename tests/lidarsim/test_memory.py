@@ -26,8 +26,8 @@ from lidarpool import (
     load_sensor,
 )
 from lidarsim.sensor.survey import OPTIONAL_NAMES
-from lidarsim.simulator.batch import columns_of
 from lidarsim.simulator.memory import HIT_COUNTER, cast_bytes, scans_that_fit
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 RAYS = 600_000

@@ -29,11 +29,11 @@ from lidarpool import (
 from lidarsim.sensor.navigation import fixes, imu_samples
 from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.weather import Weather, rain, snow
-from lidarsim.simulator import air_loops, pulse_loops, random_loops, spray_loops
-from lidarsim.simulator.losses import PACKET
-from lidarsim.simulator.range_noise import CHANNEL
-from lidarsim.simulator.recording import SAMPLE, SAMPLES
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.steps import air_loops, pulse_loops, random_loops, spray_loops
+from lidarsim.simulator.steps.losses import PACKET
+from lidarsim.simulator.steps.range_noise import CHANNEL
+from lidarsim.simulator.steps.recording import SAMPLE, SAMPLES
 from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)

@@ -37,7 +37,7 @@ from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.ouster import PROFILES
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -27,7 +27,7 @@ from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import CarryOver, Shots
 from lidarsim.packets.velodyne_position import PositionPackets
 from lidarsim.sensor.models import read_model
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import Instrument, Instruments
 from lidarsim.sweeps.sweeps import Sweeps

@@ -30,12 +30,12 @@ from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.crosstalk import CROSSTALK
-from lidarsim.simulator.false_alarms import FALSE_ALARM
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import SURFACE
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.stray_light import BLOOMING
+from lidarsim.simulator.steps.crosstalk import CROSSTALK
+from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
+from lidarsim.simulator.steps.stray_light import BLOOMING
 from raybeam import available_backends
 
 WHITE = [Material("*", reflectance=1.0)]

@@ -12,8 +12,8 @@ from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, 
 from lidarpool.columns.parts import pack
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator import static_bodies
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.casting import static_bodies
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
 

@@ -41,7 +41,7 @@ from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator import rig as rig_module
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -26,7 +26,7 @@ from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 SPHERE = seed_objects(rings=8, segments=12)[0]

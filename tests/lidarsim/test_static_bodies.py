@@ -26,9 +26,9 @@ from lidarsim.columns.table import OPTIONAL
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator import static_bodies
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.clipping import box_planes, cut
+from lidarsim.simulator.casting import static_bodies
+from lidarsim.simulator.casting.clipping import box_planes, cut
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 COLUMNS = [column.name for column in OPTIONAL]

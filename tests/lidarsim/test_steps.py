@@ -16,14 +16,19 @@ from lidarsim.columns.table import CAUSES
 from lidarsim.sensor.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
 from lidarsim.sensor.random_numbers import Purpose
 from lidarsim.sensor.survey import OPTIONAL_NAMES
-from lidarsim.simulator.doppler import VELOCITY
-from lidarsim.simulator.losses import DirtStep
-from lidarsim.simulator.paths import CastStep
-from lidarsim.simulator.recording import RecordingStep
 from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, returns_without_surface
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.step import PulseStep, Role
-from lidarsim.simulator.steps import STEPS, add_step, received_causes, remove_step
+from lidarsim.simulator.steps.doppler import VELOCITY
+from lidarsim.simulator.steps.losses import DirtStep
+from lidarsim.simulator.steps.paths import CastStep
+from lidarsim.simulator.steps.recording import RecordingStep
+from lidarsim.simulator.steps.step import PulseStep, Role
+from lidarsim.simulator.steps.step_list import (
+    STEPS,
+    add_step,
+    received_causes,
+    remove_step,
+)
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.

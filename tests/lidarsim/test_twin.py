@@ -15,19 +15,18 @@ from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.weather import Air, spray
-from lidarsim.simulator import spray_loops
-from lidarsim.simulator.air import AIR, WeatherStep, exponential, seen_by_range
-from lidarsim.simulator.detection import detected
-from lidarsim.simulator.pulse_loops import SampledHits
-from lidarsim.simulator.random_loops import RandomKeys
-from lidarsim.simulator.range_noise import noisy_ranges
+from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
-from lidarsim.simulator.saturation import saturated
-from lidarsim.simulator.separation import Reporting, separated
-from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
-from lidarsim.simulator.steps import setup_of
-from lidarsim.simulator.surfaces import SensorLight, Surfaces
-from lidarsim.simulator.waveform import Digitizer, returns_in
+from lidarsim.simulator.steps.air import AIR, WeatherStep, exponential, seen_by_range
+from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.pulse_loops import SampledHits
+from lidarsim.simulator.steps.random_loops import RandomKeys
+from lidarsim.simulator.steps.range_noise import noisy_ranges
+from lidarsim.simulator.steps.saturation import saturated
+from lidarsim.simulator.steps.separation import Reporting, separated
+from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
+from lidarsim.simulator.steps.step_list import setup_of, spray_loops
+from lidarsim.simulator.steps.waveform import Digitizer, returns_in
 
 GAP = 0.75
 KEYS = Keys(3, np.array([0, 40, 41, 300]))

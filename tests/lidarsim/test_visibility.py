@@ -34,10 +34,10 @@ from lidarsim.columns.table import CAUSES
 from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator import static_bodies
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.device import DevicePoints
+from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.memory import rig_bytes
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.points.device import DevicePoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 

@@ -26,10 +26,10 @@ from lidarpool.report.cloud_counts import CloudCounts
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.waveform import Digitizer, returns_in
+from lidarsim.simulator.steps.waveform import Digitizer, returns_in
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM

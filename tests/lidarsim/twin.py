@@ -21,7 +21,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.random_numbers import Purpose, quantiles
 from lidarsim.sensor.weather import Air, Particles
-from lidarsim.simulator.air import (
+from lidarsim.simulator.steps.air import (
     FOG_CELL,
     FOG_PLACE,
     PARTICLE_DIAMETER,
@@ -29,10 +29,10 @@ from lidarsim.simulator.air import (
     PARTICLE_SUBRAY,
     PARTICLES,
 )
-from lidarsim.simulator.detection import DETECTION, LOSS
-from lidarsim.simulator.range_noise import RANGE
-from lidarsim.simulator.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
-from lidarsim.simulator.waveform import Digitizer
+from lidarsim.simulator.steps.detection import DETECTION, LOSS
+from lidarsim.simulator.steps.range_noise import RANGE
+from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
+from lidarsim.simulator.steps.waveform import Digitizer
 
 Vector = tuple[float, ...]
 Key = tuple[int, int]  # a scan, and the number of a pulse in it

@@ -223,7 +223,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarsim.simulator.static_bodies.RayCaster",
+            "lidarsim.simulator.casting.static_bodies.RayCaster",
             raise_at(None),
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),

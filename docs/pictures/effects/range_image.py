@@ -17,7 +17,7 @@ from lidarpool.export.formats import Format
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.scene import Scene
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 

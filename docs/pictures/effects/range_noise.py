@@ -10,7 +10,7 @@ from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_be
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Survey
-from lidarsim.simulator.range_noise import range_walk
+from lidarsim.simulator.steps.range_noise import range_walk
 
 DRAWS = "effect-range-noise.png"
 NOISE = Noise(0.01, detection_range_m=100, range_at_threshold_m=0.1)

@@ -14,7 +14,7 @@ from lidarpool import Material, Noise, Returns, Scene, Survey
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import LIGHT_M_NS
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-saturation.png"

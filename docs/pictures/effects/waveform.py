@@ -15,7 +15,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
 DRAWS = "effect-waveform.png"

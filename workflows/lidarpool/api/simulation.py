@@ -15,7 +15,7 @@ from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey
-from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base.shard import Shard
 from ..export.folder import output_place

@@ -15,7 +15,7 @@ import click
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural, scans_in_words
-from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base import timeline
 from ..base.shard import Shard, shard_in_words

@@ -13,7 +13,7 @@ import numpy as np
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, SCAN, TABLE
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarview.picture_file import PictureContent
 from lidarview.viewer.point_selection import OrderedPoints

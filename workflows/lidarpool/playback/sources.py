@@ -17,7 +17,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import AXES, SCAN
-from lidarsim.simulator.batch import columns_of
+from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps

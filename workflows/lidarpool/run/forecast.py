@@ -22,6 +22,8 @@ from lidarsim.columns.cloud import CHUNK_POINTS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.sensor import Survey
+from lidarsim.simulator.casting.scene_caster import check_backend_here
+from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.simulator.memory import (
     INSTANCE,
     MB,
@@ -31,8 +33,6 @@ from lidarsim.simulator.memory import (
     scans_that_fit,
 )
 from lidarsim.simulator.sampling import sample_survey
-from lidarsim.simulator.scene_caster import check_backend_here
-from lidarsim.simulator.visibility import unseen_objects
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends

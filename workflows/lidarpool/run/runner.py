@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.simulator.scene_caster import check_backend_here
+from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base.shard import ALL
 from ..datasets.dataset import DataSet

@@ -27,8 +27,8 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.memory import MB, scans_that_fit
-from lidarsim.simulator.scene_caster import check_backend_here
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 

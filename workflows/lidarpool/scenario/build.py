@@ -32,9 +32,9 @@ from lidarsim.sensor.materials import (
 from lidarsim.sensor.survey import CloudOptions
 from lidarsim.sensor.trajectory import CENTRE
 from lidarsim.sensor.weather import Weather
-from lidarsim.simulator.static_bodies import warn_of_reach
-from lidarsim.simulator.surfaces import warn_of_grey
-from lidarsim.simulator.visibility import unseen_objects
+from lidarsim.simulator.casting.static_bodies import warn_of_reach
+from lidarsim.simulator.casting.surfaces import warn_of_grey
+from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..export.format_table import check_whole

@@ -16,7 +16,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, velocities
-from lidarsim.simulator.visibility import static_key, unseen_objects, without_objects
+from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 
 from .build import Built
 from .placing import seen_from, surroundings_of

@@ -48,10 +48,10 @@ class Column:
     meaning
         Description in a few words without a full stop.
     source
-        Name of an attribute of the returns of a batch (`lidarsim.simulator.points.BatchPoints`),
-        or a function that computes the column from the returns: an array (n,), a value for each
-        point. The function runs on the worker that casts the rays. By default the attribute with
-        the name of the column.
+        Name of an attribute of the returns of a batch
+        (`lidarsim.simulator.points.batch_points.BatchPoints`), or a function that computes the
+        column from the returns: an array (n,), a value for each point. The function runs on the
+        worker that casts the rays. By default the attribute with the name of the column.
     coordinates
         Coordinate system of the values: "world", "sensor", or "" for none.
     kind

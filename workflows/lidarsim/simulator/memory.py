@@ -12,12 +12,12 @@ from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.optics import TWO_RETURNS
-from .device import needs_hits
+from .casting.visibility import static_key, unseen_objects
+from .points.device import needs_hits
 from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
-from .step import Memory, Setup, Sizes
-from .steps import setup_of, steps_of
-from .visibility import static_key, unseen_objects
+from .steps.step import Memory, Setup, Sizes
+from .steps.step_list import setup_of, steps_of
 
 MB = 1_000_000
 

@@ -16,13 +16,13 @@ from raybeam import Pattern
 from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .doppler import radial_velocities
-from .motion import CastPoses, Firings
+from .casting.motion import CastPoses, Firings
+from .casting.scene_caster import SceneCaster
+from .casting.surfaces import Surfaces, light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
-from .scene_caster import SceneCaster
-from .step import Emitter, PulseBatch, PulseStep, Role
-from .steps import setup_of, steps_of
-from .surfaces import Surfaces, light_of
+from .steps.doppler import radial_velocities
+from .steps.step import Emitter, PulseBatch, PulseStep, Role
+from .steps.step_list import setup_of, steps_of
 
 CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
 
@@ -209,7 +209,7 @@ class PulseCaster:
 
     def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan, and keep every n-th return of a scan."""
-        from . import pulse_loops  # not before: numba takes half a second to import
+        from .steps import pulse_loops  # not before: numba takes half a second to import
 
         keep_every = self.setup.survey.keep_every
         size = len(returns.ray)

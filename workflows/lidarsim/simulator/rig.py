@@ -17,14 +17,14 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Sensor, Survey, Trajectory
-from .actor_trajectories import ActorTrajectories
-from .device import DeviceColumns, DevicePoints
-from .motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
-from .points import BatchPoints
+from .casting.actor_trajectories import ActorTrajectories
+from .casting.motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
+from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
+from .casting.surfaces import Surfaces
+from .points.batch_points import BatchPoints
+from .points.device import DeviceColumns, DevicePoints
 from .pulses import PulseCaster
 from .returns import required
-from .scene_caster import SceneCaster, casters_of_sensors, move_instances
-from .surfaces import Surfaces
 
 # Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
 PATTERN_RAYS = 20_000_000

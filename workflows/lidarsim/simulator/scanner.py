@@ -37,13 +37,13 @@ from ..sensor import (
     Trajectory,
 )
 from ..sensor.trajectory import CENTRE, pose_of
-from .batch import columns_of
 from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
-from .motion import check_trajectory
+from .casting.motion import check_trajectory
+from .casting.scene_caster import check_backend_here
+from .casting.static_bodies import warn_of_reach
+from .casting.surfaces import warn_of_grey
+from .points.batch_columns import columns_of
 from .rig import Rig
-from .scene_caster import check_backend_here
-from .static_bodies import warn_of_reach
-from .surfaces import warn_of_grey
 
 MAX_SCANS = 1 << 31  # the type of the column `scan`
 _MAX_REVOLUTIONS = 4  # whose scans are stored

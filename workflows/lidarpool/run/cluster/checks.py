@@ -13,8 +13,8 @@ from distributed import Client
 
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
+from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 from lidarsim.simulator.memory import MB, cast_bytes
-from lidarsim.simulator.scene_caster import AUTO_TAKES
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities

@@ -27,9 +27,9 @@ from lidarsim.base.arrays import Floats32
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey
-from lidarsim.simulator.batch import columns_of
-from lidarsim.simulator.device import DevicePoints
-from lidarsim.simulator.points import BatchPoints
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.points.batch_points import BatchPoints
+from lidarsim.simulator.points.device import DevicePoints
 from lidarsim.simulator.rig import Rig
 from poolpart import own_device, own_device_share
 from raybeam.registry import choose

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.simulator.scene_caster import AUTO_TAKES
+from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 
 from ...base.field_words import differences
 from ...base.fingerprint import fingerprint

@@ -1,0 +1,1 @@
+"""Casting: rays of a survey against a scene whose actors move, and the surfaces that they hit."""

@@ -1,0 +1,110 @@
+"""Triangles cut to a box around sensors.
+
+Ray casters compute in single precision by the size of the scene: planes of ± 200 km would make a
+cast 140 times slower. Within the box, the cut triangles cover the same points; new corners are off
+by about 1e-16 of the size of the triangle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Bools, Floats, Indices, Integers, Ints
+
+_Corner = tuple[float, float, float]  # of a triangle that is cut: x, y, z
+
+
+class CutMesh(NamedTuple):
+    """The parts of triangles within a box."""
+
+    vertices: Floats  # (v, 3)
+    faces: Ints  # (f, 3)
+    origin: Indices  # (f,): ascending, the triangle of the mesh of which each is a part
+
+
+def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
+    """Return the planes (6, 4) of a box (2, 3): a point p is inside if all normals @ p <= offset.
+
+    A row is a normal and an offset. With a transform (3, 4) from the frame of a mesh to the frame
+    of the box, the planes are in the frame of the mesh.
+    """
+    matrix = np.eye(3, 4) if transform is None else transform
+    lower, upper = region
+    above = np.column_stack([matrix[:, :3], upper - matrix[:, 3]])
+    below = np.column_stack([-matrix[:, :3], matrix[:, 3] - lower])
+    return np.concatenate([above, below])
+
+
+def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
+    """Return the parts of triangles (f, 3) that are within all planes; None if all are within."""
+    is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
+    crossing = is_outside.any(axis=(1, 2))
+    if not crossing.any():
+        return None
+    absent = np.any(np.all(is_outside, axis=1), axis=1)
+    parts = [
+        part
+        for face in np.flatnonzero(crossing & ~absent).tolist()
+        for part in _parts_of(face, [*map(tuple, vertices[faces[face]].tolist())], planes)
+    ]
+    rows = np.flatnonzero(~crossing)
+    new_vertices = np.array([part.corners for part in parts], np.float64).reshape(-1, 3)
+    new_faces = len(vertices) + np.arange(3 * len(parts)).reshape(-1, 3)
+    origin = np.append(rows, np.array([part.face for part in parts], np.intp))
+    order = np.argsort(origin, kind="stable")
+    return CutMesh(
+        np.concatenate([vertices, new_vertices]),
+        np.concatenate([faces[rows], new_faces])[order].astype(np.int64),
+        origin[order],
+    )
+
+
+class _Part(NamedTuple):
+    """A triangle of the parts of a face."""
+
+    face: int
+    corners: tuple[_Corner, _Corner, _Corner]
+
+
+def _outside(vertices: Floats, planes: Floats) -> Bools:
+    """Return whether vertices (v, 3) are outside of planes (6, 4): (v, 6)."""
+    x, y, z = vertices.T[:, :, None]
+    a, b, c, offset = planes.T
+    return np.asarray(a * x + b * y + c * z > offset)
+
+
+def _parts_of(face: int, polygon: Sequence[_Corner], planes: Floats) -> list[_Part]:
+    """Return the triangles of a polygon within planes (Sutherland and Hodgman, 1974)."""
+    for plane in planes.tolist():
+        polygon = _cut_polygon(polygon, plane)
+    return [_Part(face, (polygon[0], second, third)) for second, third in pairwise(polygon[1:])]
+
+
+def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner]:
+    """Return the part of a polygon within a plane."""
+    a, b, c, offset = plane
+    heights = [a * x + b * y + c * z - offset for x, y, z in polygon]
+    corners: list[_Corner] = []
+    for index, corner in enumerate(polygon):
+        height = heights[index]
+        if height <= 0:
+            corners.append(corner)
+        next_index = (index + 1) % len(polygon)
+        if (height <= 0) != (heights[next_index] <= 0):
+            corners.append(_crossing((corner, height), (polygon[next_index], heights[next_index])))
+    return corners
+
+
+def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
+    """Return the point of an edge on a plane; `first` and `second` are corners and their heights.
+
+    Neighbouring triangles get the same point of their common edge: its corners are sorted.
+    """
+    (start, start_height), (stop, stop_height) = sorted((first, second))
+    share = start_height / (start_height - stop_height)
+    x, y, z = (p + share * (q - p) for p, q in zip(start, stop, strict=True))
+    return x, y, z

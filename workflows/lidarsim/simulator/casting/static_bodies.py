@@ -1,0 +1,340 @@
+"""The ray caster of the static bodies of a scene: of its faces and instances.
+
+Bodies that a sensor does not see are left out. Bodies far beyond the range of all sensors are left
+out as well, and triangles that reach there are cut: see `clipping`. Triangles keep their numbers.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
+from raybeam.registry import choose
+
+from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
+from ...scene.scene import Scene
+from ...scene.scene_instances import Instances, MeshPart
+from ...sensor import Survey
+from .clipping import CutMesh, box_planes, cut
+
+_log = logging.getLogger(__name__)
+
+# Half of the longest side of a scene above which bodies beyond the range are cut, metres: up to
+# here the size of a scene costs no time.
+MAX_REACH_M = 50_000.0
+# Distance, beyond twice the range of the sensors, at which triangles are cut, metres: sensors may
+# move that far before trees are built again.
+MARGIN_M = 10_000.0
+_NO_ROWS = np.zeros(0, np.int64)
+_SLACK_M = 200.0  # of the margin, for sensors beside their carrier
+
+
+def largest_range_m(survey: Survey) -> float:
+    """Return the largest range of the sensors of a survey, metres."""
+    return max(carried.sensor.max_range_m for carried in survey.carried)
+
+
+def warn_of_reach(scene: Scene, survey: Survey) -> None:
+    """Warn that a part of a scene is left out, since no sensor can reach it."""
+    range_m = largest_range_m(survey)
+    reach_m = _half_side(scene.bounds)
+    if reach_m > MAX_REACH_M and _is_short(range_m):
+        _log.warning(
+            "the scene is %s km wide, and the sensor measures up to %.6g m: what is more than %s "
+            "km from the sensor is left out, so that casting stays fast; no point is lost",
+            f"{2 * reach_m / 1e3:,.0f}",
+            range_m,
+            f"{(2 * range_m + MARGIN_M) / 1e3:.3g}",
+        )
+
+
+def _half_side(bounds: Floats) -> float:
+    """Return half of the longest side of a box (2, 3)."""
+    return float(np.ptp(bounds, axis=0).max(initial=0.0)) / 2
+
+
+def _is_short(range_m: float) -> bool:
+    """Return whether bodies beyond a range may be left out: whether a region around it is small."""
+    return 2 * (2 * range_m + MARGIN_M) <= MAX_REACH_M
+
+
+class _Trees(NamedTuple):
+    """A caster of the static bodies, or of those within a region, with numbers of the scene."""
+
+    caster: RayCaster
+    region: Floats | None  # (2, 3), metres; None for the whole scene
+    # (b,): first triangle of each instance of the caster; None for a caster of faces alone
+    first_triangles: Ints32 | None
+    # (r,): rows in the scene's instances of the last r instances of the caster, ascending
+    rows: Ints
+    # {instance of the caster: the triangle of its mesh of which each triangle is a part}
+    origins: dict[int, Indices]
+
+    @property
+    def face_bodies(self) -> int:
+        """Number of instances of the caster that are the scene's faces: 0 or 1."""
+        return self.caster.instance_count - len(self.rows)
+
+    def numbered(self, hits: ScanReturns) -> Ints32:
+        """Return the triangles of hits (k,), by the numbers of the scene."""
+        triangle = hits.triangle
+        if self.origins:
+            triangle = triangle.copy()
+            for instance, origin in self.origins.items():
+                on_instance = (
+                    slice(None) if self.first_triangles is None else hits.instance == instance
+                )
+                triangle[on_instance] = origin[triangle[on_instance]]
+        if self.first_triangles is not None:
+            triangle = triangle + self.first_triangles[hits.instance]
+        return triangle
+
+
+class StaticBodies:
+    """Ray caster of the faces and instances of a scene.
+
+    Parameters
+    ----------
+    scene
+        Faces and instances.
+    vertices
+        (v, 3): vertices of the scene's faces, metres.
+    range_m
+        Largest range of the sensors, metres; inf leaves out no body for its distance.
+    options
+        Arguments of `RayCaster`.
+    unseen
+        (objects,): True for the static objects that are left out; None for no object.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        vertices: Floats,
+        range_m: float,
+        options: dict[str, Any],
+        unseen: Bools | None = None,
+    ) -> None:
+        self._faces: Integers = scene.faces
+        self._vertices = vertices
+        self._instances = scene.instances
+        self._has_faces = len(scene.faces) > 0
+        self._sees_all_faces = unseen is None
+        # (n,): whether the instances are seen; None if all are.
+        self._instance_is_seen: Bools | None = None
+        if unseen is not None:
+            # A triangle without an area is never hit, and the other triangles keep their numbers.
+            self._faces = np.where(unseen[scene.face_object, None], 0, scene.faces)
+            self._has_faces = _have_area(vertices, self._faces)
+            if scene.instances is not None:
+                self._instance_is_seen = ~unseen[scene.instances.owner]
+        self._options = options
+        self._lock = threading.Lock()
+        self._centre = scene.bounds.mean(axis=0)
+        on_device = choose(options.get("backend", "auto")).on_device
+        # Whether bodies may be left out once some are remote, and whether some are.
+        self._can_cut = _is_short(range_m) and not on_device
+        self._may_cut = self._can_cut and _half_side(scene.bounds) > MAX_REACH_M
+        self._trees: _Trees | None = None
+        if not self._may_cut:
+            self._trees = self._build(None)
+
+    @property
+    def trees(self) -> _Trees:
+        """The trees: of the whole scene, or of the region that was covered last."""
+        if self._trees is None:
+            with self._lock:
+                self._trees = self._trees or self._build(None)
+        return self._trees
+
+    @property
+    def backend(self) -> str:
+        """Name of the backend in use."""
+        if self._trees is None:
+            return choose(self._options.get("backend", "auto")).name
+        return self._trees.caster.backend
+
+    @property
+    def on_device(self) -> bool:
+        """Whether hits can stay on a CUDA device."""
+        return not self._may_cut and self.trees.caster.on_device
+
+    def cover(self, positions: Floats, range_m: float) -> None:
+        """Build trees of all bodies that sensors at positions (p, 3) reach, unless there are.
+
+        Trees of a smaller region stay valid for casts under way.
+        """
+        if not self._may_cut:
+            return
+        points = positions.reshape(-1, 3)
+        sensors = np.stack([points.min(axis=0), points.max(axis=0)])
+        outwards = np.array([[-1.0], [1.0]])
+        with self._lock:
+            trees = self._trees
+            if trees is not None:
+                needed = sensors + outwards * (2 * range_m + _SLACK_M)
+                region = trees.region
+                if region is None or ((region[0] <= needed[0]) & (needed[1] <= region[1])).all():
+                    return
+            region = sensors + outwards * (2 * range_m + MARGIN_M)
+            if trees is not None and trees.region is not None:
+                lower = np.minimum(region[0], trees.region[0])
+                region = np.stack([lower, np.maximum(region[1], trees.region[1])])
+            self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
+
+    def move(self, instances: Instances, rows: Indices) -> None:
+        """Move instances `rows` (m,) to their transforms in `instances`; no cast may be under way.
+
+        Trees are built again if an instance leaves for where no sensor reaches, such as a body that
+        falls for ever, if it comes from there, or if it was cut.
+        """
+        self._instances = instances
+        if self._instance_is_seen is not None:
+            rows = rows[self._instance_is_seen[rows]]
+        trees = self._trees
+        if trees is None or not len(rows):
+            return
+        offsets = instances.transforms[rows, :, 3] - self._centre
+        is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
+        if trees.region is None and is_remote.any() and self._can_cut:
+            self._may_cut = True
+            self._trees = None  # `cover` builds them
+            return
+        first = trees.face_bodies
+        if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
+            trees.caster.move(first + rows, instances.transforms[rows])
+            return
+        numbers = first + np.searchsorted(trees.rows, rows)
+        if trees.region is None:
+            trees.caster.move(numbers, instances.transforms[rows])
+            return
+        has_tree = np.isin(rows, trees.rows)
+        is_cut = has_tree & np.isin(numbers, list(trees.origins))
+        comes = ~has_tree & _is_near(instances, trees.region)[rows]
+        if (is_cut | comes | (has_tree & is_remote)).any():
+            self._trees = self._build(trees.region)
+            return
+        trees.caster.move(numbers[has_tree], instances.transforms[rows[has_tree]])
+
+    def _build(self, region: Floats | None) -> _Trees:
+        """Build the trees of the bodies within a region (2, 3), or of all bodies.
+
+        If there is no body within the region, the trees are those of all bodies.
+        """
+        faces = None if region is None else self._cut_faces(region)
+        if self._instances is not None:
+            return self._build_nested(self._instances, region, faces)
+        if not self._has_faces:
+            return self._build_transparent()
+        if faces is None:
+            caster = RayCaster(self._vertices, self._faces, **self._options)
+            return _Trees(caster, region, None, _NO_ROWS, {})
+        if not len(faces.faces):
+            return self._build(None)
+        caster = RayCaster(faces.vertices, faces.faces, **self._options)
+        return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
+
+    def _cut_faces(self, region: Floats) -> CutMesh | None:
+        """Return the parts of the seen faces within a region (2, 3); None if all are within."""
+        parts = cut(self._vertices, self._faces, box_planes(region))
+        if parts is None or self._sees_all_faces:
+            return parts
+        seen = np.flatnonzero((parts.faces != parts.faces[:, :1]).any(axis=1))
+        return parts._replace(faces=parts.faces[seen], origin=parts.origin[seen])
+
+    def _build_transparent(self) -> _Trees:
+        """Build the tree of a single triangle through which all rays pass: nothing is seen.
+
+        A caster needs a triangle with an area. The triangles are as many as the scene's faces.
+        """
+        count = max(1, len(self._faces))
+        faces = np.zeros((count, 3), np.int64)
+        faces[0] = 0, 1, 2
+        opacity = Opacity(np.zeros((1, 1), np.bool_), np.zeros((count, 3, 2), np.float32))
+        mesh = Mesh(np.eye(3), faces, opacity)
+        caster = RayCaster.from_instances([Instance(mesh)], **self._options)
+        return _Trees(caster, None, None, _NO_ROWS, {})
+
+    def _build_nested(
+        self, instances: Instances, region: Floats | None, faces: CutMesh | None
+    ) -> _Trees:
+        """Build the trees of faces, cut or not, and of instances."""
+        bodies: list[Instance] = []
+        origins: dict[int, Indices] = {}
+        if faces is None and self._has_faces:
+            bodies.append(Instance(Mesh(self._vertices, self._faces)))
+        elif faces is not None and len(faces.faces):
+            origins[0] = faces.origin
+            bodies.append(Instance(Mesh(faces.vertices, faces.faces)))
+        face_bodies = len(bodies)
+        meshes: dict[int, Mesh] = {}  # {index of the part: mesh}
+        rows = []
+        for row, cut_part in _parts_in(instances, region, self._instance_is_seen):
+            index = int(instances.part[row])
+            if cut_part is None:
+                if index not in meshes:
+                    meshes[index] = mesh_of(instances.parts[index])
+                mesh = meshes[index]
+            else:
+                origins[len(bodies)] = cut_part.origin
+                mesh = Mesh(cut_part.vertices, cut_part.faces)
+            bodies.append(Instance(mesh, instances.transforms[row]))
+            rows.append(row)
+        if not bodies:
+            return self._build_transparent() if region is None else self._build(None)
+        caster = RayCaster.from_instances(bodies, **self._options)
+        starts = len(self._faces) + np.cumsum(instances.sizes) - instances.sizes
+        first_triangles = np.append(np.zeros(face_bodies, np.int64), starts[rows])
+        return _Trees(
+            caster, region, first_triangles.astype(np.int32), np.array(rows, np.int64), origins
+        )
+
+
+def _parts_in(
+    instances: Instances, region: Floats | None, is_seen: Bools | None
+) -> Iterator[tuple[int, CutMesh | None]]:
+    """Yield the rows of the seen instances within a region (2, 3), and the parts of cut instances.
+
+    `is_seen` (n,) tells which instances are seen; None if all are. Parts with a mask are not cut:
+    single precision of the corners' coordinates in the texture would move the mask.
+    """
+    if region is None:
+        rows = range(len(instances)) if is_seen is None else np.flatnonzero(is_seen).tolist()
+        yield from ((row, None) for row in rows)
+        return
+    lower, upper = instances.bounds.transpose(1, 0, 2)
+    is_whole = ((region[0] <= lower) & (upper <= region[1])).all(axis=1)
+    is_near = _is_near(instances, region)
+    if is_seen is not None:
+        is_near &= is_seen
+    for row in np.flatnonzero(is_near).tolist():
+        cut_part = None
+        part = instances.parts[instances.part[row]]
+        if not is_whole[row] and part.mask is None:
+            planes = box_planes(region, instances.transforms[row])
+            cut_part = cut(part.vertices, part.faces, planes)
+        if cut_part is None or len(cut_part.faces):
+            yield row, cut_part
+
+
+def _have_area(vertices: Floats, faces: Integers) -> bool:
+    """Return True if a triangle (f, 3) has an area."""
+    a, b, c = vertices[faces[(faces != faces[:, :1]).any(axis=1)]].transpose(1, 0, 2)
+    return bool(np.cross(b - a, c - a).any())
+
+
+def _is_near(instances: Instances, region: Floats) -> Bools:
+    """Return whether the box of each instance meets a region (2, 3): (n,)."""
+    lower, upper = instances.bounds.transpose(1, 0, 2)
+    return np.asarray(((lower <= region[1]) & (region[0] <= upper)).all(axis=1))
+
+
+def mesh_of(part: MeshPart) -> Mesh:
+    """Return the mesh of a part, with the mask of its texture, if any."""
+    opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
+    return Mesh(part.vertices, part.faces, opacity)

@@ -1,0 +1,483 @@
+"""Loops over hits: surfaces of hits, their normals, and the light that surfaces send back or on."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined
+from raybeam.rays import UNIT_SLACK
+
+from ...base.arrays import Bools, Floats, Floats32, Ints, Ints32
+from ...base.elementary_loops import exp, sin_cos
+from ...sensor.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
+from ...sensor.materials import fresnel as fresnel_of_arrays
+from ...sensor.materials import within_water as within_water_of_arrays
+
+fresnel = inlined(fresnel_of_arrays)
+within_water = inlined(within_water_of_arrays)
+
+
+class TriangleNumbers(NamedTuple):
+    """Numbers of triangles: faces of the scene, then of instances, then of actors."""
+
+    instance_starts: Ints  # (i + 1,): first triangle of each instance, and of actors
+    owners: (
+        Ints32  # (f + a + 1,): objects of the triangles of faces and actors; -1 for no triangle, -1
+    )
+    instance_objects: Ints32  # (i,)
+    instance_rows: Ints  # (i,): stored row of the first triangle of each instance
+    actor_shifts: Ints  # (actors,): from numbers of an actor's triangles to stored rows
+    static_objects: int  # number of objects that are no actors
+
+
+class TriangleOwners(NamedTuple):
+    """Owners of triangles: (n,) each."""
+
+    row: Ints  # among the stored triangles, which actors and instances share
+    object: Ints32
+    instance: Ints  # or -1
+
+
+class HitSurfaces(NamedTuple):
+    """Surfaces of hits: (n,) each."""
+
+    row: Ints  # of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
+    kind: Ints32  # number of a material of an object, see `Scene.surface_kinds`
+    instance: Ints  # or -1
+    run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
+
+
+class NormalTables(NamedTuple):
+    """Normals of triangles, and the rotations of instances and actors."""
+
+    stored: Floats32  # (f, 3): unit normals of stored triangles
+    deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
+    # (i, 3, 3): from normals of an instance's mesh to normals in the scene, of any length.
+    instances: Floats
+    # (12, m): poses of actors, position and rotation by rows; a column for each run of hits that
+    # have equal actors and times.
+    poses: Floats
+
+
+class Incidence(NamedTuple):
+    """Incidence of rays on surfaces."""
+
+    normals: Floats  # (3, n): unit normals, scene frame
+    cosines: Floats  # (n,): products of normals and directions, of either sign
+    back: Floats  # (n,): energy that is received from the surface at a distance of 10 m
+
+
+class WaterFilm(NamedTuple):
+    """Water on surfaces."""
+
+    level: float  # smallest z of the normal, on the visible side, of surfaces that hold water
+    wet: float  # share of these surfaces that is below water
+    dry: Bools  # (kinds,): whether a kind of surface stays dry
+
+
+class OnwardOptics(NamedTuple):
+    """Optics of kinds of surfaces: (kinds,) each."""
+
+    specular: Floats  # share of light that is mirrored at normal incidence
+    passes: Bools  # whether light passes as through glass
+    straight: Bools  # whether the surface bounds no refracting medium, so that light is not bent
+    leafy: Bools  # whether the surface bounds leaves, and sends nothing back
+
+
+class OnwardHits(NamedTuple):
+    """Hits from which light goes on: (n,) each."""
+
+    kind: Ints32
+    cosines: Floats  # of either sign
+    film: Bools  # whether there may be water; empty without water
+    share: Floats  # of the energy, after the earlier surfaces: light passes each out and back
+    distance: Floats  # optical path from the sensor, metres
+
+
+class OnwardLimits(NamedTuple):
+    """Water and detection of light that goes on."""
+
+    wet: float  # share of surfaces with a film that is below water
+    brightest: float  # largest energy that any surface returns at a distance of 10 m
+    extinction: float  # 1/m
+    faintest: float  # light that can return no more energy is dropped
+
+
+class ActorTriangles(NamedTuple):
+    """Numbers of the triangles of actors.
+
+    A shape is a distinct mesh, which actors may share; its parts are cast separately.
+    """
+
+    parts: Ints32  # (shapes, parts): first triangle of each part, numbered within the shape
+    shape: Ints  # (actors,): row of `parts`
+    firsts: Ints32  # (actors,): first triangle of each actor
+
+
+class JoinedHits(NamedTuple):
+    """Arrays to which the nearest hits are written: (n,) each."""
+
+    ray: Ints
+    distance: Floats  # metres
+    triangle: Ints32
+
+
+class TrackTable(NamedTuple):
+    """Straight tracks among trajectories, with their segments in the order of tracks."""
+
+    member: Ints  # (w,): for each trajectory its track, 0 to t - 1; -1 for curved trajectories
+    first: Ints  # (t,): first segment of each track
+    segments: Ints  # (t,): number of segments of each track
+    # (4, t): seconds: start by the track's clock, first and last time of its poses, and how far
+    # outside these a time may be; inf for any time.
+    limits: Floats
+    times: Floats  # (s,): start of each segment, seconds
+    start: Floats  # (3, s): position at the start of each segment, metres
+    speed: Floats  # (3, s): velocity, m/s
+    # (3, 9, s): a rotation, by rows, is term 0 + sin(a) term 1 + cos(a) term 2, where a is the
+    # angle since the start of the segment: see `Segments`.
+    rotation: Floats
+    rates: Floats  # (s,): growth of the angle a, rad/s
+
+
+@inlined
+def _product(x, y, z, a, b, c):
+    """Return a scalar product, in the order of `vectors.products`."""
+    return (x * a + y * b) + z * c
+
+
+@inlined
+def _instance_of(t, instance_starts):
+    """Return the instance that contains a triangle, by binary search."""
+    lower = 0
+    upper = len(instance_starts) - 1
+    while upper - lower > 1:
+        middle = (lower + upper) // 2
+        if instance_starts[middle] <= t:
+            lower = middle
+        else:
+            upper = middle
+    return lower
+
+
+@compiled()
+def find_owners(triangle, numbers, output):
+    """Write the stored rows, objects and instances of triangles (n,) to `output`, `TriangleOwners`.
+
+    `numbers` are `TriangleNumbers`.
+    """
+    starts = numbers.instance_starts
+    owners = numbers.owners
+    rows = output.row
+    objects = output.object
+    instances = output.instance
+    face_count = starts[0]
+    actors_start = starts[-1]
+    for k in range(len(triangle)):
+        t = np.int64(triangle[k])
+        instances[k] = -1
+        if t < face_count:
+            rows[k] = t
+            objects[k] = owners[t]
+        elif t >= actors_start:
+            owner = owners[t - (actors_start - face_count)]
+            rows[k] = t + numbers.actor_shifts[owner - numbers.static_objects]
+            objects[k] = owner
+        else:
+            i = _instance_of(t, starts)
+            rows[k] = numbers.instance_rows[i] + t - starts[i]
+            objects[k] = numbers.instance_objects[i]
+            instances[k] = i
+
+
+@inlined
+def _instance_normal(matrices, i, x, y, z):
+    """Return the unit normal of an instance, rounded in the order of columns.cu."""
+    a = _product(matrices[i, 0, 0], matrices[i, 0, 1], matrices[i, 0, 2], x, y, z)
+    b = _product(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2], x, y, z)
+    c = _product(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2], x, y, z)
+    length = np.sqrt((a * a + b * b) + c * c)
+    return a / length, b / length, c / length
+
+
+@inlined
+def _actor_normal(poses, run, x, y, z):
+    """Return a normal rotated by the pose (12, m) of a run."""
+    a = _product(poses[3, run], poses[4, run], poses[5, run], x, y, z)
+    b = _product(poses[6, run], poses[7, run], poses[8, run], x, y, z)
+    c = _product(poses[9, run], poses[10, run], poses[11, run], x, y, z)
+    return a, b, c
+
+
+@compiled()
+def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
+    """Write how rays with directions (3, n) meet surfaces to `output`, `Incidence`.
+
+    `hits` are `HitSurfaces`, `tables` `NormalTables`; `reflectance` and `retro` are by kinds of
+    surfaces. The light that is sent back is that of surfaces that are neither textured nor rough.
+    No view of an array is made: a view would be counted, which takes five times as long as the
+    rest of the loop.
+    """
+    rows = hits.row
+    kinds = hits.kind
+    instances = hits.instance
+    run = hits.run
+    stored = tables.stored
+    deformed = tables.deformed
+    matrices = tables.instances
+    poses = tables.poses
+    normals = output.normals
+    cosines = output.cosines
+    back = output.back
+    for k in range(len(rows)):
+        row = rows[k]
+        i = instances[k]
+        kind = kinds[k]
+        if row >= 0:
+            x = stored[row, 0]
+            y = stored[row, 1]
+            z = stored[row, 2]
+        else:
+            x = deformed[~row, 0]
+            y = deformed[~row, 1]
+            z = deformed[~row, 2]
+        x = np.float64(x)
+        y = np.float64(y)
+        z = np.float64(z)
+        if i >= 0:
+            x, y, z = _instance_normal(matrices, i, x, y, z)
+        if len(run) and run[k] >= 0:
+            x, y, z = _actor_normal(poses, run[k], x, y, z)
+        cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
+        normals[0, k] = x
+        normals[1, k] = y
+        normals[2, k] = z
+        cosines[k] = cosine
+        back[k] = reflectance[kind] * (RETRO_GAIN if retro[kind] else abs(cosine))
+
+
+@inlined
+def at_right_angles(distance, extinction):
+    """Return the energy of white surfaces at normal incidence, as `materials.at_right_angles`."""
+    range_m = max(distance, NEAREST_M)
+    nearer = REFERENCE_M / range_m
+    nearer = nearer * nearer
+    return nearer * exp(-2 * extinction * range_m) if extinction else nearer
+
+
+@compiled()
+def fade(distance, extinction, energy):
+    """Multiply energies (n,) by `at_right_angles` of their distances (n,)."""
+    for k in range(len(energy)):
+        energy[k] *= at_right_angles(distance[k], extinction)
+
+
+@compiled()
+def soak(normals_z, cosines, kinds, shares, water, film, back):
+    """Mark hits where there may be water in `film`, and reduce their energies `back` by the water.
+
+    `normals_z` are z of the normals, `shares` the shares of light that surfaces scatter, and `back`
+    the received energies: (n,) each. `water` is a `WaterFilm`. The share `WaterFilm.wet` of marked
+    surfaces scatters as below water, which mirrors a part of the light on the way in and out.
+    """
+    level = water.level
+    wet = water.wet
+    dry = water.dry
+    for k in range(len(normals_z)):
+        visible_z = normals_z[k] if cosines[k] < 0 else -normals_z[k]
+        film[k] = visible_z >= level and not dry[kinds[k]]
+        if film[k]:
+            mirrored = fresnel(abs(cosines[k]), WATER_INDEX)
+            back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
+
+
+@compiled()
+def divide_light(rows, reflected, hits, shares, optics, limits, onward_share):
+    """Write the share of light that goes on from `rows` of hits, through surfaces or reflected.
+
+    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`. For each of the
+    `rows` (k,), `reflected` (k,) is True for light that the surface mirrors, False for light that
+    passes the surface, and `shares` (k,) is the share of light that the surface scatters. At
+    surfaces of refracting media, light is not divided here into mirrored and transmitted light:
+    `LightInMedia.cross` divides it. Light that is too faint is dropped: overwrites `rows` and
+    `reflected` by the remaining light, and writes its `onward_share`: of the energy, since light
+    passes the surface out and back. Returns the number of remaining rows.
+    """
+    count = 0
+    for j in range(len(rows)):
+        k = rows[j]
+        kind = hits.kind[k]
+        cosine = abs(hits.cosines[k])
+        specular = optics.specular[kind]
+        grazing = 1 - min(cosine, 1.0)
+        square = grazing * grazing
+        mirrored = (
+            specular + (1 - specular) * (grazing * (square * square)) if specular > 0 else 0.0
+        )
+        if optics.passes[kind]:
+            mirrored = fresnel(cosine, GLASS_INDEX)
+        onward = mirrored if reflected[j] else 1 - mirrored if optics.passes[kind] else 1.0
+        onward = onward if optics.straight[kind] else 1.0
+        onward *= 1.0 if optics.leafy[kind] else 1 - shares[j]
+        if len(hits.film) and hits.film[k]:
+            onward = (1 - limits.wet) * onward + limits.wet * fresnel(cosine, WATER_INDEX)
+        onward = hits.share[k] * (onward * onward)
+        brightest = limits.brightest * at_right_angles(hits.distance[k], limits.extinction)
+        if onward * brightest > limits.faintest:
+            rows[count] = k
+            reflected[count] = reflected[j]
+            onward_share[count] = onward
+            count += 1
+    return count
+
+
+@compiled()
+def start_behind(origins, directions, step_m, clear_m, starts, onward):
+    """Write where light starts `clear_m` (n,) behind its ends, and normalise its directions.
+
+    The light ends `step_m` (n,) from `origins` along `directions`, and goes on along `onward`,
+    which becomes unit vectors; `starts` is written. Vectors are (3, n).
+    """
+    for k in range(len(step_m)):
+        for axis in range(3):
+            end = origins[axis, k] + step_m[k] * directions[axis, k]
+            starts[axis, k] = end + clear_m[k] * onward[axis, k]
+        x = onward[0, k]
+        y = onward[1, k]
+        z = onward[2, k]
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does for all rays
+            largest = max(max(abs(x), abs(y)), abs(z))
+            x = x / largest
+            y = y / largest
+            z = z / largest
+            length = np.sqrt((x * x + y * y) + z * z)
+            onward[0, k] = x / length
+            onward[1, k] = y / length
+            onward[2, k] = z / length
+
+
+@compiled()
+def firing_times(ray, start, subrays, firing_starts, delays, times):
+    """Write the firing times of sub-rays `ray` (n,) to `times`; all times are nanoseconds.
+
+    Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
+    times of firings, and `delays` the times of the beams of a firing after its start.
+    """
+    first_beam = 0
+    firing = -1
+    channels = len(delays)
+    for k in range(len(ray)):  # mostly, rays are consecutive
+        beam = start + ray[k] // subrays
+        if firing < 0 or not first_beam <= beam < first_beam + channels:
+            firing = int(beam // channels)
+            first_beam = firing * channels
+        times[k] = firing_starts[firing] + delays[beam - first_beam]
+
+
+@compiled()
+def merge(ray, triangle, nearest, actors, output):
+    """Write the nearest hits of rays, on static bodies and actors, to `output`, `JoinedHits`.
+
+    `ray` and `triangle` (k,) are hits on static bodies, in the order of rays. `nearest` are the
+    nearest hits of all rays on actors, `raybeam.crossing.Nearest`: the body is the actor, or below
+    0 for rays that miss all actors, whose distance is then the distance to static bodies. `actors`
+    are `ActorTriangles`. Returns the number of hits.
+    """
+    hit_actors = nearest.body
+    i = 0
+    count = 0
+    for k in range(len(hit_actors)):
+        actor = hit_actors[k]
+        hit = i < len(ray) and ray[i] == k
+        if actor >= 0:
+            part_triangle = actors.parts[actors.shape[actor], nearest.instance[k]]
+            output.triangle[count] = nearest.triangle[k] + part_triangle + actors.firsts[actor]
+        elif hit:
+            output.triangle[count] = triangle[i]
+        i += int(hit)
+        if hit or actor >= 0:
+            output.ray[count] = k
+            output.distance[count] = nearest.distance[k]
+            count += 1
+    return count
+
+
+@compiled()
+def find_runs(trajectory, times, first_rows, run_numbers):
+    """Write the number of each row's run, and the first row of each run; return the number of runs.
+
+    In a run, trajectories and times are equal. `trajectory` (n,) are numbers of trajectories; rows
+    with numbers below 0 have the run -1, and do not end a run.
+    """
+    count = 0
+    last = -1
+    for k in range(len(trajectory)):
+        run_numbers[k] = -1
+        if trajectory[k] < 0:
+            continue
+        if last < 0 or trajectory[k] != trajectory[last] or times[k] != times[last]:
+            first_rows[count] = k
+            count += 1
+        run_numbers[k] = count - 1
+        last = k
+    return count
+
+
+@inlined
+def _segment_at(tracks, track, time_s):
+    """Return the last segment of a track that has started at a time, by binary search."""
+    segment = tracks.first[track]
+    later_segments = tracks.segments[track] - 1
+    while later_segments:
+        half = (later_segments + 1) // 2
+        if tracks.times[segment + half] <= time_s:
+            segment = segment + half
+            later_segments = later_segments - half
+        else:
+            later_segments = half - 1
+    return segment
+
+
+@inlined
+def _write_pose(tracks, segment, elapsed_s, poses, k):
+    """Write the pose `elapsed_s` after the start of a segment to column `k` of `poses`."""
+    for axis in range(3):
+        poses[axis, k] = tracks.speed[axis, segment] * elapsed_s + tracks.start[axis, segment]
+    sine, cosine = sin_cos(elapsed_s * tracks.rates[segment])
+    for part in range(9):
+        poses[3 + part, k] = (
+            tracks.rotation[0, part, segment] + sine * tracks.rotation[1, part, segment]
+        ) + cosine * tracks.rotation[2, part, segment]
+
+
+@compiled()
+def poses_on_tracks(trajectory, times_ns, tracks, poses):
+    """Write poses (12, n) of trajectories on straight tracks, with the operations of `Track.poses`.
+
+    `trajectory` (n,) are numbers of trajectories, and `tracks` is a `TrackTable`; columns of curved
+    trajectories are not written. Returns the first row whose time is outside of its track, or -1.
+    """
+    limits = tracks.limits
+    for k in range(len(trajectory)):
+        track = tracks.member[trajectory[k]]
+        if track < 0:
+            continue
+        if k and trajectory[k] == trajectory[k - 1] and times_ns[k] == times_ns[k - 1]:
+            for part in range(12):
+                poses[part, k] = poses[part, k - 1]
+            continue
+        time_s = times_ns[k] / 1e9 + limits[0, track]
+        first_s = limits[1, track]
+        last_s = limits[2, track]
+        slack_s = limits[3, track]
+        if max(first_s - time_s, time_s - last_s) > slack_s:
+            return k
+        if slack_s == np.inf:
+            time_s = min(max(time_s, first_s), last_s)
+        segment = _segment_at(tracks, track, time_s)
+        _write_pose(tracks, segment, time_s - tracks.times[segment], poses, k)
+    return -1

@@ -1,0 +1,79 @@
+"""Visibility: the objects that each sensor of a survey does not see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...base.arrays import Bools
+from ...scene.scene import Scene
+from ...sensor import Survey
+from ...sensor.materials import matching_rows
+
+
+def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
+    """Return the objects that the sensors of a survey do not see, by the sensors' patterns.
+
+    Returns
+    -------
+    For each sensor a mask (objects,), in the order of `Scene.all_names`; None if the sensor sees
+    all objects.
+
+    Raises
+    ------
+    LidarError
+        If a pattern of a sensor fits no object.
+    """
+    if not any(carried.unseen for carried in survey.carried):
+        return (None,) * len(survey.carried)
+    names = scene.all_names
+    object_rows = {name: row for row, name in enumerate(names)}
+    masks: list[Bools | None] = []
+    for carried in survey.carried:
+        mask = np.zeros(len(names), np.bool_)
+        subject = f"unseen of sensor {carried.name!r}" if carried.name else "unseen"
+        for pattern in carried.unseen:
+            mask[matching_rows(pattern, names, object_rows, subject)] = True
+        masks.append(mask if mask.any() else None)
+    return tuple(masks)
+
+
+def static_key(scene: Scene, unseen: Bools | None) -> bytes:
+    """Return bytes that are equal for masks (objects,) of the same unseen static objects.
+
+    Empty if all static objects are seen: of the mask None, or of unseen actors alone.
+    """
+    if unseen is None or not unseen[: len(scene.names)].any():
+        return b""
+    return unseen[: len(scene.names)].tobytes()
+
+
+def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
+    """Return the static objects of a scene that are seen, by a mask (objects,).
+
+    Objects keep their numbers; colours, materials and actors are left out. None if no object is
+    left.
+    """
+    faces = np.flatnonzero(~unseen[scene.face_object])
+    instances = scene.instances
+    if instances is not None:
+        rows = np.flatnonzero(~unseen[instances.owner])
+        instances = replace(
+            instances,
+            part=instances.part[rows],
+            transforms=instances.transforms[rows],
+            owner=instances.owner[rows],
+        )
+        instances = instances if len(rows) else None
+    if not len(faces) and instances is None:
+        return None
+    return Scene(
+        scene.vertices,
+        scene.faces[faces],
+        scene.face_object[faces],
+        scene.names,
+        scene.origin,
+        instances=instances,
+        world_origin=scene.world_origin,
+    )

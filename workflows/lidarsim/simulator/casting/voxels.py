@@ -1,0 +1,243 @@
+"""Passage of light through grids of leaf area density, until the light meets a leaf."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Bools, Floats, Indices
+from ...base.vectors import applied, inverse, matmul
+from ...scene.scene_instances import Instances
+
+BLOCK_RAYS = 1 << 13  # rays that are followed at a time, to fit a cache
+_LEVEL = 1e-30  # voxels a metre: along an axis, slower light stays in its layer of voxels
+
+
+class GridPassage(NamedTuple):
+    """Passage of n rays of light through k grids each."""
+
+    metres: Floats  # (n,): from the start to the leaf that light meets; inf without a leaf
+    # (n,): optical depth that is left until a leaf, at the path's end; -inf if light meets a leaf.
+    remaining_depth: Floats
+    density: Floats  # (n, k): optical depth per metre of each grid at the leaf; 0 without a leaf
+
+
+class _GridRays(NamedTuple):
+    """Rays of light in the voxels of k grids; the last axis of all arrays is the ray.
+
+    Rays leave the table when they meet a leaf or reach their end.
+    """
+
+    row: Indices  # (n,): number of the ray among those that entered
+    uniform_density: Floats  # (n,): optical depth per metre of the media that are not grids
+    length: Floats  # (n,): length of the path, metres
+    depth: Floats  # (n,): remaining optical depth until a leaf
+    metres: Floats  # (n,): distance from the start
+    cell: Floats  # (3, k, n): indices of the voxel of the light; outside of the grid too
+    step: Floats  # (3, k, n): -1, 0 or 1, the sign of the light's direction
+    pace: Floats  # (3, k, n): metres for each voxel; 0 for light that stays in its layer
+    shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` metres
+    size: Floats  # (3, k, n): number of voxels of the grid
+    first: Floats  # (k, n): index of the grid's first voxel among the densities of all grids
+    # (k, n): optical depth per metre for a leaf area density of 1, which is the mean projection of
+    # the leaves; 0 without a grid.
+    projection: Floats
+
+    def take(self, rows: Indices) -> _GridRays:
+        """Return the light of selected rows."""
+        return _GridRays._make(array[..., rows] for array in self)
+
+
+class Grids:
+    """The grids of the instances of a scene, with the densities of each part stored once."""
+
+    def __init__(self, shared: Instances) -> None:
+        voxels = [part.voxels for part in shared.parts]
+        sizes = [(0, 0, 0) if grid is None else grid.density.shape for grid in voxels]
+        self._sizes = np.array(sizes, np.float64)
+        self._starts = np.cumsum([0, *(int(np.prod(size)) for size in sizes[:-1])])
+        densities = [grid.density.reshape(-1) for grid in voxels if grid is not None]
+        self._values = densities[0] if len(densities) == 1 else np.concatenate(densities)
+        self._matrices = np.array(
+            [np.eye(3, 4) if grid is None else grid.matrix for grid in voxels], np.float64
+        )
+        self._place_instances(shared)
+
+    @classmethod
+    def from_instances(cls, shared: Instances | None) -> Grids | None:
+        """Return the grids of instances; None without grids."""
+        if shared is None or all(part.voxels is None for part in shared.parts):
+            return None
+        return cls(shared)
+
+    def moved(self, shared: Instances) -> Grids:
+        """Return the grids with the instances placed anew."""
+        grids = copy(self)
+        grids._place_instances(shared)
+        return grids
+
+    def _place_instances(self, shared: Instances) -> None:
+        """Compute the origin of each instance's grid, scene frame, and matrices to its voxels."""
+        self._part = shared.part
+        to_scene = shared.transforms
+        matrices = self._matrices[self._part]
+        self._origins = applied(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
+        self._to_grid = inverse(matmul(to_scene[:, :, :3], matrices[:, :, :3]))
+
+    def through(
+        self,
+        instances: Indices,
+        starts: Floats,
+        directions: Floats,
+        projection: Floats,
+        uniform_density: Floats,
+        length: Floats,
+        depth: Floats,
+    ) -> GridPassage:
+        """Follow light (n,) through grids, voxel by voxel (Amanatides and Woo 1987).
+
+        Parameters
+        ----------
+        instances
+            (n, k): instances whose grids overlap along the path; -1 for none.
+        starts, directions
+            (n, 3): origins of the light, and directions, in the scene frame.
+        projection
+            (n, k): optical depth per metre for a leaf area density of 1 in each grid.
+        uniform_density
+            (n,): optical depth per metre of the media that are not grids.
+        length
+            (n,): length of the path, metres.
+        depth
+            (n,): optical depth after which the light meets a leaf.
+        """
+        parts = [
+            self._block_through(
+                instances[block],
+                starts[block],
+                directions[block],
+                projection[block],
+                uniform_density[block],
+                length[block],
+                depth[block],
+            )
+            for block in (
+                slice(k, k + BLOCK_RAYS) for k in range(0, max(len(depth), 1), BLOCK_RAYS)
+            )
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return GridPassage(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def _block_through(
+        self,
+        instances: Indices,
+        starts: Floats,
+        directions: Floats,
+        projection: Floats,
+        uniform_density: Floats,
+        length: Floats,
+        depth: Floats,
+    ) -> GridPassage:
+        """Follow a block of light, see `through`."""
+        passage = GridPassage(
+            np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
+        )
+        rays = self._enter(
+            instances, starts, directions, projection, uniform_density, length, depth
+        )
+        while len(rays.row):
+            density, inside = self._density(rays)
+            density *= rays.projection
+            total = rays.uniform_density.copy()
+            for grid_density in density:
+                total += grid_density
+            border = _border(rays, inside)
+            border_m = np.minimum.reduce(border.reshape(-1, len(rays.row)))
+            passed_depth = total * np.maximum(np.minimum(border_m, rays.length) - rays.metres, 0)
+            meets_leaf = passed_depth > rays.depth
+            row = rays.row[meets_leaf]
+            passage.metres[row] = (
+                rays.metres[meets_leaf] + rays.depth[meets_leaf] / total[meets_leaf]
+            )
+            passage.density[row] = density[:, meets_leaf].T
+            remaining = rays.depth - passed_depth
+            at_end = ~meets_leaf & (border_m >= rays.length)
+            passage.remaining_depth[rays.row[at_end]] = remaining[at_end]
+            rays = rays._replace(
+                depth=remaining,
+                # A first border may be before the start, by rounding.
+                metres=np.maximum(border_m, 0),
+                cell=np.where(border <= border_m, rays.cell + rays.step, rays.cell),
+            )
+            followed = ~(meets_leaf | at_end)
+            if not followed.all():
+                rays = rays.take(np.flatnonzero(followed))
+        return passage
+
+    def _enter(
+        self,
+        instances: Indices,
+        starts: Floats,
+        directions: Floats,
+        projection: Floats,
+        uniform_density: Floats,
+        length: Floats,
+        depth: Floats,
+    ) -> _GridRays:
+        """Return the light of a block in the voxels at its start, see `through`."""
+        to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
+        x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
+        u, v, w = directions.T[:, None]
+        # Product by product, for the same bits in every block.
+        position = np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in to_grid])
+        direction = np.stack([(row[0] * u + row[1] * v) + row[2] * w for row in to_grid])
+        level = np.abs(direction) < _LEVEL
+        step = np.where(level, 0, np.sign(direction))
+        pace = 1 / np.where(level, 1, direction)
+        without_borders = level | (instances.T < 0)
+        shift = np.where(without_borders, np.inf, ((step > 0) - position) * pace)
+        pace[level] = 0
+        return _GridRays(
+            row=np.arange(len(depth)),
+            uniform_density=uniform_density,
+            length=length,
+            depth=depth,
+            metres=np.zeros(len(depth)),
+            cell=np.floor(position),
+            step=step,
+            pace=pace,
+            shift=shift,
+            size=np.moveaxis(self._sizes[self._part[instances]], 2, 0).swapaxes(1, 2),
+            first=self._starts[self._part[instances]].T,
+            projection=np.where(instances < 0, 0, projection).T,
+        )
+
+    def _density(self, rays: _GridRays) -> tuple[Floats, Bools]:
+        """Return leaf area densities, m²/m³, at light, and whether its voxels are in a grid.
+
+        Both are (k, n); densities outside of grids are 0.
+        """
+        i, j, k = rays.cell
+        size = rays.size
+        inside = np.asarray(((rays.cell >= 0) & (rays.cell < size)).all(axis=0))
+        index = ((i * size[1] + j) * size[2] + k) + rays.first
+        values = self._values[np.where(inside, index, 0).astype(np.intp)]
+        return np.where(inside, values, 0.0), inside
+
+
+def _border(rays: _GridRays, inside: Bools) -> Floats:
+    """Return the distances from the start to the borders of voxels ahead, (3, k, n), metres.
+
+    Light that leaves a grid for ever, by `inside` (k, n), has no borders ahead: `rays.shift` is
+    set to inf.
+    """
+    beyond = ~inside & np.isfinite(rays.shift).any(axis=0)
+    if beyond.any():
+        in_front = (rays.cell < 0) & (rays.step <= 0)
+        behind = (rays.cell >= rays.size) & (rays.step >= 0)
+        leaves = (in_front | behind).any(axis=0)
+        rays.shift[:, beyond & leaves] = np.inf
+    return np.asarray(rays.cell * rays.pace + rays.shift)

@@ -1,0 +1,1 @@
+"""Points: the columns of returns, made on the host or on the CUDA device."""

@@ -1,0 +1,572 @@
+"""The returns of a batch: the sources of columns."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ...base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ...base.elementary import arccos, arcsin, arctan2
+from ...base.errors import LidarError
+from ...base.vectors import products, turned
+from ...columns.table import Column
+from ...columns.waveforms import column_type
+from ...scene.colours import unpacked
+from ...scene.scene import Scene
+from ...sensor import ScanSpec, Survey
+from ...sensor.materials import at_right_angles
+from ...sensor.optics import LIGHT_M_NS
+from ...sensor.random_numbers import normal
+from ...sensor.reflectivity import COUNTS, SCALES
+from ..casting.motion import CastPoses, Firings
+from ..casting.surfaces import Surfaces, light_of
+from ..pulses import Scanned
+from ..returns import required
+from ..steps.doppler import VELOCITY, radial_velocities
+from ..steps.paths import GHOST
+from ..steps.step_list import received_causes
+
+BLOCK_HITS = 1 << 16  # hits whose normals are computed at a time
+MIN_REMAINING = 1e-30  # share of light, so that quotients are finite in single precision
+
+
+class BatchPoints:
+    """Reported returns of consecutive scans of a station, in (scan, ray) order.
+
+    The attributes are arrays (n,) with a value for each return, computed on first use: the
+    sources of columns (`lidarsim.columns.table`).
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        survey: Survey,
+        surfaces: Surfaces,
+        specs: list[ScanSpec],  # of consecutive firings
+        scanned: Scanned,  # rays are numbered from 0 at the first firing
+        *,
+        pattern: Pattern,
+        start: int,  # number of ray 0 within the pattern
+        poses: CastPoses,
+    ) -> None:
+        self.scene = scene
+        self.survey = survey
+        self.carried = survey.carried[specs[0].sensor]
+        self.sensor = self.carried.sensor
+        self.specs = specs
+        # Counters that are not 0, see `Surfaces.counter`, and their hits, (k,) each: counts of all
+        # triangles of the scene would take much memory, since each station of a batch stores them.
+        counter_hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
+        counters = np.flatnonzero(counter_hits)
+        self.tally = counters, counter_hits[counters]
+        self.pulse_returns = scanned.returns
+        self.hits = scanned.hits  # (scans,): returns of each scan, also if they are not kept
+        self._surfaces = surfaces
+        self._pattern = pattern
+        self._start = start
+        self._poses = poses
+        self._firings = Firings.from_scans(self.sensor, specs)
+
+    def __len__(self) -> int:
+        return len(self.pulse_returns.ray)
+
+    def column(self, column: Column) -> AnyArray:
+        """Values of a column."""
+        return column.make(self)
+
+    def positions_of(self, rows: Ints) -> Floats:
+        """Return the positions of the returns `rows` (k,), as `positions`: (k, 3)."""
+        return self.positions[rows]
+
+    # -- the ray -----------------------------------------------------------------------------
+
+    @cached_property
+    def _first_rays(self) -> Ints:
+        """Number of the first ray of each scan."""
+        begin = self.specs[0].firings[0]
+        firsts = [spec.firings[0] - begin for spec in self.specs]
+        return np.array(firsts, np.int64) * self.sensor.channels
+
+    @cached_property
+    def counts(self) -> Ints:
+        """Returns of each scan: (scans,)."""
+        cuts = np.searchsorted(self.pulse_returns.ray, self._first_rays)
+        return np.diff(np.append(cuts, len(self))).astype(np.int64)
+
+    @cached_property
+    def scan(self) -> Ints32:
+        """Number of the scan."""
+        first = self.specs[0].scan
+        return np.repeat(np.arange(first, first + len(self.specs), dtype=np.int32), self.counts)
+
+    @cached_property
+    def ray(self) -> Ints:
+        """Number of the ray within its scan."""
+        return self.pulse_returns.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
+
+    @cached_property
+    def channel(self) -> UInts32:
+        """Beam of the sensor."""
+        return np.asarray(self.pulse_returns.ray % np.uint32(self.sensor.channels), np.uint32)
+
+    @cached_property
+    def firing(self) -> Ints:
+        """Number of the firing, from the beginning of the station."""
+        return self.specs[0].firings[0] + self._firing_in_run
+
+    @property
+    def sensor_number(self) -> Bytes:
+        """Number of the sensor."""
+        return np.full(len(self), self.specs[0].sensor, np.uint8)
+
+    @cached_property
+    def _firing_times_ns(self) -> Ints:
+        """Firing times, nanoseconds since the survey's start."""
+        return self._firings.times(self.pulse_returns.ray)
+
+    @cached_property
+    def time(self) -> Ints:
+        """Time of the ray by the sensor's clock, nanoseconds since the survey's start.
+
+        A frozen sensor sends an old sweep again, with the times of the sweep that it replaces.
+        """
+        spec = self.specs[0]
+        stamp = self._firing_times_ns
+        if spec.repeats is not None:
+            repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
+            stamp = stamp + round(current_start_ns - repeated_start_ns)
+        jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
+        return sum((jump.jumps_ns(stamp) for jump in jumps), stamp)
+
+    @property
+    def _actor_times_ns(self) -> Ints:
+        """Firing times, nanoseconds since the survey's start; zeros if there are no actors."""
+        return (
+            self._firing_times_ns
+            if self._poses.actor_trajectories
+            else np.zeros(len(self), np.int64)
+        )
+
+    @cached_property
+    def _firing_in_run(self) -> Ints:
+        """Number of the firing, counted from the first firing of the first scan."""
+        return self.pulse_returns.ray // np.int64(self.sensor.channels)
+
+    # -- positions ---------------------------------------------------------------------------
+
+    @cached_property
+    def _rays(self) -> tuple[Floats, Floats]:
+        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays, in the scene frame."""
+        return self._poses.rays(self._pattern, self.pulse_returns.ray, self._start)
+
+    @property
+    def origins(self) -> Floats:
+        """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
+        return np.broadcast_to(self._rays[0], (len(self), 3))
+
+    @property
+    def directions(self) -> Floats:
+        """Unit directions in the scene frame: (n, 3)."""
+        return self._rays[1]
+
+    @property
+    def range(self) -> Floats:
+        """Distance from the start of the ray, metres, with noise."""
+        return required(self.pulse_returns.reported)
+
+    @cached_property
+    def positions(self) -> Floats:
+        """Ends of the rays, metres, the scene's local coordinates: (n, 3).
+
+        The points that a frozen sensor sends again stay fixed in the sensor frame, and move with
+        the sensor.
+        """
+        return self._moved_with_sensor(self._scene_positions)
+
+    def _moved_with_sensor(self, points: Floats) -> Floats:
+        """Move points (n, 3) with a frozen sensor from the old sweep to the sweep that it replaces.
+
+        Points are in the scene frame; points of a sensor that is not frozen are returned unchanged.
+        """
+        if self.specs[0].repeats is None:
+            return points
+        frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
+        if frozen_pose == current_pose:
+            return points
+        in_sensor = turned(np.subtract(points, frozen_pose.position), frozen_pose.rotation_matrix.T)
+        return turned(in_sensor, current_pose.rotation_matrix) + current_pose.position
+
+    @cached_property
+    def ray_origins(self) -> Floats:
+        """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
+        if self.survey.coordinates == "sensor":
+            return self._in_sensor(np.zeros(len(self)))
+        return self._moved_with_sensor(self.origins) + self.scene.origin
+
+    @property
+    def origin_x(self) -> Floats:
+        """Return x of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 0]
+
+    @property
+    def origin_y(self) -> Floats:
+        """Return y of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 1]
+
+    @property
+    def origin_z(self) -> Floats:
+        """Return z of the starts of the rays, see `ray_origins`."""
+        return self.ray_origins[:, 2]
+
+    @cached_property
+    def _scene_positions(self) -> Floats:
+        """Ends of the rays when they were fired, metres, scene frame: (n, 3)."""
+        origins, directions = self._rays
+        positions = directions * self.range[:, None]
+        return np.add(positions, origins, out=positions)
+
+    @cached_property
+    def cells(self) -> Ints32:
+        """Positions as whole multiples of the survey's precision: (3, n)."""
+        world = self.survey.coordinates == "world"
+        scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
+        cells = np.empty((3, len(self)), np.int32)
+        try:
+            with np.errstate(invalid="raise"):
+                cells[:] = np.rint(scaled, out=scaled).T
+        except FloatingPointError:
+            extent_m = np.abs(scaled).max() * self.survey.precision_m
+            step = self.survey.precision_m
+            raise LidarError(
+                f"precision_m {step} is too fine for points {extent_m:.0f} m from the "
+                f"origin: use at least {extent_m / 2e9:.2g}."
+            ) from None
+        return cells
+
+    @property
+    def cell_x(self) -> Ints32:
+        """Quantised x of each return, multiples of the precision from the local origin."""
+        return self.cells[0]
+
+    @property
+    def cell_y(self) -> Ints32:
+        """Quantised y of each return, multiples of the precision from the local origin."""
+        return self.cells[1]
+
+    @property
+    def cell_z(self) -> Ints32:
+        """Quantised z of each return, multiples of the precision from the local origin."""
+        return self.cells[2]
+
+    @cached_property
+    def _pattern_rows(self) -> Ints:
+        """Row of the ray in the pattern."""
+        return (self._start + self.pulse_returns.ray.astype(np.int64)) % len(self._pattern)
+
+    @cached_property
+    def _sensor_directions(self) -> Floats:
+        """Unit directions in the sensor frame: (n, 3)."""
+        return self._to_sensor(self._pattern.directions[self._pattern_rows])
+
+    @cached_property
+    def sensor_positions(self) -> Floats:
+        """Ends of the rays in the sensor frame at the firing, metres: (n, 3)."""
+        return self._in_sensor(self.range)
+
+    def _in_sensor(self, distance: Floats) -> Floats:
+        """Return points of the rays at distances (n,), sensor frame, metres: (n, 3)."""
+        origins = self._pattern.origins
+        points = self._pattern.directions[self._pattern_rows] * distance[:, None]
+        if origins is not None:
+            points += origins[self._pattern_rows]
+        if not self._poses.by_head:
+            points -= self.carried.mount.position
+        elif self.sensor.centre is not None:
+            points += self.sensor.centre
+        return self._to_sensor(points)
+
+    def _to_sensor(self, vectors: Floats) -> Floats:
+        """Rotate vectors (n, 3), a vector for each return, to the sensor frame.
+
+        Vectors are in the frame of the pattern: of the head, where the pattern is a single firing
+        that each pose turns (`CastPoses.by_head`), else of the carrier.
+        """
+        if self._poses.by_head:
+            spins = self.sensor.spins(self._firings.numbers)
+            assert spins is not None  # or the rig would not cast by head
+            cos, sin = (values.take(self._firing_in_run) for values in spins)
+            x, y, z = vectors.T
+            in_head = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+            return turned(in_head, self.sensor.axes)
+        mount = self.carried.mount.rotation
+        return turned(vectors, None if mount is None else mount.T)
+
+    def _world_to_sensor(self, vectors: Floats) -> Floats:
+        """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
+        in_carrier = np.empty(vectors.shape[::-1])
+        for axis, unit in enumerate(np.eye(3)):
+            _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
+            in_carrier[axis] = products(vectors.T, axes.T)
+        return self._to_sensor(in_carrier.T)
+
+    @cached_property
+    def azimuth(self) -> Floats:
+        """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
+        x, y, _ = self._sensor_directions.T
+        return np.degrees(arctan2(y, x)) % 360
+
+    @cached_property
+    def elevation(self) -> Floats:
+        """Angle of the ray above the sensor's xy plane, degrees."""
+        return np.degrees(arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
+
+    # -- the surface -------------------------------------------------------------------------
+
+    @property
+    def triangle(self) -> Ints32:
+        """Triangle of the scene."""
+        return self.pulse_returns.triangle
+
+    @cached_property
+    def object(self) -> Ints32:
+        """Object of the scene."""
+        return self._surfaces.objects(self.pulse_returns.triangle)
+
+    @cached_property
+    def _kinds(self) -> Ints32:
+        """Kinds of surfaces, rows of the table of materials."""
+        if not self.scene.has_mixed_objects:
+            return self.object
+        return self._surfaces.kinds(self.pulse_returns.triangle)
+
+    @cached_property
+    def cosine(self) -> Floats:
+        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
+
+        Undefined for returns without a surface.
+        """
+        return np.abs(self._lit[0])
+
+    @cached_property
+    def _facing_normals(self) -> tuple[Floats, Floats]:
+        """Unit normals (n, 3), scene frame, on the side that was hit, and cosines of incidence.
+
+        NaN for returns without a surface, leaves within a crown, and ghosts, whose last ray starts
+        at a mirror.
+        """
+        triangle = self.pulse_returns.triangle
+        surfaces = self._surfaces
+        normals = np.full((len(self), 3), np.nan)
+        cosines = np.full(len(self), np.nan)
+        on_surface = triangle >= 0
+        if self.pulse_returns.cause is not None:
+            on_surface &= self.pulse_returns.cause != GHOST
+        if surfaces.materials.leafy.any():
+            on_surface &= ~surfaces.materials.leafy[self._kinds]
+        rows = np.flatnonzero(on_surface)
+        for begin in range(0, len(rows), BLOCK_HITS):
+            block = rows[begin : begin + BLOCK_HITS]
+            facing = surfaces.normals(
+                triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
+            )
+            signed_cosines = products(facing.T, self.directions[block].T)
+            facing[signed_cosines > 0] *= -1
+            normals[block] = facing
+            cosines[block] = np.abs(signed_cosines)
+        return normals, cosines
+
+    @cached_property
+    def normals(self) -> Floats:
+        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3)."""
+        normals, _ = self._facing_normals
+        if self.survey.coordinates == "sensor":
+            return self._world_to_sensor(normals)
+        return self._moved_with_sensor(normals) - self._moved_with_sensor(np.zeros((1, 3)))
+
+    @property
+    def normal_x(self) -> Floats:
+        """Return x of the normals, see `normals`."""
+        return self.normals[:, 0]
+
+    @property
+    def normal_y(self) -> Floats:
+        """Return y of the normals, see `normals`."""
+        return self.normals[:, 1]
+
+    @property
+    def normal_z(self) -> Floats:
+        """Return z of the normals, see `normals`."""
+        return self.normals[:, 2]
+
+    @property
+    def incidence_deg(self) -> Floats:
+        """Angle between the ray and the normal of its surface, degrees; NaN as in `normals`."""
+        return np.degrees(arccos(np.minimum(self._facing_normals[1], 1.0)))
+
+    @cached_property
+    def _lit(self) -> tuple[Floats, Floats]:
+        """Cosines of incidence, of either sign, and energies; in blocks, to save memory."""
+        light = light_of(self.survey, self.sensor)
+        cosines, energy = np.empty((2, len(self)))
+        colours = self._colours if self._surfaces.materials.textured else None
+        for begin in range(0, len(self), BLOCK_HITS):
+            block = slice(begin, begin + BLOCK_HITS)
+            lit = self._surfaces.lit(
+                self.pulse_returns.triangle[block],
+                self.directions[block],
+                self.pulse_returns.distance[block],
+                light,
+                self._actor_times_ns[block],
+                self._poses.actor_trajectories,
+                None if colours is None else colours[block],
+            )
+            cosines[block] = lit.cosines
+            energy[block] = lit.energy
+        return cosines, energy
+
+    @cached_property
+    def intensity(self) -> Floats:
+        """Received energy, on the scale of `Surfaces.energy`."""
+        if self.pulse_returns.energy is not None:
+            return self.pulse_returns.energy
+        return self._lit[1]
+
+    @cached_property
+    def _colours(self) -> UInts32:
+        """Packed colours of the surfaces, see `Surfaces.colours`."""
+        if self.pulse_returns.colour is not None:
+            return self.pulse_returns.colour
+        points = self._scene_positions
+        if self.pulse_returns.reported is not self.pulse_returns.distance:
+            points = self.directions * self.pulse_returns.distance[:, None] + self._rays[0]
+        return self._surfaces.colours(
+            self.pulse_returns.triangle,
+            points,
+            self._actor_times_ns,
+            self._poses.actor_trajectories,
+        )
+
+    @property
+    def red(self) -> Bytes:
+        """Red of the surface, sRGB."""
+        return unpacked(self._colours)[:, 0]
+
+    @property
+    def green(self) -> Bytes:
+        """Green of the surface, sRGB."""
+        return unpacked(self._colours)[:, 1]
+
+    @property
+    def blue(self) -> Bytes:
+        """Blue of the surface, sRGB."""
+        return unpacked(self._colours)[:, 2]
+
+    @property
+    def _clipped_energy(self) -> Floats:
+        """Received energy, clipped at saturation."""
+        return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
+
+    @property
+    def signal(self) -> NDArray[np.uint16]:
+        """Counts in proportion to the clipped energy."""
+        return np.minimum(np.rint(self._clipped_energy * COUNTS), 65_535).astype(np.uint16)
+
+    @property
+    def reflectivity(self) -> Bytes:
+        """Clipped energy, corrected for the loss by distance, on the scale of the manufacturer."""
+        remaining = at_right_angles(self.pulse_returns.distance)
+        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
+
+    @property
+    def reflectance(self) -> Floats:
+        """Intensity, corrected for the loss by distance and air."""
+        remaining = at_right_angles(
+            self.pulse_returns.distance, self.survey.extinction(self.sensor)
+        )
+        # In thick fog or dust, no light returns from the distance at which a false alarm appears.
+        return np.asarray(self.intensity / np.maximum(remaining, MIN_REMAINING))
+
+    @cached_property
+    def radial_velocity(self) -> Floats:
+        """Growth of the range, m/s, with noise; NaN for returns that the receiver adds."""
+        returns = self.pulse_returns
+        velocity = returns.velocity
+        if velocity is None:
+            velocity = radial_velocities(
+                self._surfaces,
+                self._poses,
+                returns.ray.astype(np.int64),
+                self._rays,
+                returns.distance,
+                returns.triangle,
+                self._actor_times_ns,
+            )
+            if returns.cause is not None:
+                velocity[np.isin(returns.cause, received_causes())] = np.nan
+        noise = self.survey.noise_each[self.specs[0].sensor]
+        if noise.velocity_m_s:
+            # A frozen sensor sends an older scan again, with the random numbers of the older scan.
+            scan = self.scan.astype(np.int64) + self.specs[0].ahead
+            errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
+            velocity = velocity + noise.velocity_m_s * errors
+        return velocity
+
+    @property
+    def amplitude(self) -> Floats:
+        """Height of the pulse in the waveform; without waveforms the energy."""
+        return (
+            self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
+        )
+
+    @property
+    def pulse_width(self) -> Floats:
+        """Full width at half maximum of the pulse in the waveform, nanoseconds."""
+        if self.pulse_returns.width is None:
+            returns = self.survey.returns_each[self.specs[0].sensor]
+            return np.full(len(self), returns.length_ns(self.sensor.optics))
+        return self.pulse_returns.width
+
+    @property
+    def waveform(self) -> Records:
+        """Recorded waveform, with location and direction: `lidarsim.columns.waveforms.record`."""
+        table = required(self.pulse_returns.waveform).copy()
+        begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
+        table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
+        world = self.survey.coordinates == "world"
+        ray_directions = self.directions if world else self._sensor_directions
+        table["toward"] = -ray_directions * (LIGHT_M_NS / 2000)
+        return table.view(column_type(table.dtype["samples"].shape[0]))
+
+    @property
+    def return_number(self) -> Bytes:
+        """Number among the reported returns of its pulse."""
+        return required(self.pulse_returns.number)
+
+    @property
+    def returns(self) -> Bytes:
+        """Number of reported returns of its pulse."""
+        return required(self.pulse_returns.returns)
+
+    @property
+    def cause(self) -> Bytes:
+        """Cause of the return, see `CAUSES` in `lidarsim.columns.table`."""
+        if self.pulse_returns.cause is None:
+            return np.zeros(len(self), np.uint8)
+        return self.pulse_returns.cause
+
+    @property
+    def semantic_class(self) -> NDArray[np.uint16]:
+        """Class of the material."""
+        classes = self._surfaces.materials.semantic_class[self._kinds]
+        return (
+            classes if self.pulse_returns.cause is None else np.where(self._kinds < 0, 0, classes)
+        )
+
+    @property
+    def material_number(self) -> Ints32:
+        """Number of the material's name among the names of the scene; -1 without a material."""
+        return self._surfaces.material_numbers(self.pulse_returns.triangle)

@@ -1,0 +1,447 @@
+"""Columns that are computed on the CUDA device: only their values cross the bus, in file types.
+
+The formulas and bits are those of `BatchPoints`. If a survey has further columns, the reported hits
+cross the bus as well, and NumPy computes these columns: energies in haze, azimuths and noise, since
+`exp` and `atan2` of a device differ from `elementary` in the last bit. NumPy also computes the
+energies of hits on actors, which depend on the actors' poses; `SceneCaster` finds the hits on
+actors, and the device merges them with its hits.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from raybeam import DeviceHits, OtherHits, Outbox, Pattern, Scan, check_scan
+from raybeam.device import filled, host_array, to_device
+
+from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
+from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
+from ...scene.scene import Scene
+from ...sensor import ScanSpec, Survey
+from ...sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from ..casting.motion import CastPoses
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..pulses import Scanned
+from ..returns import SURFACE, PulseReturns
+from .batch_points import BatchPoints
+
+OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
+_BLOCK = 128  # threads
+_ENERGIES = "intensity", "reflectance"
+_TRIANGLE = TABLE["triangle"]
+# Columns that a device computes, in the order of columns.cu.
+_DEVICE_COLUMNS = (
+    *AXES, CHANNEL, OBJECT,
+    *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
+)  # fmt: skip
+_CONSTANT_COLUMNS = "sensor", "return_number", "returns", "cause"  # the same for all points
+_HITS = np.uint32, np.float64, np.int32  # types of rays, distances and triangles for NumPy
+_NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
+
+
+def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
+    """Return the names of the columns that a device can compute for a survey of a scene."""
+    hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
+    several_wavelengths = (
+        len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    )
+    textured_or_rough = any(
+        m.reflectance == "texture"
+        or m.roughness is not None
+        or (several_wavelengths and m.spectrum)
+        for m in survey.materials
+    )
+    computable = {column.name for column in _DEVICE_COLUMNS} - {
+        *(_ENERGIES if hazy or textured_or_rough else ())
+    }
+    if scene.has_mixed_objects:  # the device has no materials of faces
+        computable -= {*_ENERGIES, "class"}
+    computable -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
+    return computable - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+
+
+def needs_hits(scene: Scene, survey: Survey) -> bool:
+    """Return True if NumPy computes a column, so that all reported hits leave the device."""
+    names = {column.name for column in survey.stored_columns}
+    return not names <= _device_column_names(scene, survey) | {*_CONSTANT_COLUMNS}
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePoints:
+    """Points of consecutive scans of a station: columns from the device, as of `BatchPoints`."""
+
+    scene: Scene
+    survey: Survey
+    specs: list[ScanSpec]
+    counts: Ints  # (scans,): number of points of each scan
+    hits: Ints  # (scans,): number of hits of each scan, reported or not
+    tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
+    columns: dict[str, AnyArray]  # by name
+    returns: BatchPoints | None  # on the host, if NumPy computes columns
+
+    def __len__(self) -> int:
+        return int(self.counts.sum())
+
+    def column(self, column: Column) -> AnyArray:
+        """Return the values of a column."""
+        if column.name in self.columns:
+            return self.columns[column.name]
+        if self.returns is not None:
+            return column.make(self.returns)
+        value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
+        return np.full(len(self), value, column.dtype)
+
+    def positions_of(self, rows: Ints) -> Floats:
+        """Return the positions of points `rows` (k,), metres: (k, 3).
+
+        Positions are rounded to the precision unless NumPy computes columns.
+        """
+        if self.returns is not None:
+            return self.returns.positions_of(rows)
+        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+        return cells * self.survey.precision_m
+
+
+class SeenBodies:
+    """Bodies that a sensor sees, numbered as its caster numbers them."""
+
+    def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
+        self.caster = caster
+        self.rows = caster.body_rows  # rows in `Surfaces.bodies`
+        self.table = bodies[self.rows]  # as in `Surfaces.bodies`; all actors are the last body
+        self.counters = caster.counters()
+        self.device_table: Any = None
+        self.device_normal_matrices: Any = None
+
+
+class DeviceColumns:
+    """Casts surveys whose rays have a single return, and computes columns on the device.
+
+    NumPy computes the columns that the device cannot compute, see the module. `casters` are those
+    of the sensors, by their numbers.
+    """
+
+    def __init__(
+        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: Surfaces
+    ) -> None:
+        self._scene = scene
+        self._surfaces = surfaces
+        self.survey = survey
+        stored = {column.name for column in survey.stored_columns}
+        computable = _device_column_names(scene, survey)
+        self.needs_all_hits = needs_hits(scene, survey)
+        if self.needs_all_hits and scene.actors:
+            computable -= {*_ENERGIES}
+        self.device_columns = [
+            column for column in _DEVICE_COLUMNS if column.name in stored & computable
+        ]
+        self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
+        # Whether NumPy computes energies of hits on actors, which the device computes of others.
+        self.needs_actor_hits = bool(scene.actors and self.energies)
+        bodies, _ = surfaces.bodies()
+        seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
+        self._seen_bodies = [seen[caster] for caster in casters]  # by sensors
+        self._surface_tables: tuple[Any, ...] | None = None
+
+    def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
+        """Return a copy for a scene with moved instances; unchanged tables stay on the device."""
+        moved_columns = copy(self)
+        moved_columns._scene = scene
+        moved_columns._surfaces = surfaces
+        for seen in self._seen_bodies:
+            seen.device_normal_matrices = None
+        return moved_columns
+
+    def returns(
+        self,
+        specs: list[ScanSpec],
+        pattern: Pattern,
+        poses: CastPoses,
+        window: tuple[int, int],
+        groups: Ints,
+    ) -> DevicePoints:
+        """Cast consecutive scans of a station, and compute their columns.
+
+        `window` has the first ray in `pattern` and the ray after the last; `groups` (scans,) has
+        the first ray of each scan, counted from the first ray of the window.
+        """
+        survey = self.survey
+        sensor = survey.carried[specs[0].sensor].sensor
+        seen = self._seen_bodies[specs[0].sensor]
+        keep_every = survey.keep_every
+        scan = check_scan(
+            pattern,
+            **poses.caster_arguments,
+            window=window,
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+            keep_every=keep_every,
+            groups=groups,
+            tally=True,
+        )
+        actor_hits = _actor_hits(seen, scan, poses)
+        transfer = _ColumnTransfer(
+            self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
+        )
+        try:
+            hits, tally = seen.caster.caster.visit(scan, transfer.make, seen.counters, actor_hits)
+        finally:  # else the device would write to memory that goes back to the pool
+            columns, (ray, distance, triangle) = transfer.finish()
+        assert tally is not None
+        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
+        returns = BatchPoints(
+            self._scene,
+            survey,
+            self._surfaces,
+            specs,
+            scanned,
+            pattern=pattern,
+            start=window[0],
+            poses=poses,
+        )
+        if self.needs_actor_hits:
+            for column in self.energies:
+                columns[column.name][transfer.actor_rows] = column.make(returns)
+        return DevicePoints(
+            self._scene,
+            survey,
+            specs,
+            -(-hits // keep_every),
+            hits,
+            tally,
+            columns,
+            returns if self.needs_all_hits else None,
+        )
+
+    def write_ranges(
+        self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
+    ) -> None:
+        """Write the ranges of rays of sensor `number` to `image` (n,), metres.
+
+        Ray i is row ``i % len(pattern)`` of the pattern. `image` has inf before; a ray without a
+        return keeps inf.
+        """
+        sensor = self.survey.carried[number].sensor
+        seen = self._seen_bodies[number]
+        scan = check_scan(
+            pattern,
+            **poses.caster_arguments,
+            window=(0, len(image)),
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+        )
+        images: list[Any] = []  # on the device, as soon as there are hits
+
+        def take(hits: DeviceHits) -> None:
+            if not images:
+                images.append(hits.cupy.full(len(image), np.inf, np.float32))
+            images[0][hits.ray] = hits.distance
+
+        seen.caster.caster.visit(scan, take, other_hits=_actor_hits(seen, scan, poses))
+        for device_image in images:
+            device_image.get(out=image)
+
+    def tables(self, cupy: Any, seen: SeenBodies) -> tuple[Any, ...]:
+        """Return the tables of surfaces that columns.cu reads, on the caster's device."""
+        if self._surface_tables is None:
+            surfaces = self._surfaces
+            materials = self._surfaces.materials
+            normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
+            tables = (
+                surfaces.owners,
+                normals,
+                materials.reflectance,
+                materials.retro.astype(np.uint8),
+                materials.semantic_class,
+            )
+            self._surface_tables = tuple(to_device(cupy, table) for table in tables)
+        if seen.device_table is None:
+            seen.device_table = to_device(cupy, seen.table)
+        if seen.device_normal_matrices is None:
+            normal_matrices = self._surfaces.bodies()[1][seen.rows]
+            seen.device_normal_matrices = to_device(cupy, normal_matrices)
+        return seen.device_table, *self._surface_tables, seen.device_normal_matrices
+
+
+def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
+    """Find the hits of a scan on actors that are seen; None without actors.
+
+    All actors are the last body: its triangles count from 0.
+    """
+    if not poses.actor_trajectories:
+        return None
+    hits = seen.caster.on_actors(scan, poses)
+    return replace(hits, triangle=hits.triangle - np.int32(seen.table[-1, 0]))
+
+
+class _ColumnTransfer:
+    """Computes columns of a batch on the device, and sends the values to the host.
+
+    `maker` names the columns and has the tables of surfaces. The caster of the bodies `seen` passes
+    the hits of the batch to `make` in parts; `finish` returns the columns of all hits.
+    """
+
+    def __init__(
+        self,
+        maker: DeviceColumns,
+        seen: SeenBodies,
+        specs: list[ScanSpec],
+        groups: Ints,
+        max_points: int,
+    ) -> None:
+        self._maker = maker
+        self._seen = seen
+        self._specs = specs
+        self._groups = groups
+        self._max_points = max_points
+        self._buffers: _TransferBuffers | None = None
+        self._count = 0
+        # Rows, rays, distances and triangles of the hits on actors, of each call of `make`.
+        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]
+
+    def make(self, hits: DeviceHits) -> None:
+        """Compute the columns of the next hits, in ray order, and send the values to the host."""
+        if not len(hits):
+            return
+        buffers = self._buffers = self._buffers or self._start(hits.cupy)
+        device_arrays = self._compute(hits, buffers)
+        rows = slice(self._count, self._count + len(hits))
+        pairs = [(device_arrays[column], host[rows]) for column, host in buffers.columns.items()]
+        hit_arrays = hits.ray, hits.distance, device_arrays[_TRIANGLE]
+        pairs += [
+            (array, host[rows]) for array, host in zip(hit_arrays, buffers.hits, strict=False)
+        ]
+        buffers.outbox.send(pairs)
+        if self._maker.needs_actor_hits:
+            self._on_actors.append(self._actor_hits(hits))
+        self._count += len(hits)
+
+    def _compute(self, hits: DeviceHits, buffers: _TransferBuffers) -> dict[Column, Any]:
+        """Compute columns of hits on the device; unneeded columns have a single element."""
+        computed = {*buffers.columns, *([_TRIANGLE] if buffers.hits else [])}
+        arrays = {
+            column: hits.cupy.empty(len(hits) if column in computed else 1, column.dtype)
+            for column in _DEVICE_COLUMNS
+        }
+        flags = sum(1 << _DEVICE_COLUMNS.index(column) for column in computed)
+        arguments = (
+            hits.ray,
+            hits.distance,
+            hits.triangle,
+            hits.instance,
+            *hits.rays(),
+            np.int64(len(hits)),
+            np.int32(flags),
+            *buffers.kernel_arguments,
+            *arrays.values(),
+        )
+        buffers.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), arguments)
+        return arrays
+
+    def _actor_hits(self, hits: DeviceHits) -> tuple[AnyArray, ...]:
+        """Return the rows of the hits on actors, and their rays, distances and triangles."""
+        on_actors = hits.cupy.flatnonzero(hits.instance == len(self._seen.table) - 1)
+        columns = (
+            on_actors,
+            hits.ray[on_actors],
+            hits.distance[on_actors],
+            hits.triangle[on_actors],
+        )
+        rows, ray, distance, triangle = (array.get() for array in columns)
+        triangle += np.int32(self._seen.table[-1, 0])
+        return self._count + rows, ray, distance, triangle
+
+    @property
+    def actor_rows(self) -> Ints:
+        """Rows of the hits on actors among all hits of the batch."""
+        return np.concatenate([rows for rows, *_ in self._on_actors])
+
+    def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
+        """Wait for the values; return {column name: values}, and the hits that NumPy needs.
+
+        Hits are rays, distances and triangles: of all hits, of those on actors, or of none.
+        """
+        if self._buffers is None:
+            return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
+        self._buffers.outbox.wait()
+        sizes = (self._count, self._max_points)
+        columns = {
+            column.name: filled(host, *sizes) for column, host in self._buffers.columns.items()
+        }
+        if self._buffers.hits:
+            return columns, tuple(filled(host, *sizes) for host in self._buffers.hits)
+        _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
+        return columns, tuple(hits)
+
+    def _start(self, cupy: Any) -> _TransferBuffers:
+        """Allocate host arrays, and send the kernel's arguments that are the same for all hits."""
+        maker = self._maker
+        kernel_arguments = self._kernel_arguments(cupy)
+        outbox = Outbox(cupy)
+        columns = {
+            column: host_array(cupy, self._max_points, column.dtype)
+            for column in maker.device_columns
+        }
+        hits = (
+            [host_array(cupy, self._max_points, kind) for kind in _HITS]
+            if maker.needs_all_hits
+            else []
+        )
+        kernel = _kernel(cupy, cupy.cuda.Device().id)
+        return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)
+
+    def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
+        """Return the arguments of the kernel between hits and columns, arrays on the device."""
+        maker = self._maker
+        specs = self._specs
+        sensor = maker.survey.carried[specs[0].sensor].sensor
+        bodies, owners, normals, reflectance, retro, classes, normal_matrices = maker.tables(
+            cupy, self._seen
+        )
+        firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
+        return (
+            np.float64(maker.survey.precision_m),
+            cupy.asarray(self._groups),
+            np.int32(len(specs)),
+            cupy.asarray(sensor.begins_ns(firings)),
+            cupy.asarray(sensor.beams.time_ns),
+            np.int32(sensor.channels),
+            np.int64(specs[0].start_ns),
+            bodies,
+            owners,
+            normals,
+            normal_matrices,
+            reflectance,
+            retro,
+            np.float64(RETRO_GAIN),
+            np.float64(REFERENCE_M),
+            np.float64(NEAREST_M),
+            classes,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _TransferBuffers:
+    """Kernel of a batch with hits, and page-locked host arrays that receive the values."""
+
+    kernel: Any
+    kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
+    outbox: Outbox
+    columns: dict[Column, AnyArray]  # with room for all rays
+    hits: list[AnyArray]  # as `_HITS`; empty unless NumPy needs all hits
+
+
+@lru_cache(maxsize=16)
+def _kernel(cupy: Any, device: int) -> Any:
+    """Compile columns.cu for the current device, whose number is `device`, once."""
+    code = importlib.resources.files(__package__).joinpath("columns.cu").read_text("utf-8")
+    module = cupy.RawModule(code=f'#line 1 "columns.cu"\n{code}', options=OPTIONS)
+    return module.get_function("columns")

@@ -1,0 +1,447 @@
+"""Hits in the air: drops, flakes, fog and dust in front of surfaces.
+
+Which particles a beam meets follows from random numbers for each pulse alone. Only particles that
+the sensor may detect are drawn: the number is Poisson's, ranges and diameters are quantiles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache, lru_cache
+from statistics import NormalDist
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Bools, Floats, Indices, Ints, owned
+from ...base.elementary import exp, expm1, geomspace, interp, log1p
+from ...base.elementary_scalars import exp_of
+from ...columns.table import CAUSES
+from ...sensor.materials import MaterialTable
+from ...sensor.noise import THRESHOLD_SIGMAS
+from ...sensor.random_numbers import Purpose, named_seed, starts
+from ...sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
+from ...sensor.weather import reach as reach_of
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..returns import (
+    RETURN_COLUMNS,
+    SURFACE,
+    Keys,
+    Planes,
+    PulseReturns,
+    joined,
+    numbers,
+    returns_without_surface,
+)
+from .doppler import range_rates_of_origins
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+if TYPE_CHECKING:
+    from .pulse_loops import SampledHits
+    from .random_loops import RandomKeys
+
+FOG_CELL = Purpose(10, "cell of fog with the highest peak")
+FOG_PLACE = Purpose(11, "place of the peak in its cell")
+PARTICLES = Purpose(12, "number of particles that a beam meets")
+PARTICLE_RANGE = Purpose(13, "range of a particle")
+PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
+PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
+AIR = CAUSES.index("air")
+QUANTILES = 1 << 16  # equal shares of a distribution, in tables
+CACHED_TABLES = 32  # as a scanner builds its casters again whenever an object is moved
+MAX_FOG_CELLS = 255  # cells of half a pulse's length
+# Standard deviations below and above the highest signal, up to which probabilities are summed.
+TAIL_SIGMAS = 6.0
+
+
+class DetectableParticles(NamedTuple):
+    """Distribution of the particles of a kind that may be detected."""
+
+    counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
+    # (5, QUANTILES), a column for each equal share of the particles by range: ascending distances,
+    # metres; smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest));
+    # energies of a particle of 1 mm; and energies of a particle that fills the beam.
+    by_range: Floats
+    step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
+
+
+class FogCells(NamedTuple):
+    """Cells of half a pulse's length of fog that may be detected, from the sensor on."""
+
+    begin_m: float  # range of the first cell
+    cell_m: float  # length of a cell
+    energy: Floats  # (cells,): received of the fog in a cell
+    # ((cells + 1) * cells,): cumulative probabilities that a cell has the highest peak of the first
+    # n cells: row n is n plus the probabilities.
+    peaks: Floats
+
+
+class WeatherStep(PulseStep):
+    """Samples the returns of rain, snow, fog and dust.
+
+    Raises
+    ------
+    LidarError
+        If a beam would return from too many particles.
+    """
+
+    role = Role.CHANGES
+    effects = "Rain", "Snow", "Fog", "Dust"
+    reads = "ray", "distance", "triangle", "cause", "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
+    causes = (AIR,)
+    purposes = (
+        FOG_CELL,
+        FOG_PLACE,
+        PARTICLES,
+        PARTICLE_RANGE,
+        PARTICLE_SUBRAY,
+        PARTICLE_DIAMETER,
+    )
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        sensor = setup.sensor
+        noise = setup.noise
+        survey = setup.survey
+        self._seed = noise.seed
+        self._wavelength_nm = sensor.optics.wavelength_nm
+        air = survey.air(setup.number)
+        faintest = FAINTEST * noise.threshold
+        min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
+        # For each kind of particles; None where no particle can be detected.
+        self.detectable_kinds = [
+            _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
+        ]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self.detectable_kinds))]
+        self._seeds = [named_seed(noise.seed, name) for name in names]
+        backscatter = survey.backscatter_at(self._wavelength_nm)
+        self.fog_cells = _fog_cells(
+            air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
+        )
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether the weather of the survey returns light."""
+        return setup.survey.returns_light
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """Return the mean number of returns of particles and fog in a pulse."""
+        backscatter = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
+        return setup.survey.mean_particles(setup.number) + bool(backscatter)
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of sub-rays and of hits in the air, in bytes."""
+        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the hits of a batch after hits in the air are sampled, see `add_air_hits`."""
+        air_hits = self.sample_air_hits(
+            returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
+        )
+        if air_hits is None:
+            return returns
+        return add_air_hits(self.setup, returns, batch, air_hits)
+
+    def sample_air_hits(
+        self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, subrays: int
+    ) -> PulseReturns | None:
+        """Sample the hits in the air before surfaces, of particles and of fog.
+
+        `beams` are the numbers of the first beam, and one past the last, as in `keys`. `hits` are
+        the hits of these beams on surfaces; each beam has `subrays` sub-rays. Hits in the air are
+        in the order of rays: sub-rays, numbered from the first of the first beam. Returns None if
+        neither particles nor fog can be detected.
+        """
+        first, stop = beams
+        count = (stop - first) * subrays
+        reach = light_reach(
+            self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
+        )
+        parts: list[SampledHits] = []
+        for kind, seed in zip(self.detectable_kinds, self._seeds, strict=True):
+            if kind is not None:
+                random = random_keys(seed, self.purposes[2:], keys, first)
+                parts += _particles(kind, random, subrays, reach)
+        if self.fog_cells is not None:
+            random = random_keys(self._seed, self.purposes[:2], keys, first)
+            parts.append(_fog_hits(self.fog_cells, random, subrays, self._fog_ends(hits, reach)))
+        if not parts:
+            return None
+        ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        air_hits = returns_without_surface(hits, ray, distance, energy, AIR)
+        if len(self._refracting(hits)):
+            air_hits = air_hits.take(~self._in_refracting_bodies(hits, ray, distance))
+        if parts[1:] or subrays > 1:
+            air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
+        return air_hits
+
+    def _refracting(self, hits: PulseReturns) -> Indices:
+        """Return rows of hits on surfaces of water and glass with a refractive index.
+
+        Of each ray, the first, third, … such hits enter a body, the others leave it.
+        """
+        refracts = self.surfaces.at_wavelength(self._wavelength_nm).refracts
+        if not refracts.any():
+            return np.zeros(0, np.intp)
+        refracting = refracts[self.surfaces.kinds(hits.triangle)]
+        return np.flatnonzero(
+            refracting if hits.cause is None else refracting & (hits.cause == SURFACE)
+        )
+
+    def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Return whether points at distances on rays (n,) are in water or glass: (n,)."""
+        rows = self._refracting(hits)
+        surface_ray = hits.ray[rows]
+        surface_distance = hits.distance[rows]
+        first = np.searchsorted(surface_ray, ray, side="left")
+        stop = np.searchsorted(surface_ray, ray, side="right")
+        count = np.zeros(len(ray), np.int64)
+        for number in range(int((stop - first).max(initial=0))):
+            present = np.flatnonzero(first + number < stop)
+            count[present] += surface_distance[first[present] + number] < distance[present]
+        return np.asarray(count % 2 == 1)
+
+    def _fog_ends(self, hits: PulseReturns, reach: Floats) -> Floats:
+        """Return the ranges at which the fog before each sub-ray ends, (rays,), metres.
+
+        Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half of
+        the pulse's length: panes of glass do not end fog.
+        """
+        rows = self._refracting(hits)
+        if not len(rows):
+            return reach
+        ray = hits.ray[rows]
+        surface_distance = hits.distance[rows]
+        exit_distance = np.full(len(rows), np.inf)
+        same_ray = ray[1:] == ray[:-1]
+        exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
+        enters = (numbers(ray) % 2 == 0) & (
+            exit_distance - surface_distance > self.setup.half_pulse_m
+        )
+        reach = reach.copy()
+        np.minimum.at(reach, ray[enters], surface_distance[enters])
+        return reach
+
+
+def light_reach(
+    materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
+) -> Floats:
+    """Return ranges that the light of `count` sub-rays reaches, (count,), metres.
+
+    The range is that of the last hit of a sub-ray on a surface; inf without a hit, or if the last
+    surface lets light pass. `hits.ray` are sub-rays, from 0.
+    """
+    ray = hits.ray
+    end_distance = hits.distance
+    transmits = materials.passes
+    if transmits.any():
+        end_distance = np.where(transmits[surfaces.kinds(hits.triangle)], np.inf, end_distance)
+    if hits.cause is not None:
+        rows = np.flatnonzero(hits.cause == SURFACE)
+        ray = ray[rows]
+        end_distance = end_distance[rows]
+    reach = np.full(count, np.inf)
+    reach[ray] = end_distance  # the last hit of a ray counts
+    return reach
+
+
+def add_air_hits(
+    setup: Setup, returns: PulseReturns, batch: PulseBatch, air_hits: PulseReturns
+) -> PulseReturns:
+    """Return the hits of a batch after hits in the air are added.
+
+    With waveforms, the hits in the air are inserted before the hits on surfaces; else `batch.air`
+    receives the hits in the air, for `SeparationStep`.
+    """
+    if returns.velocity is not None:  # the air is at rest
+        first_subray = batch.window[0]  # of the batch, in `batch.beams`
+        rays = batch.subray_poses.rays(batch.beams, air_hits.ray, first_subray)
+        air_hits = air_hits._replace(
+            velocity=range_rates_of_origins(batch.subray_poses, air_hits.ray, *rays)
+        )
+    if setup.in_waveforms or setup.waveform_samples:
+        batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
+        return batch.hits
+    if batch.air is not None:
+        air_hits = joined([batch.air, air_hits])
+        air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
+    batch.air = air_hits
+    return returns
+
+
+def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
+    """Return the keys of the random numbers of beams from number `first` on, for loops."""
+    from .random_loops import RandomKeys
+
+    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
+
+
+def room_for_hits(size: int) -> SampledHits:
+    """Return arrays to which loops write up to `size` hits."""
+    from .pulse_loops import SampledHits
+
+    return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
+
+
+def _particles(
+    detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
+) -> Iterator[SampledHits]:
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), metres."""
+    from . import air_loops  # not before: numba takes half a second to import
+
+    beams = len(reach) // subrays
+    tables = air_loops.ParticleTables(
+        detectable.counts, detectable.by_range, detectable.step_mm, exponential()
+    )
+    beam = 0
+    while beam < beams:
+        hits = room_for_hits(2 * beams + len(detectable.counts))
+        beam, count = air_loops.sample_particles(beam, beams, subrays, tables, random, reach, hits)
+        yield hits.first(count)
+
+
+def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
+    """Return a hit of fog for each beam that has fog, on its first sub-ray.
+
+    `reach` (rays,) is where fog ends on each sub-ray, metres.
+    """
+    from . import air_loops
+
+    hits = room_for_hits(len(reach) // subrays)
+    tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
+    count = air_loops.sample_fog(subrays, tables, random, reach, hits)
+    return hits.first(count)
+
+
+def insert_air_hits(
+    hits: PulseReturns, planes: Planes | None, air_hits: PulseReturns
+) -> tuple[PulseReturns, Planes | None]:
+    """Return hits and planes with the hits in the air inserted before the surfaces of their rays.
+
+    The planes of hits in the air are 0; planes stay None.
+    """
+    order = np.argsort(np.concatenate([air_hits.ray, hits.ray]), kind="stable")
+    if planes is not None:
+        no_vectors = np.zeros((len(air_hits.ray), 3))
+        normals, directions = (np.concatenate([no_vectors, vectors])[order] for vectors in planes)
+        planes = normals, directions
+    return joined([air_hits, hits]).take(order), planes
+
+
+@lru_cache(CACHED_TABLES)
+def _detectable(
+    air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
+) -> DetectableParticles | None:
+    """Return the distribution of particles that return at least `min_energy`; None if empty."""
+    tables = seen_by_range(air, kind, min_energy, min_range_m, max_range_m)
+    if tables is None:
+        return None
+    mean, by_range = tables
+    return DetectableParticles(_poisson(mean), by_range, 1 / kind.slope)
+
+
+@lru_cache(CACHED_TABLES)
+def seen_by_range(
+    air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
+) -> tuple[float, Floats] | None:
+    """Return the mean number of particles in a beam that return at least `min_energy`, and a table.
+
+    The table is that of `DetectableParticles.by_range`. Returns None without such particles.
+    """
+    distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
+    detectable = np.flatnonzero(air.rate(kind, min_energy, distance) > 0)
+    if not len(detectable):
+        return None
+    last = min(detectable[-1] + 1, NODES - 1)
+    distance = geomspace(distance[max(detectable[0] - 1, 0)], distance[last], NODES)
+    rate = air.rate(kind, min_energy, distance)
+    parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
+    sums = np.concatenate([[0.0], np.cumsum(parts)])
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    distance = single(interp(shares, sums / sums[-1], distance))
+    smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
+    larger = -expm1(-kind.slope * (kind.largest - smallest))
+    full_beam_energy = kind.reflectance * air.white_energy(distance)
+    energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
+    rows = [smallest, larger, energy_of_1_mm, full_beam_energy]
+    return float(sums[-1]), np.stack([distance, *(single(row) for row in rows)])
+
+
+def _poisson(mean: float) -> Floats:
+    """Return the cumulative probabilities of 0, 1, … events of a mean number; the last is 1."""
+    sums = []
+    term = exp_of(-mean)
+    count = 0
+    total = term
+    while count < mean or 1 - total > 1e-9:
+        sums.append(total)
+        count += 1
+        term *= mean / count
+        total += term
+    return single(np.array([*sums, 1.0]))
+
+
+@lru_cache(CACHED_TABLES)
+def _fog_cells(
+    air: Air,
+    backscatter: float,
+    threshold: float,
+    min_range_m: float,
+    max_range_m: float,
+    cell_m: float,
+) -> FogCells | None:
+    """Return the cells of fog that may be detected; None without such cells.
+
+    `backscatter` is that of fog and dust, 1/(m sr); `cell_m` is half of the pulse's length.
+    """
+    count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
+    edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
+    energy = air.cloud(backscatter, edges[:-1], edges[1:])
+    energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
+    if not len(energy):
+        return None
+    peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
+    rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
+    return FogCells(min_range_m, cell_m, single(energy), rows.reshape(-1))
+
+
+def highest_probabilities(signals: Floats) -> Floats:
+    """Return cumulative probabilities that a signal is the highest of the first n: (k + 1, k).
+
+    The signals (k,) fall, and have noise of standard deviation 1. Row n is for the first n signals;
+    row 0 is 1.
+    """
+    count = len(signals)
+    probabilities = np.ones((count + 1, count))
+    # The highest signal is about as high as the first, or somewhat higher.
+    levels = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
+    normal = NormalDist()
+    below = np.array([[normal.cdf(x - signal) for x in levels] for signal in signals])
+    density = exp(-((levels - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
+    product = np.ones(len(levels))
+    for number in range(1, count + 1):
+        product = product * below[number - 1]
+        share = (density[:number] * product).sum(axis=1)
+        probabilities[number, :number] = np.cumsum(share / share.sum())
+        probabilities[number, number - 1 :] = 1.0
+    return probabilities
+
+
+def single(table: Floats) -> Floats:
+    """Round to single precision, in which the error functions of C libraries are the same."""
+    return table.astype(np.float32).astype(np.float64)
+
+
+@cache
+def exponential() -> Floats:
+    """Return quantiles of the exponential distribution at the middles of equal shares."""
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    return single(-log1p(-shares))

@@ -1,0 +1,88 @@
+"""Errors of the directions in which beams are sent; reported directions have no errors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...base.arrays import Floats, Integers
+from ...base.elementary import sin_cos
+from ...base.vectors import hypot
+from ...sensor.noise import Noise
+from ...sensor.random_numbers import Purpose, normal
+from ..returns import PulseReturns
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+ACROSS = Purpose(2, "noise of a beam's direction, across")
+UP = Purpose(3, "noise of a beam's direction, up")
+
+
+class AngleNoiseStep(PulseStep):
+    """Turns each beam by a random angle."""
+
+    role = Role.AIMS
+    purposes = ACROSS, UP
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if directions have random errors."""
+        return setup.noise.angle_deg > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of the directions of beams, in bytes."""
+        return beam_memory(setup, sizes)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Add random angles to the beams of a batch; return the returns unchanged."""
+        beams = np.arange(batch.start, batch.stop)
+        scan, ray = batch.keys.scan_and_number(beams)
+        across, up = angle_errors(self.setup.noise, scan, ray)
+        batch.deflect(np.column_stack([across, up]))
+        return returns
+
+
+class RippleStep(PulseStep):
+    """Turns beams by an error of azimuth that repeats with the head's revolutions."""
+
+    role = Role.AIMS | Role.ABOUT_AXIS
+    effects = ("Errors that last",)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if azimuths have a periodic error."""
+        return setup.noise.ripple_deg > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of the directions of beams; 0 if `AngleNoiseStep` counts the memory."""
+        return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Add the errors of azimuth to the beams of a batch; return the returns unchanged."""
+        noise = self.setup.noise
+        sensor = self.setup.sensor
+        azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
+        sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
+        # An error of azimuth moves a beam across by the horizontal part of its unit direction.
+        level = hypot(*sensor.ahead.T[:2])
+        across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
+        batch.deflect(np.column_stack([across, np.zeros(len(across))]))
+        return returns
+
+
+def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, Floats]:
+    """Return random angles of beams, across and up: (n,) and (n,), radians.
+
+    `ray` (n,) are numbers of rays in their scans, `scan` (n,).
+    """
+    sigma = np.radians(noise.angle_deg)
+    across = sigma * normal(noise.seed, ACROSS, scan, ray)
+    up = sigma * normal(noise.seed, UP, scan, ray)
+    return across, up
+
+
+def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
+    """Return the memory of the directions of deflected beams, in bytes."""
+    if setup.has_several_returns:  # then the beams are deflected batch by batch
+        return Memory()
+    return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

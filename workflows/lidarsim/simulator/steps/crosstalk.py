@@ -1,0 +1,338 @@
+"""Crosstalk: a receiver cannot tell foreign pulses, of other sensors, from its own pulses."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from raybeam import Pattern
+
+from ...base.arrays import Floats, Indices, Ints, Ints32, owned
+from ...base.elementary import arccos, exp
+from ...base.elementary_scalars import sin_cos_of
+from ...base.vectors import into_axes, length, products, turned
+from ...columns.table import CAUSES
+from ...sensor import ScanSpec, Sensor, Survey
+from ...sensor.materials import at_right_angles
+from ...sensor.optics import LIGHT_M_NS
+from ...sensor.random_numbers import Purpose
+from ...sensor.survey import firing_start_ns
+from ..casting.motion import CastPoses, Clock
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..returns import RETURN_COLUMNS, PulseReturns, merged, numbers, returns_without_surface
+from .detection import passes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+if TYPE_CHECKING:
+    from .stray_loops import ReceivedSpots
+
+FOREIGN_PULSE = Purpose(23, "noise of the energy of another sensor's pulse")
+CROSSTALK = CAUSES.index("crosstalk")
+CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
+FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
+SLACK_NS = 10.0  # error of the estimated time at which a pulse reaches the receiver, at most
+
+
+class ReceivedPulses(NamedTuple):
+    """Foreign pulses that rays receive: arrays (k,)."""
+
+    row: Indices  # of the receiving rays
+    distance: Floats  # at which the pulse appears to the receiver, metres
+    energy: Floats  # 1 for a white surface at `REFERENCE_M`
+
+
+class _WaitingRays(NamedTuple):
+    """Rays whose receiver waits for light: arrays (n,), vectors (n, 3) in the scene frame."""
+
+    fired: Floats  # firing times, nanoseconds since the start of the station
+    order: Indices  # rows of the rays in order of their firing times
+    origins: Floats
+    directions: Floats
+    gate: Floats  # (2,): nanoseconds after firing between which the receiver waits
+
+
+class _Spots(NamedTuple):
+    """Points on surfaces that the pulses of a sensor light: arrays (n,)."""
+
+    time: Floats  # at which the pulse lights the spot, nanoseconds since the start of the station
+    position: Floats  # (n, 3), metres, scene frame
+    normal: Floats  # (n, 3), unit vectors
+    triangle: Ints32
+    distance: Floats  # from the sensor, metres
+
+
+class _Candidates(NamedTuple):
+    """Spots, and consecutive rays that may see each spot: arrays (k,)."""
+
+    spot: Indices
+    start: Indices  # index of the first ray in `_WaitingRays.order`
+    stop: Indices  # one past the index of the last ray
+
+
+class CrosstalkStep(PulseStep):
+    """Adds the foreign pulses that a sensor receives.
+
+    A pulse of another sensor lights a spot. A ray receives the light of the spot if the spot is
+    visible and in the field of view of the ray's receiver, which is as wide as the beam, and if
+    the light arrives while the receiver waits for the pulse of the ray.
+    """
+
+    role = Role.RECEIVES
+    effects = ("Crosstalk",)
+    reads = "ray", "distance"
+    writes = RETURN_COLUMNS
+    causes = (CROSSTALK,)
+    purposes = (FOREIGN_PULSE,)
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        self._survey = setup.survey
+        self._sensor = setup.sensor
+        divergence = setup.reporting.divergence(self._sensor.optics)
+        self._cosine = sin_cos_of(divergence / 2)[1]  # of half the field of view of a ray
+        nm = self._sensor.optics.wavelength_nm
+        self._other_sensors = [
+            number
+            for number, carried in enumerate(self._survey.carried)
+            if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
+        ]
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the sensor has crosstalk."""
+        return setup.noise.crosstalk
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of causes of returns, of rays, and of foreign pulses, in bytes."""
+        foreign_pulses = _foreign_pulses(setup.survey, setup.sensor)
+        return Memory(
+            retained=10 * sizes.returns, casting=(120 + 180 * foreign_pulses) * sizes.beams
+        )
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns of a batch and the received foreign pulses."""
+        rays = np.arange(batch.start, batch.stop)
+        row, distance, energy = self.received(
+            batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
+        )
+        order = np.lexsort((distance, row))
+        ray = rays[row[order]]
+        distance = distance[order]
+        energy = energy[order]
+        scan, number = batch.keys.scan_and_number(ray)
+        detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
+        foreign_returns = returns_without_surface(
+            returns, ray[detected], distance[detected], energy[detected], CROSSTALK
+        )
+        return merged(returns, foreign_returns)
+
+    def received(
+        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
+    ) -> ReceivedPulses:
+        """Return the foreign pulses that consecutive rays (n,) receive.
+
+        `rays` are numbers counted from the first ray of scan `scan`. Origins, metres, and unit
+        directions are (n, 3), in the scene frame.
+        """
+        spec = self._survey.scan(scan)
+        sensor = self._sensor
+        firing, channel = np.divmod(rays, sensor.channels)
+        firing = firing + spec.firings[0]
+        fired = sensor.begins_ns(firing) + sensor.beams.time_ns[channel]
+        gate = 2 / LIGHT_M_NS * np.array([sensor.min_range_m, sensor.max_range_m])
+        order = np.argsort(fired, kind="stable")
+        waiting = _WaitingRays(fired, order, origins, directions, gate)
+        pulses = [
+            self._received_from(number, spec, waiting, poses) for number in self._other_sensors
+        ]
+        if not pulses:
+            return ReceivedPulses(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
+        return ReceivedPulses(*map(np.concatenate, zip(*pulses, strict=True)))
+
+    def _received_from(
+        self, number: int, spec: ScanSpec, waiting: _WaitingRays, poses: CastPoses
+    ) -> ReceivedPulses:
+        """Return the foreign pulses that rays receive from sensor `number` of the survey."""
+        max_range_m = self._survey.carried[number].sensor.max_range_m
+        reach_ns = (max_range_m + self._sensor.max_range_m) / LIGHT_M_NS
+        first_ns = waiting.fired[waiting.order[0]] - reach_ns
+        last_ns = waiting.fired[waiting.order[-1]] + waiting.gate[1]
+        spots = self._spots(number, spec, (first_ns, last_ns), poses)
+        row, spot, distance, range_m = self._sightings(waiting, spots)
+        towards = spots.position[spot] - waiting.origins[row]
+        times = waiting.fired[row] + spec.start_ns
+        visible = self.caster.is_visible(
+            waiting.origins[row], towards, range_m, times, poses.actor_trajectories
+        )
+        energy = self._energy(spots, spot[visible], towards[visible], range_m[visible])
+        return ReceivedPulses(row[visible], distance[visible], energy)
+
+    def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
+        """Return the pairs of a ray and a spot in the ray's field of view while the ray waits."""
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        candidates = self._candidates(waiting, spots)
+        max_count = int(np.maximum(candidates.stop - candidates.start, 0).sum())
+        sightings = stray_loops.ReceivedSpots(
+            row=np.empty(max_count, np.int64),
+            spot=np.empty(max_count, np.int64),
+            distance=np.empty(max_count),
+            range_m=np.empty(max_count),
+        )
+        count = stray_loops.receive(
+            stray_loops.SpotPairs(candidates.spot, candidates.start, candidates.stop),
+            stray_loops.ReceivingRays(
+                waiting.order,
+                owned(waiting.fired),
+                owned(waiting.origins),
+                owned(waiting.directions),
+            ),
+            stray_loops.LitSpots(owned(spots.time), owned(spots.position)),
+            stray_loops.ReceptionLimits(
+                self._cosine, self._sensor.min_range_m, self._sensor.max_range_m
+            ),
+            sightings,
+        )
+        return sightings.first(count)
+
+    def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
+        """Return spots, and for each spot the rays that may receive the light of the spot.
+
+        The rays wait while the light of the spot arrives, and their cell looks towards the spot.
+        """
+        times = waiting.fired[waiting.order]
+        nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
+        towards = spots.position - waiting.origins[waiting.order[nearest_firing]]
+        distance = np.sqrt(products(towards.T, towards.T))
+        arrival = spots.time + distance / LIGHT_M_NS
+        first = np.searchsorted(times, arrival - waiting.gate[1] - SLACK_NS)
+        stop = np.searchsorted(times, arrival - waiting.gate[0] + SLACK_NS, side="right")
+        axes, opening = self._cells(waiting.directions[waiting.order])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slack = SLACK_NS * LIGHT_M_NS / distance  # rays of a cell start at different positions
+        spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
+        angles = arccos(np.clip(products(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
+        in_view = ~(angles > opening[cell] + slack[spot])
+        spot = spot[in_view]
+        cell = cell[in_view]
+        first_row = np.maximum(first[spot], cell * CELL_RAYS)
+        return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
+
+    def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Return the axes (c, 3) and opening angles (c,), radians, of cones of consecutive rays.
+
+        Consecutive rays look into a narrow cone, and few spots are in the cone.
+        """
+        cell_starts = np.arange(0, len(directions), CELL_RAYS)
+        sums = np.add.reduceat(directions, cell_starts, axis=0)
+        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
+        min_cosine = np.minimum.reduceat(
+            products(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
+        )
+        return axes, arccos(np.clip(min_cosine, -1, 1)) + arccos(self._cosine)
+
+    def _spots(
+        self, number: int, spec: ScanSpec, span: tuple[float, float], poses: CastPoses
+    ) -> _Spots:
+        """Cast the pulses that another sensor fires within a span of time; return their spots."""
+        sensor: Sensor = self._survey.carried[number].sensor
+        firings = np.arange(*_firings_in(sensor, self._survey.steps_each[number], span))
+        firing_starts = sensor.begins_ns(firings)
+        fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
+        origins, directions = self._fired_rays(number, spec.station, firings, firing_starts)
+        trajectories = poses.actor_trajectories
+        hits = self.caster.of_sensors[number].scan(
+            Pattern(directions, origins),
+            CastPoses(np.zeros(3), clock=Clock(fired + spec.start_ns, np.zeros(1), trajectories)),
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+        )
+        ray = hits.ray.astype(np.int64)
+        distance = hits.distance
+        triangle = hits.triangle
+        if self.caster.unseen is not None:  # spots on objects that this sensor does not see
+            seen = np.flatnonzero(~self.caster.unseen[self.surfaces.objects(triangle)])
+            ray = ray[seen]
+            distance = distance[seen]
+            triangle = triangle[seen]
+        times = fired[ray] + spec.start_ns
+        return _Spots(
+            fired[ray] + distance / LIGHT_M_NS,
+            origins[ray] + distance[:, None] * directions[ray],
+            self.surfaces.normals(triangle, times, trajectories),
+            triangle,
+            distance,
+        )
+
+    def _fired_rays(
+        self, number: int, station: int, firings: Ints, firing_starts: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return origins and directions of the rays of firings, in the scene frame: (n, 3)."""
+        carried = self._survey.carried[number]
+        path = self._survey.path
+        sensor = carried.sensor
+        directions = sensor.directions(firings)
+        origins = sensor.origins(firings)
+        origins = np.zeros_like(directions) if origins is None else origins
+        directions = turned(directions.reshape(-1, 3), carried.mount.rotation)
+        origins = turned(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
+        times = np.minimum(firing_starts + sensor.lead_ns, path.duration_ns)
+        positions, rotations = path.poses(station, times)
+        if rotations is not None:
+            inverse = np.repeat(rotations.transpose(0, 2, 1), sensor.channels, axis=0)
+            directions = into_axes(directions, inverse)
+            origins = into_axes(origins, inverse)
+        return origins + np.repeat(positions, sensor.channels, axis=0), directions
+
+    def _energy(self, spots: _Spots, spot: Indices, towards: Floats, path_m: Floats) -> Floats:
+        """Return the energies received from spots `spot` (n,), as of the receiving sensor's pulses.
+
+        `towards` (n, 3) are vectors from the receivers to the spots, of lengths `path_m` (n,).
+        """
+        surfaces = self.surfaces
+        triangle = spots.triangle[spot]
+        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / path_m
+        # The depth of air from the other sensor to the spot, and on to the receiver.
+        air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
+        kinds = surfaces.kinds(triangle)
+        table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
+        # A retro-reflector sends light back only to the sensor that sent the light.
+        share = table.reflectance[kinds] * ~table.retro[kinds]
+        return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))
+
+
+def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
+    """Return rows (k,) and integers (k,) of all half-open ranges, `first` to `stop` (n,)."""
+    counts = np.maximum(stop - first, 0)
+    row = np.repeat(np.arange(len(counts)), counts)
+    return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
+    """Return start and stop of firings with beams in a span, ns since the station's start."""
+    firings = range(sensor.firings(steps - 1)[1])
+    start_of = partial(firing_start_ns, sensor)
+    slowest_ns = float(sensor.beams.time_ns.max())
+    start = bisect_left(firings, span[0] - slowest_ns, key=start_of)
+    return start, bisect_left(firings, span[1], key=start_of)
+
+
+def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
+    """Return the number of foreign pulses for each pulse of a sensor."""
+
+    def rate(lidar: Sensor) -> float:
+        first, stop = lidar.firings(0)
+        begin, end = lidar.begins_ns(np.array([first, stop], np.int64))
+        return float((stop - first) * lidar.channels / (end - begin))
+
+    total = sum(rate(carried.sensor) for carried in survey.carried)
+    return total / rate(sensor) - 1

@@ -1,0 +1,71 @@
+"""Detection: which signals pass the threshold of a receiver, and which returns drop out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...base.arrays import Bools, Floats, Integers
+from ...sensor.noise import THRESHOLD_SIGMAS, Noise
+from ...sensor.random_numbers import Purpose, normal, uniform
+from ..returns import PulseReturns, numbers
+from .step import PulseBatch, PulseStep, Role, Setup
+
+DETECTION = Purpose(4, "noise of a return's energy")
+LOSS = Purpose(5, "whether a return is lost")
+
+
+class DetectionStep(PulseStep):
+    """Drops weak returns of waveforms, and a random share of all returns, `Noise.dropout`.
+
+    Without waveforms, `SeparationStep` drops the returns by the same function, `detected`.
+    """
+
+    role = Role.CHANGES
+    reads = "ray", "amplitude"
+    purposes = LOSS, DETECTION
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the noise can lose returns and returns are found in waveforms."""
+        return setup.noise.loses and setup.in_waveforms
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the detected returns."""
+        scan, ray = batch.keys.scan_and_number(returns.ray)
+        detected_mask = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
+        return returns.take(detected_mask)
+
+
+def detected(
+    noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
+) -> Bools:
+    """Return whether returns (n,) of some energy are detected: (n,).
+
+    `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (number in the
+    scan) and `number` (number in the ray, from 0) are the keys of the random numbers.
+
+    The signal with its normally distributed noise has to pass a threshold: at an energy equal to
+    the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a fifth of
+    the threshold 3 in 100,000.
+    """
+    detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
+    if noise.detection_range_m is not None:
+        detected_mask &= passes(noise, DETECTION, energy, scan, ray, number)
+    return detected_mask
+
+
+def passes(
+    noise: Noise,
+    purpose: Purpose,
+    energy: Floats,
+    scan: Integers,
+    ray: Integers,
+    number: ArrayLike = 0,
+) -> Bools:
+    """Return whether signals (n,) with their noise pass the threshold: (n,).
+
+    The arguments are those of `detected`; the random numbers of the noise are of a purpose.
+    """
+    signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
+    return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

@@ -1,0 +1,90 @@
+"""False alarms: noise of a receiver that passes its threshold."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Floats, Indices, Integers
+from ...base.elementary import exp, log
+from ...columns.table import CAUSES
+from ...sensor.noise import THRESHOLD_SIGMAS, Noise
+from ...sensor.optics import LIGHT_M_NS
+from ...sensor.random_numbers import Purpose, uniform
+from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+FALSE_ALARM = CAUSES.index("false alarm")
+ALARM = Purpose(20, "time until the next false alarm")
+PEAK = Purpose(21, "energy of a false alarm")
+
+
+class FalseAlarms(NamedTuple):
+    """False alarms of rays: arrays (k,)."""
+
+    row: Indices  # of the rays of the alarms
+    time_s: Floats  # since the receiver opened, seconds
+    energy: Floats  # on the scale of `Noise.threshold`
+
+
+class FalseAlarmStep(PulseStep):
+    """Adds false alarms to the returns of pulses."""
+
+    role = Role.RECEIVES
+    effects = ("False alarms",)
+    reads = "ray", "distance"
+    writes = RETURN_COLUMNS
+    causes = (FALSE_ALARM,)
+    purposes = ALARM, PEAK
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the receiver has false alarms."""
+        return setup.noise.false_alarm_hz > 0
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """Return the mean number of false alarms while the receiver waits for a pulse."""
+        return setup.noise.false_alarm_hz * setup.sensor.gate_s
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of a cause for each return, and of the rays, in bytes."""
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns of a batch and the false alarms of its rays."""
+        sensor = self.setup.sensor
+        rays = np.arange(batch.start, batch.stop)
+        scan, ray = batch.keys.scan_and_number(rays)
+        alarms = false_alarms(self.setup.noise, sensor.gate_s, scan, ray)
+        distance = sensor.min_range_m + alarms.time_s * (LIGHT_M_NS * 1e9 / 2)
+        alarm_returns = returns_without_surface(
+            returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM
+        )
+        return merged(returns, alarm_returns)
+
+
+def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> FalseAlarms:
+    """Sample false alarms of rays (n,), whose receivers are open for `gate_s` seconds.
+
+    False alarms come at the same rate at all times. Each is a maximum of the receiver's noise above
+    the threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
+    distribution (Rice 1944).
+    """
+    rows = np.arange(len(ray))
+    since_s = np.zeros(len(ray))
+    alarms: list[FalseAlarms] = []
+    while len(rows) or not alarms:
+        number = len(alarms)
+        # The time until the next false alarm is exponentially distributed.
+        uniform_numbers = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
+        in_gate = np.flatnonzero(uniform_numbers > exp(-noise.false_alarm_hz * (gate_s - since_s)))
+        rows = rows[in_gate]
+        since_s = since_s[in_gate] - log(uniform_numbers[in_gate]) / noise.false_alarm_hz
+        since_s = np.minimum(since_s, gate_s)
+        complement = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
+        peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(complement))
+        alarms.append(FalseAlarms(rows, since_s, noise.threshold * peak))
+    return FalseAlarms(*map(np.concatenate, zip(*alarms, strict=True)))

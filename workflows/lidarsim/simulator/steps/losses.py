@@ -1,0 +1,99 @@
+"""Faults of sensors: dirt on the window, and channels, packets and scans without returns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...base.arrays import Bools, Floats, owned
+from ...base.elementary import sin_cos
+from ...base.vectors import hypot
+from ...sensor import Fault
+from ...sensor.faults import PACKET
+from ..returns import PulseReturns, required
+from .step import PulseBatch, PulseStep, Role, Setup
+
+
+class DirtStep(PulseStep):
+    """Weakens light that passes a dirty part of the window."""
+
+    role = Role.CHANGES
+    effects = ("Faults",)
+    reads = "ray", "energy"
+    writes = ("energy",)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the window of the sensor has dirt."""
+        return bool(setup.faults("dirt"))
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return hits with the energies behind the dirty window; replace the hits of the batch."""
+        sensor = self.setup.sensor
+        beams = np.arange(batch.start, batch.stop)
+        transmission = np.ones(len(beams))
+        x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
+        for fault in self.setup.faults("dirt").values():
+            in_spot = _in_spot(fault, x, y, z)
+            if fault.from_s or fault.to_s is not None:
+                in_spot &= fault.during(batch.firings.times(beams))
+            transmission[in_spot] *= required(fault.transmission)
+        transmission = transmission.repeat(batch.subrays_per_beam)
+        hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
+        batch.hits = hits
+        if batch.air is not None:
+            energy = required(batch.air.energy) * transmission.take(batch.air.ray)
+            batch.air = batch.air._replace(energy=energy)
+        return hits
+
+
+def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
+    """Return whether unit directions x, y, z (n,), sensor frame, pass a fault's dirt: (n,)."""
+    begin, end = fault.azimuth_deg or (0, 360)
+    half = ((end - begin) % 360 or 360) / 2
+    lowest, highest = fault.elevation_deg or (-90, 90)
+    sin, cos = sin_cos(np.radians((begin + half, half, lowest, highest)))
+    # Computing the angles of beams would take long; sines of a full circle are not exact.
+    in_spot = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
+    in_spot &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
+    return in_spot
+
+
+class LossStep(PulseStep):
+    """Drops returns of dead channels, lost packets, and scans that a frozen sensor has not made."""
+
+    role = Role.CHANGES
+    effects = ("Faults",)
+    reads = ("ray",)
+    purposes = (PACKET,)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the sensor has dead channels, lost packets or frozen sweeps."""
+        return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns that are not lost."""
+        from . import fault_loops  # not before: numba takes half a second to import
+
+        firings = batch.firings
+        spec = batch.firings.spec
+        seed = self.setup.noise.seed
+        # First scans of the sweep that a frozen sensor sends again, and of the sweep it replaces.
+        first_sent_again, first_replaced = spec.repeats or (spec.ahead, 0)
+        if spec.ahead != first_sent_again - first_replaced:  # the sweep sent again has no such scan
+            return returns.take(np.zeros(0, np.intp))
+        faults = self.setup.faults("dead_channels", "dropped_packets")
+        spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
+        lost_channels = np.zeros((len(faults), firings.sensor.channels), np.bool_)
+        lost_firings = np.zeros((len(faults), len(firings.numbers)), np.bool_)
+        for row, (fault_number, fault) in enumerate(faults.items()):
+            if fault.packet is None:
+                lost_channels[row, required(fault.channels)] = True
+            else:
+                lost_firings[row] = fault.drops(firings.numbers, seed, spec.station, fault_number)
+        rows = np.empty(len(returns.ray), np.int64)
+        ray = owned(returns.ray, np.int64)
+        count = fault_loops.remaining(
+            ray, firings.times(ray), spans, lost_firings, lost_channels, rows
+        )
+        return returns if count == len(rows) else returns.take(rows[:count])

@@ -1,0 +1,596 @@
+"""Media within closed surfaces: refraction and attenuation, and leaves that light meets by chance.
+
+Directions follow Snell's law, energies Fresnel's equations, Beer and Lambert's law, and the beam's
+widening: ray differentials (Igehy 1999) say how large an area a cone of light is at its end. Leaves
+are met after an exponentially distributed optical depth (Ross 1981).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern, any_axes
+
+from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
+from ...base.elementary import exp, log
+from ...base.elementary_scalars import log_of
+from ...base.errors import LidarError
+from ...base.vectors import applied, products
+from ...scene.scene import Scene
+from ...sensor.leaves import brightness, projection
+from ...sensor.materials import MaterialTable, fresnel
+from ...sensor.random_numbers import Purpose
+from ..casting.actor_trajectories import ActorTrajectories
+from ..casting.motion import CastPoses, Clock
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..returns import selected
+
+LEAF = Purpose(30, "depth of leaves that light gets through")
+CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
+MAX_MEDIA = 8  # media around a point that are stored
+MAX_PROBES = 256  # surfaces that a search for the media around a point passes
+UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of the search; parallel to no edge of usual models
+
+# Random bits of rays for a purpose: (n,).
+Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
+
+
+class Rays(NamedTuple):
+    """Light of sub-rays at its origin, and the trajectories of actors."""
+
+    origins: Floats  # (n, 3): metres, scene frame
+    directions: Floats  # (n, 3): unit vectors, scene frame
+    times: Floats  # (n,): nanoseconds, for the poses of actors
+    actor_trajectories: ActorTrajectories
+
+
+@dataclass
+class MediaStack:
+    """Media around the light of sub-rays, the innermost first: (n, MAX_MEDIA); -1 for no medium."""
+
+    kinds: Ints32  # of the surfaces of the media
+    triangles: Ints32  # through which the light entered
+
+    @classmethod
+    def none(cls, count: int) -> MediaStack:
+        """Return the stacks of light in the air."""
+        return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
+
+    def __getitem__(self, rows: Integers) -> MediaStack:
+        """Return the stacks of selected sub-rays."""
+        return MediaStack(self.kinds[rows], self.triangles[rows])
+
+    def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium within the media around light: a medium for each of `rows`.
+
+        A full stack loses its outermost medium.
+        """
+        for table, values in ((self.kinds, kinds), (self.triangles, triangles)):
+            table[rows, 1:] = table[rows, :-1]
+            table[rows, 0] = values
+
+    def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium around the media of each of `rows`; full stacks stay as they are."""
+        depth = (self.kinds[rows] >= 0).sum(axis=1)
+        free = depth < MAX_MEDIA
+        self.kinds[rows[free], depth[free]] = kinds[free]
+        self.triangles[rows[free], depth[free]] = triangles[free]
+
+    def leave(self, rows: Indices, kinds: Ints32) -> Bools:
+        """Remove a medium from the stacks of `rows`; return False for rows without the medium."""
+        matches = self.kinds[rows] == kinds[:, None]
+        in_stack = matches.any(axis=1)
+        rows = rows[in_stack]
+        depth = matches[in_stack].argmax(axis=1)
+        column = np.arange(MAX_MEDIA)
+        column = column + (column >= depth[:, None])
+        for table in (self.kinds, self.triangles):
+            padded = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
+            table[rows] = np.take_along_axis(padded, column, axis=1)
+        return in_stack
+
+
+@dataclass
+class RayDifferentials:
+    """Refraction, attenuation and widening of the light of sub-rays: arrays (n, …)."""
+
+    index: Floats  # (n,): refractive index at the light's position
+    initial_index: Floats  # (n,): refractive index at the light's origin
+    attenuation_depth: Floats  # (n,): optical depth by attenuation, one way
+    position_derivatives: Floats  # (n, 2, 3): of the position, by the initial direction
+    direction_derivatives: Floats  # (n, 2, 3): of the direction, by the initial direction
+
+    @classmethod
+    def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
+        """Return the differentials of light at its origin, from directions (n, 3)."""
+        derivatives = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
+        zeros = np.zeros(len(derivatives))
+        return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
+
+    def __getitem__(self, rows: Integers) -> RayDifferentials:
+        """Return the differentials of selected sub-rays."""
+        return RayDifferentials(*selected(vars(self).values(), rows))
+
+    def advance(self, step: Floats, attenuation: Floats) -> None:
+        """Move the light straight on by steps (n,), metres, through an attenuation (n,), 1/m."""
+        shift = step[:, None, None] * self.direction_derivatives
+        self.position_derivatives = self.position_derivatives + shift
+        self.attenuation_depth = self.attenuation_depth + attenuation * step
+
+    def energy_factor(self, directions: Floats, distance: Floats, extinction: float) -> Floats:
+        """Return the energy relative to light on a straight path of `distance` in the air: (n,).
+
+        Light that is scattered at the end of a path reaches the receiver in proportion to the
+        receiver's area over the area of the cone of scattered light there. By reciprocity, the
+        latter is the area of the cone of the outgoing light, times the square of the refractive
+        index.
+        """
+        first_axis, second_axis = self.position_derivatives.transpose(1, 2, 0)
+        a, b, c = directions.T
+        x, y, z = first_axis
+        u, v, w = second_axis
+        area = np.abs((y * w - z * v) * a + (z * u - x * w) * b + (x * v - y * u) * c)
+        area *= (self.index / self.initial_index) ** 2
+        spreading = distance**2 / np.maximum(area, 1e-12)
+        # Beyond the limit, the factor of the air itself is 0.
+        exponent = np.minimum(2 * (extinction * distance - self.attenuation_depth), 700.0)
+        return np.asarray(spreading * exp(exponent))
+
+    def deflect(
+        self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools, index: Floats
+    ) -> None:
+        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3).
+
+        `index` (n,) is the refractive index behind the surfaces, for light that is not mirrored.
+        """
+        incoming_cosine = _away_from_zero(products(incoming.T, normals.T))
+        outgoing_cosine = _away_from_zero(products(outgoing.T, normals.T))
+        # Neighbouring rays meet the plane of the surface before or behind the central ray.
+        shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
+        self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
+        ratio = np.where(mirrored, 1.0, self.index / index)
+        bend = np.where(mirrored, 2.0, ratio - ratio**2 * incoming_cosine / outgoing_cosine)
+        slope = bend[:, None] * applied(self.direction_derivatives, normals)
+        derivatives = ratio[:, None, None] * self.direction_derivatives
+        self.direction_derivatives = derivatives - slope[..., None] * normals[:, None]
+        self.index = np.where(mirrored, self.index, index)
+
+
+class Media:
+    """The media of a scene.
+
+    `table` are the materials at the wavelength of the light, and `air_extinction` is the extinction
+    of the scene's air, 1/m.
+    """
+
+    def __init__(
+        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air_extinction: float = 0.0
+    ) -> None:
+        self._surfaces = surfaces
+        self.air_extinction = air_extinction
+        self.filled = table.leafy | table.refracts  # surfaces that enclose a medium
+        self.leafy = bool(table.leafy.any())
+        self.refracts = bool(table.refracts.any())
+        self.mirrors = table.refracts & (table.specular > 0)  # surfaces that refract and mirror
+        self.grids = surfaces.grids
+        self.instances = surfaces.instances
+        owners = surfaces.material_kinds.object
+        # (kinds + 1,): whether the leaves are in grids of voxels; the last entry is of kind -1.
+        self.gridded = np.append(scene.has_voxels[owners], False)
+        self._angles = table.leaf_angles
+        # The value of the kind -1, no surface, is 0: the last entry.
+        self._area, self._index, self._attenuation = (
+            np.append(values, 0.0)
+            for values in (table.leaf_area, table.refractive_index, table.attenuation)
+        )
+        self._angle = np.append(table.leaf_angle, 0)
+        closed, self._inwards = surfaces.solids
+        for number in np.flatnonzero(table.leafy).tolist():
+            if not closed[number]:
+                raise LidarError(
+                    f"materials: {surfaces.material_kinds.describe(number)} has a "
+                    "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
+                    "or a sphere."
+                )
+        # Boxes in which sensors may be within media. A surface of water that is an open sheet has
+        # water below at any depth; an actor that holds a medium may be anywhere.
+        is_static = owners < len(scene.object_bounds)
+        static_kinds = np.flatnonzero(self.filled & is_static)
+        bounds = scene.object_bounds[owners[static_kinds]]
+        bounds[~closed[static_kinds], 0, 2] = -np.inf
+        if self.filled[~is_static].any():
+            bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
+        self._bounds = bounds
+        for angle in self._angles if self.leafy else ():
+            projection(angle, np.ones(1))  # computes and caches the table of the angle
+
+    def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
+        """Return whether light enters bodies: (n,); `cosines` are between normals and light."""
+        return np.asarray((cosines < 0) != self._inwards[kinds])
+
+    def stack_at(self, caster: SceneCaster, light: Rays) -> MediaStack:
+        """Return the media around the origins of light."""
+        stack = MediaStack.none(len(light.origins))
+        in_bounds = np.zeros(len(light.origins), np.bool_)
+        if not len(in_bounds):
+            return stack
+        lower = light.origins.min(axis=0)
+        upper = light.origins.max(axis=0)
+        overlapping = ((self._bounds[:, 0] <= upper) & (self._bounds[:, 1] >= lower)).all(axis=1)
+        for box_min, box_max in self._bounds[overlapping]:
+            in_bounds |= ((light.origins >= box_min) & (light.origins <= box_max)).all(axis=1)
+        rows = np.flatnonzero(in_bounds)
+        if not len(rows):
+            return stack
+        # Most rays start at the same position and time as the ray before.
+        origins = light.origins[rows]
+        times = light.times[rows]
+        first_of_run = np.ones(len(rows), np.bool_)
+        first_of_run[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
+        searched = self._search(
+            caster, origins[first_of_run], times[first_of_run], light.actor_trajectories
+        )
+        search_rows = np.cumsum(first_of_run) - 1
+        stack.kinds[rows] = searched.kinds[search_rows]
+        stack.triangles[rows] = searched.triangles[search_rows]
+        return stack
+
+    def _search(
+        self,
+        caster: SceneCaster,
+        origins: Floats,
+        times: Floats,
+        actor_trajectories: ActorTrajectories,
+    ) -> MediaStack:
+        """Find the media around origins (n, 3) by casting rays upwards.
+
+        A medium that a ray leaves without having entered it is around the origin of the ray.
+        """
+        surrounding = MediaStack.none(len(origins))
+        entered = MediaStack.none(len(origins))
+        up = UPWARDS / np.sqrt((UPWARDS**2).sum())
+        rows = np.arange(len(origins))
+        skip_m = caster.clear_m / up[2]
+        for _ in range(MAX_PROBES):
+            if not len(rows):
+                break
+            light = Pattern(np.broadcast_to(up, origins.shape), origins)
+            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            hits = caster.scan(light, poses)
+            rows = rows[hits.ray]
+            times = times[hits.ray]
+            origins = origins[hits.ray] + (hits.distance[:, None] + skip_m) * up
+            normals = self._surfaces.normals(hits.triangle, times, actor_trajectories)
+            cosines = products(normals.T, up[:, None])
+            self._cross_probes(entered, surrounding, rows, hits.triangle, cosines)
+        return surrounding
+
+    def _cross_probes(
+        self,
+        entered: MediaStack,
+        surrounding: MediaStack,
+        rows: Indices,
+        triangles: Ints32,
+        cosines: Floats,
+    ) -> None:
+        """Update the stacks of a search for probes `rows` that cross triangles."""
+        kinds = self._surfaces.kinds(triangles)
+        at_medium = self.filled[kinds]
+        entering = self.enters(kinds, cosines) & at_medium
+        entered.enter(rows[entering], kinds[entering], triangles[entering])
+        leaving = np.flatnonzero(at_medium & ~entering)
+        was_entered = entered.leave(rows[leaving], kinds[leaving])
+        leaving = leaving[~was_entered]
+        surrounding.surround(rows[leaving], kinds[leaving], triangles[leaving])
+
+    def initial_state(
+        self, caster: SceneCaster, light: Rays, depths: Floats | None
+    ) -> LightInMedia:
+        """Return the state of light at its origin; `depths` (n,) are optical depths to a leaf."""
+        stack = self.stack_at(caster, light)
+        differentials = (
+            RayDifferentials.from_directions(light.directions, self.index(stack))
+            if self.refracts
+            else None
+        )
+        return LightInMedia(self, stack, differentials, depths)
+
+    def index(self, stack: MediaStack) -> Floats:
+        """Return the refractive index of the innermost medium with an index: (n,)."""
+        indices = self._index[stack.kinds]
+        return _first_masked(indices, indices > 0, 1.0)
+
+    def attenuation(self, stack: MediaStack) -> Floats:
+        """Return the extinction, 1/m: (n,): of the innermost refracting medium, or of the air."""
+        refracts = self._index[stack.kinds] > 0
+        return _first_masked(self._attenuation[stack.kinds], refracts, self.air_extinction)
+
+    def behind(
+        self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
+    ) -> MediaStack:
+        """Return the media behind surfaces (n,); `cosines` are between normals and light."""
+        behind = stack[np.arange(len(kinds))]
+        enters = self.enters(kinds, cosines)
+        filled = self.filled[kinds]
+        entering = np.flatnonzero(filled & enters)
+        leaving = np.flatnonzero(filled & ~enters)
+        behind.enter(entering, kinds[entering], triangles[entering])
+        behind.leave(leaving, kinds[leaving])
+        return behind
+
+    def density(self, stack: MediaStack, upright: Floats) -> Floats:
+        """Return the optical depth of leaves per metre, in each medium around light.
+
+        `upright` (n,) are cosines between the light and the vertical, 0 to 1. Returns
+        (n, MAX_MEDIA); for grids of voxels, values are for a leaf area density of 1 m²/m³.
+        """
+        density = self._area[stack.kinds]
+        if density.any():
+            for number, angle in enumerate(self._angles):
+                projected_area = projection(angle, upright)[:, None]
+                density *= np.where(self._angle[stack.kinds] == number, projected_area, 1)
+        return density
+
+    def leaf_cosines(self, kinds: Ints32, upright: Floats) -> Floats:
+        """Return the mean cosine between light and the normals of the leaves that it hits: (n,).
+
+        `kinds` (n,) are kinds of crowns (closed surfaces with leaves), and `upright` (n,) cosines
+        between the light and the vertical, 0 to 1.
+        """
+        cosines = np.ones(len(kinds))
+        for number, angle in enumerate(self._angles):
+            cosines = np.where(self._angle[kinds] == number, brightness(angle, upright), cosines)
+        return cosines
+
+
+class LightInGrids(NamedTuple):
+    """Light among all that passes grids of voxels: arrays (k,)."""
+
+    rows: Indices  # of the light
+    metres: Floats  # to the leaf that the light meets; inf if there is no leaf
+    remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
+
+
+class Refraction(NamedTuple):
+    """Light behind surfaces: arrays (n,), vectors (n, 3)."""
+
+    directions: Floats
+    # Share of the light, on one way: transmitted, or mirrored where light is reflected.
+    shares: Floats | float
+    totally_reflected: Bools  # with directions as if there were no surface
+
+
+class Leaves(NamedTuple):
+    """Leaves that light meets: arrays (k,)."""
+
+    rows: Indices  # of the light
+    metres: Floats  # from the start of the span to the leaf
+    triangles: Ints32  # through which the light entered the crown
+    cosines: Floats  # mean cosine between light and leaves
+
+
+@dataclass
+class LightInMedia:
+    """State of light in media: stack of media, refraction, and optical depth to a leaf."""
+
+    media: Media
+    stack: MediaStack
+    differentials: RayDifferentials | None  # None if no medium refracts
+    remaining_depth: Floats | None  # (n,): optical depth to a leaf; None if there are no leaves
+
+    def __getitem__(self, rows: Integers) -> LightInMedia:
+        """Return the state of selected sub-rays."""
+        return LightInMedia(
+            self.media, *selected((self.stack, self.differentials, self.remaining_depth), rows)
+        )
+
+    @property
+    def index(self) -> Floats | float:
+        """Refractive index at the position of the light."""
+        return 1.0 if self.differentials is None else self.differentials.index
+
+    def optical(self, step: Floats) -> Floats:
+        """Return the optical paths of steps (n,), metres."""
+        return step if self.differentials is None else step * self.differentials.index
+
+    def meet_leaves(
+        self,
+        origins: Floats,
+        directions: Floats,
+        starts_m: Floats,
+        ends_m: Floats,
+        ray: Ints,
+        draw: Draw,
+    ) -> Leaves:
+        """Return the leaves that light meets between distances from its origins.
+
+        Distances `starts_m` and `ends_m` are metres (n,), `ray` are numbers of sub-rays (n,), and
+        `draw` draws random bits that choose among crowns that overlap. Reduces `remaining_depth`.
+        """
+        if self.remaining_depth is None:
+            no_rows = np.zeros(0, np.intp)
+            return Leaves(no_rows, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
+        upright = np.minimum(np.abs(directions[:, 2]), 1)
+        density = self.media.density(self.stack, upright)
+        length = ends_m - starts_m
+        passage = None
+        if self.media.grids is not None:
+            starts = origins + starts_m[:, None] * directions
+            passage = self._pass_grids(starts, directions, length, density)
+        cumulative = np.cumsum(density, axis=1)
+        rows, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
+        layer = _crown_layers(draw(CROWN, ray[rows]), cumulative[rows])
+        cosines = self.media.leaf_cosines(self.stack.kinds[rows, layer], upright[rows])
+        return Leaves(rows, metres, self.stack.triangles[rows, layer], cosines)
+
+    def _advance_to_leaves(
+        self, density: Floats, length: Floats, passage: LightInGrids | None
+    ) -> tuple[Indices, Floats]:
+        """Reduce the remaining depth over lengths (n,), metres, of a density (n,), 1/m.
+
+        Returns the rows of light that meets a leaf, and the metres to the leaf.
+        """
+        assert self.remaining_depth is not None
+        depth = density * length
+        if passage is not None:
+            in_grids = passage.rows
+            depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
+        rows = np.flatnonzero(depth > self.remaining_depth)
+        metres = self.remaining_depth[rows] / density[rows]
+        if passage is not None:
+            metres_in_grids = np.full(len(depth), np.nan)
+            metres_in_grids[passage.rows] = passage.metres
+            metres = np.where(np.isnan(metres_in_grids[rows]), metres, metres_in_grids[rows])
+        self.remaining_depth = self.remaining_depth - depth
+        return rows, metres
+
+    def _pass_grids(
+        self, starts: Floats, directions: Floats, length: Floats, density: Floats
+    ) -> LightInGrids:
+        """Follow light through grids of voxels, and write their densities into `density`.
+
+        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. Before, `density`
+        (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area density of 1 m²/m³;
+        afterwards, for the voxel in which light meets a leaf, or 0. Other media keep their values.
+        """
+        grids = self.media.grids
+        stack = self.stack
+        assert grids is not None and self.remaining_depth is not None
+        gridded = self.media.gridded[stack.kinds]
+        rows = np.flatnonzero(gridded.any(axis=1))
+        gridded = gridded[rows]
+        # Columns of the stack: grids first, as many columns as the most grids around any light.
+        grid_layers = np.argsort(~gridded, axis=1, kind="stable")
+        grid_layers = grid_layers[:, : gridded.sum(axis=1).max(initial=1)]
+        is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
+        triangles = np.take_along_axis(stack.triangles[rows], grid_layers, axis=1)
+        media_density = np.where(gridded, 0, density[rows])
+        metres, remaining_depth, grid_density = grids.through(
+            np.where(is_grid, self.media.instances(triangles), -1),
+            starts[rows],
+            directions[rows],
+            np.take_along_axis(density[rows], grid_layers, axis=1),
+            np.cumsum(media_density, axis=1)[:, -1],
+            length[rows],
+            self.remaining_depth[rows],
+        )
+        layer_density = np.where(
+            is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
+        )
+        np.put_along_axis(media_density, grid_layers, layer_density, 1)
+        density[rows] = media_density
+        return LightInGrids(rows, metres, remaining_depth)
+
+    def advance(self, step: Floats) -> None:
+        """Move the light straight on by steps (n,), metres."""
+        if self.differentials is not None:
+            self.differentials.advance(step, self.media.attenuation(self.stack))
+
+    def energy_factor(self, directions: Floats, distance: Floats) -> Floats | float:
+        """Return the energy relative to light on a straight path of `distance` in the air: (n,)."""
+        if self.differentials is None:
+            return 1.0
+        return self.differentials.energy_factor(directions, distance, self.media.air_extinction)
+
+    def cross(
+        self,
+        kinds: Ints32,
+        triangles: Ints32,
+        directions: Floats,
+        normals: Floats,
+        cosines: Floats,
+        reflected: Bools,
+    ) -> Refraction:
+        """Transmit light through surfaces (n,), or reflect the light of the mask `reflected`.
+
+        `cosines` are between normals and directions. Updates the stacks of media: transmitted light
+        enters or leaves a medium; reflected and totally reflected light stays in its media.
+        Reflected light keeps its direction here. At surfaces of `Media.mirrors`, mirrored light has
+        rows of its own in `reflected`, so totally reflected light in other rows has the share 0.
+        """
+        stack_before = self.stack
+        self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
+        if self.differentials is None:
+            return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
+        ratio = self.media.index(self.stack) / self.differentials.index
+        refraction = refracted(directions, normals, cosines, ratio)
+        keeps_media = refraction.totally_reflected | reflected
+        self.stack.kinds[keeps_media] = stack_before.kinds[keeps_media]
+        self.stack.triangles[keeps_media] = stack_before.triangles[keeps_media]
+        mirrors = self.media.mirrors[kinds]
+        shares = np.where(refraction.totally_reflected & mirrors, 0.0, refraction.shares)
+        shares = np.where(reflected, np.where(mirrors, 1 - shares, 1.0), shares)
+        outgoing = np.where(reflected[:, None], directions, refraction.directions)
+        return Refraction(outgoing, shares, refraction.totally_reflected)
+
+    def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
+        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3)."""
+        if self.differentials is not None:
+            self.differentials.deflect(
+                incoming, outgoing, normals, mirrored, self.media.index(self.stack)
+            )
+
+
+def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
+    """Refract light at surfaces by Snell's law; `ratio` (n,) is the index behind over before.
+
+    Totally reflected light has the direction and share that it would have without a surface.
+    """
+    cosine = np.maximum(np.abs(cosines), 1e-9)
+    squared_cosine = 1 - (1 - cosine**2) / ratio**2
+    bends = ratio != 1
+    totally_reflected = bends & (squared_cosine <= 0)
+    bends &= ~totally_reflected
+    facing = np.where(cosines < 0, 1.0, -1.0)[:, None] * normals
+    root = np.sqrt(np.maximum(squared_cosine, 0))
+    bent = directions / ratio[:, None] + (cosine / ratio - root)[:, None] * facing
+    transmitted = np.where(bends, 1 - fresnel(cosine, ratio), 1.0)
+    outgoing = np.where(bends[:, None], bent, directions)
+    return Refraction(outgoing, transmitted, totally_reflected)
+
+
+def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
+    """Choose the crown of each leaf in proportion to the crowns' densities, by random bits (k,).
+
+    `cumulative` (k, MAX_MEDIA) are cumulative sums of the densities of the media in the stacks.
+    Returns columns of `MediaStack`, (k,).
+    """
+    share = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
+
+
+def depths(bits: NDArray[np.uint64]) -> Floats:
+    """Return exponentially distributed numbers of mean 1, from random bits: (n,).
+
+    The logarithm is computed from the binary exponent and a table of 32,768 logarithms: fast.
+    """
+    share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    mantissa, exponent = np.frexp(share)
+    row = ((mantissa - 0.5) * (2 * len(_logs()))).astype(np.intp)
+    return np.asarray(_logs()[row] - exponent * float(np.float32(log_of(2.0))))
+
+
+@cache
+def _logs() -> Floats:
+    """Return negative logarithms of equal steps from 1/2 to 1, in single precision."""
+    steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
+    return -log(steps).astype(np.float32).astype(np.float64)
+
+
+def _away_from_zero(cosine: Floats) -> Floats:
+    """Replace cosines close to 0 by 1e-9."""
+    return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
+
+
+def _first_masked(values: Floats, mask: AnyArray, default: float) -> Floats:
+    """Return the first value of each row that is in the mask, or a default: (n,)."""
+    column = mask.argmax(axis=1)
+    rows = np.arange(len(values))
+    return np.where(mask[rows, column], values[rows, column], default)

@@ -1,0 +1,692 @@
+"""Paths of light: casts sub-rays, and follows the light through glass and off mirrors.
+
+A surface that mirrors, transmits and scatters light divides it; the parts continue separately.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
+from ...base.vectors import into_axes, products
+from ...columns.table import CAUSES, COLOURS
+from ...scene.colours import luminance
+from ...sensor.random_numbers import Purpose, raw
+from ...sensor.weather import FAINTEST
+from ..casting.actor_trajectories import ActorTrajectories
+from ..casting.motion import CastPoses, Clock, along_rings
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces, light_of
+from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
+from .doppler import range_rates_of_origins, velocities_of_ends
+from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+GHOST = CAUSES.index("ghost")
+MAX_PASSES = 16  # surfaces that light passes before it is dropped
+MAX_LEAFY_PASSES = 64  # if there are crowns: light passes the surface of a crown twice
+MAX_REFLECTIONS = 2  # of light, which a mirror may divide each time
+
+
+@dataclass
+class LightPaths:
+    """Straight pieces of the paths of sub-rays: arrays (n,), vectors (n, 3) in the scene frame.
+
+    The first piece starts at the sensor, each later piece just behind a surface that transmits or
+    mirrors the light.
+    """
+
+    ray: Ints  # number of the sub-ray, from 0 at the start of the batch
+    times: Floats  # firing times, nanoseconds since the survey's start; 0 without actors
+    origins: Floats  # starts of the pieces, metres
+    directions: Floats  # unit vectors
+    # Share of the energy that the earlier surfaces pass, on the way out and back: 1 at the sensor.
+    share: Floats
+    optical_start: Floats  # optical path from the sensor to the origins, metres
+    # (n, 3, 3): product of the reflections so far, which turns directions as they were fired into
+    # directions of the pieces. None if no light is reflected, and for beams of a single sub-ray.
+    mirror_matrices: Floats | None = None
+    mirrored: Bytes | None = None  # number of reflections so far, if there are mirrors
+    in_media: LightInMedia | None = None  # if there are media
+    # Growth of the optical path by the motions of the sensor and of the earlier surfaces, m/s, as
+    # if the next surface stood still; None if no column stores velocities.
+    range_rate: Floats | None = None
+
+    def take(self, rows: Integers) -> LightPaths:
+        """Return the light of selected rows."""
+        return LightPaths(*selected(vars(self).values(), rows))
+
+    def optical_end(self, step_m: Floats) -> Floats:
+        """Return the optical paths from the sensor to distances (n,) from the origins, metres."""
+        return self.optical_start + (
+            step_m if self.in_media is None else self.in_media.optical(step_m)
+        )
+
+    @property
+    def index(self) -> Floats | float:
+        """Refractive index around the light (n,), or 1.0 without media."""
+        return 1.0 if self.in_media is None else self.in_media.index
+
+
+class CastLight(NamedTuple):
+    """Light that hits a surface, and the surfaces that it hits: arrays (n,)."""
+
+    light: LightPaths
+    # Leaves are met from here on, metres from the origin: from the sensor's smallest range, or
+    # from the surface that the light left, which is at or below 0.
+    start_m: Floats
+    step_m: Floats  # distance of the hit from the origin, metres
+    triangle: Ints32  # number of the triangle, see `SceneCaster`
+
+
+class SurfaceHits(NamedTuple):
+    """Hits of light, one for each row of the light: arrays (n,), vectors (n, 3)."""
+
+    step_m: Floats  # metres from the origin of the last piece of the path
+    triangle: Ints32  # of a leaf: where the light entered the crown
+    distance: Floats  # optical path from the sensor, metres
+    colour: UInts32 | None  # packed, see `Surfaces.colours`; None if not needed
+    normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
+    cosines: Floats  # of the angles between normals and directions, of either sign
+    kinds: Ints32  # kinds of surfaces: rows of the table of materials
+    energy: Floats  # that the sensor receives, in the unit of `Surfaces.energy`
+    film: Bools | None  # whether there may be a film of water; None if no surface is wet
+    leaves: Indices  # (l,): rows where light meets a leaf within a crown
+    velocities: Floats  # of the surfaces; (0, 3) if they are not needed
+
+
+class VisibleHits(NamedTuple):
+    """The k hits that the sensor may see, and where the light of all n hits continues."""
+
+    hits: PulseReturns  # k rows; all hits, unless there are media
+    normals: Floats  # (k, 3): of the hits, mirrored back into the directions as fired
+    transmits: Bools  # (n,): whether light continues through the surface
+    mirrors: Bools  # (n,): whether the surface mirrors a part of the light
+
+
+class Crossings(NamedTuple):
+    """Surfaces that transmit or mirror light: arrays (n,), vectors (n, 3).
+
+    A surface that does both is in two rows.
+    """
+
+    step_m: Floats  # metres from the origin
+    distance: Floats  # optical path from the sensor, metres
+    triangle: Ints32
+    normals: Floats
+    cosines: Floats  # of the angles between normals and directions, of either sign
+    reflected: Bools  # whether the light of the row is mirrored, else transmitted
+    # Velocities of the surfaces, m/s: a moving surface that bends light changes the range rate.
+    velocities: Floats | None
+
+
+class OnwardRows(NamedTuple):
+    """Rows of light that continues: arrays (k,); a row occurs twice where the light divides."""
+
+    rows: Indices
+    reflected: Bools  # whether the light of the row is mirrored, else transmitted
+    share: Floats  # as `LightPaths.share`, behind the surface
+
+
+class Deflection(NamedTuple):
+    """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
+
+    directions: Floats
+    share: Floats  # as `LightPaths.share`, behind the surface
+    mirrored: Bools  # whether light is mirrored, also by total reflection
+    twice_normals: Floats  # normals times 2 where light is mirrored, else 0
+
+
+class OnwardLight(NamedTuple):
+    """Light behind the surfaces of its last hits, before its next cast: arrays (n,)."""
+
+    light: LightPaths
+    start_m: Floats  # positions of those surfaces along the light, metres, at or below 0
+    path: Pattern  # the rays to cast: origins and directions of `light`
+
+
+class CastStep(PulseStep):
+    """Casts the sub-rays, and makes hits where their light meets surfaces and leaves.
+
+    Light that a surface transmits or mirrors is cast again from the surface, and makes more hits.
+    """
+
+    role = Role.FRAME
+    effects = (
+        "Ghosts",
+        "Wet ground",
+        "Gaussian and oval beams",
+        "Refraction",
+        "Vegetation",
+        "Rays without a return",
+    )
+    writes = *RETURN_COLUMNS, "velocity"
+    causes = (GHOST,)
+    purposes = LEAF, CROWN
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        survey = setup.survey
+        sensor = setup.sensor
+        self._light = light_of(survey, sensor)
+        self._seed = setup.noise.seed
+        table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
+        filled = table.leafy.any() or table.refracts.any()
+        air = self._light.extinction
+        self._media = Media(setup.scene, surfaces, table, air) if filled else None
+        # Light that can return no more energy than this is not cast again, if there are mirrors.
+        self._faintest = FAINTEST * setup.noise.threshold
+        white = np.ones(len(table.reflectance))
+        # Largest energy that a kind of surface sends back from 10 m.
+        self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
+        shown = any(column.name in COLOURS for column in survey.stored_columns)
+        self._coloured = shown or surfaces.materials.textured
+        # Whether the origins of rays are needed, and not only their directions.
+        self._needs_origins = (
+            self._coloured
+            or setup.has_velocities
+            or setup.has_onward_light
+            or self._media is not None
+        )
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return the step for a scene in which instances have moved; media have new bounds."""
+        if self._media is not None:
+            return super().moved(setup, surfaces)
+        return self.repointed(setup, surfaces)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if a ray may have several returns, or no return."""
+        return setup.has_several_returns
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """Return the number of ghosts that a pulse can have, an upper bound of the mean number."""
+        return MAX_REFLECTIONS * setup.has_mirrors
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the bytes of sub-rays and hits, more if light continues or is bent.
+
+        The bytes are those while rays are cast and while returns are counted, see `Memory`.
+        """
+        subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
+        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
+        return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the hits of the sub-rays of a batch; `returns` are not used."""
+        cast, rays = self._cast_first(batch)
+        first_light = cast.light
+        parts: list[VisibleHits] = []
+        for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
+            surface_hits = self._surface_hits(cast, batch)
+            parts.append(self._visible_hits(cast.light, surface_hits))
+            onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
+            if onward is None:
+                break
+            cast = self._cast_again(onward, batch.subray_poses.actor_trajectories)
+        return self._join(batch, parts, rays, first_light)
+
+    @property
+    def _leafy(self) -> bool:
+        """Whether there are crowns."""
+        return self._media is not None and self._media.leafy
+
+    @property
+    def _reach_m(self) -> float:
+        """Greatest length of a cast ray, metres; inf if there are crowns.
+
+        The path through a crown ends at the surface on its far side, at any distance.
+        """
+        return np.inf if self._leafy else self.setup.sensor.max_range_m
+
+    def _draw(self, batch: PulseBatch) -> Draw:
+        """Return the function `draw(purpose, ray)` of random bits of sub-rays `ray` (n,): (n,)."""
+
+        def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
+            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
+            return raw(self._seed, purpose, scan, number, ray % batch.subrays_per_beam)
+
+        return draw
+
+    # -- the first cast ----------------------------------------------------------------------
+
+    def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
+        """Cast the sub-rays of a batch; return the light that hits a surface, and all rays.
+
+        The rays are origins, if they are needed, and unit directions of all sub-rays of the batch,
+        in the scene frame: (6, s) or (3, s). The light has a row for each of the sub-rays that hit.
+        """
+        poses = batch.subray_poses
+        first, stop = batch.window
+        nearest_m = self.setup.sensor.min_range_m
+        rows = 6 if self._needs_origins or poses.actor_trajectories else 3
+        rays = np.empty((rows, stop - first))
+        hits = self.caster.scan(
+            batch.beams,
+            poses,
+            window=batch.window,
+            t_min=nearest_m,
+            t_max=self._reach_m,
+            room=rays,
+        )
+        light = self._light_of_rays(hits.ray.astype(np.int64), rays, batch)
+        start_m = np.full(len(light.ray), nearest_m)
+        return CastLight(light, start_m, hits.distance, hits.triangle), rays
+
+    def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
+        """Return the light at the sensor of sub-rays `ray` (n,) of a batch that hit a surface.
+
+        `rays` are all sub-rays of the batch, see `_cast_first`.
+        """
+        setup = self.setup
+        poses = batch.subray_poses
+        directions = rays[-3:].take(ray, axis=1).T
+        origins = np.broadcast_to(np.zeros(3), directions.shape)
+        if self._needs_origins:
+            origins = rays[:3].take(ray, axis=1).T
+        count = len(ray)
+        times = poses.times(ray)
+        light = LightPaths(ray, times, origins, directions, np.ones(count), np.zeros(count))
+        media = self._media
+        if setup.has_velocities:
+            light.range_rate = range_rates_of_origins(poses, ray, origins, directions)
+        if setup.has_mirrors:
+            light.mirrored = np.zeros(count, np.uint8)
+        deflected = setup.has_mirrors or (media is not None and media.refracts)
+        if batch.subrays_per_beam > 1 and deflected:
+            light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
+        if media is not None:
+            leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
+            media_rays = Rays(origins, directions, times, poses.actor_trajectories)
+            light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
+        return light
+
+    # -- hits --------------------------------------------------------------------------------
+
+    def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
+        """Return the hits of light on surfaces, or on leaves before the surfaces.
+
+        Advances `cast.light.in_media`, the state of the light in media, to the hits.
+        """
+        surfaces = self.surfaces
+        actor_trajectories = batch.subray_poses.actor_trajectories
+        light = cast.light
+        cast, leaves = self._meet_leaves(cast, batch)
+        step_m = cast.step_m
+        triangle = cast.triangle
+        distance = light.optical_end(step_m)
+        colour = None
+        if self._coloured:
+            points = light.origins + step_m[:, None] * light.directions
+            colour = surfaces.colours(triangle, points, light.times, actor_trajectories)
+        normals, cosines, kinds, energy, film = surfaces.lit(
+            triangle,
+            light.directions,
+            distance,
+            self._light,
+            light.times,
+            actor_trajectories,
+            colour,
+        )
+        if leaves is not None and len(leaves.rows):
+            # Leaves face the light: two leaves behind each other are then never one surface.
+            normals[leaves.rows] = light.directions[leaves.rows]
+            energy[leaves.rows] = self._leaf_energy(leaves, triangle, distance, colour)
+        energy *= light.share
+        if light.in_media is not None:
+            light.in_media.advance(step_m)
+            energy *= light.in_media.energy_factor(light.directions, distance)
+        return SurfaceHits(
+            step_m,
+            triangle,
+            distance,
+            colour,
+            normals,
+            cosines,
+            kinds,
+            energy,
+            film,
+            np.zeros(0, np.intp) if leaves is None else leaves.rows,
+            self._velocities(light, step_m, triangle, actor_trajectories),
+        )
+
+    def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
+        """Return light that ends at the leaves that it meets, and the leaves.
+
+        The leaves are None if there are no media.
+        """
+        light = cast.light
+        if light.in_media is None:
+            return cast, None
+        leaves = light.in_media.meet_leaves(
+            light.origins,
+            light.directions,
+            cast.start_m,
+            cast.step_m,
+            light.ray,
+            self._draw(batch),
+        )
+        step_m = cast.step_m.copy()
+        step_m[leaves.rows] = cast.start_m[leaves.rows] + leaves.metres
+        triangle = cast.triangle.copy()
+        triangle[leaves.rows] = leaves.triangles
+        return cast._replace(step_m=step_m, triangle=triangle), leaves
+
+    def _leaf_energy(
+        self, leaves: Leaves, triangle: Ints32, distance: Floats, colour: UInts32 | None
+    ) -> Floats:
+        """Return the energies received from leaves (k,).
+
+        `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
+        """
+        rows = leaves.rows
+        leaf_colour = None if colour is None else colour[rows]
+        return self.surfaces.energy(
+            triangle[rows], leaves.cosines, distance[rows], self._light, leaf_colour
+        )
+
+    def _velocities(
+        self,
+        light: LightPaths,
+        step_m: Floats,
+        triangle: Ints32,
+        actor_trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the velocities of surfaces at hits, m/s: (n, 3); (0, 3) if not needed."""
+        if light.range_rate is None:
+            return np.zeros((0, 3))
+        return velocities_of_ends(
+            self.surfaces,
+            actor_trajectories,
+            (light.origins, light.directions),
+            step_m,
+            triangle,
+            light.times,
+        )
+
+    def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
+        """Return the hits that the sensor may see, and where light continues.
+
+        With media, hits on the surfaces of crowns and hits beyond the sensor's range are left out.
+        """
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        velocity = None
+        if light.range_rate is not None:
+            along_ray = products(surface_hits.velocities.T, light.directions.T)
+            velocity = light.range_rate + light.index * along_ray
+        cause = None
+        mirrored = light.mirrored
+        if mirrored is not None:
+            cause = np.where(mirrored > 0, np.uint8(GHOST), np.uint8(SURFACE))
+        hits = PulseReturns(
+            light.ray,
+            surface_hits.distance,
+            surface_hits.triangle,
+            surface_hits.energy,
+            surface_hits.colour,
+            cause,
+            velocity,
+        )
+        normals = surface_hits.normals
+        if light.mirror_matrices is not None:
+            normals = into_axes(normals, light.mirror_matrices)
+        transmits = materials.passes[surface_hits.kinds]
+        mirrors = np.zeros(len(surface_hits.kinds), np.bool_)
+        if mirrored is not None:
+            film = False if surface_hits.film is None else surface_hits.film
+            smooth = (materials.specular > 0)[surface_hits.kinds] | film
+            mirrors = smooth & (mirrored < MAX_REFLECTIONS)
+        if light.in_media is None:
+            return VisibleHits(hits, normals, transmits, mirrors)
+        crowns = materials.leafy[surface_hits.kinds]  # whose surfaces reflect no light
+        crowns[surface_hits.leaves] = False
+        # Optical paths are longer than the rays that were cast.
+        in_range = surface_hits.distance <= self.setup.sensor.max_range_m
+        rows = np.flatnonzero(in_range & ~crowns)
+        return VisibleHits(
+            hits.take(rows), normals[rows], (transmits | crowns) & in_range, mirrors & in_range
+        )
+
+    # -- light that continues ----------------------------------------------------------------
+
+    def _continue(
+        self,
+        light: LightPaths,
+        surface_hits: SurfaceHits,
+        visible: VisibleHits,
+        subrays_per_beam: int,
+    ) -> OnwardLight | None:
+        """Return the light that surfaces transmit or mirror, ready to cast; None if there is none.
+
+        Rows that are transmitted and mirrored are taken twice, and ordered along rings.
+        """
+        if not self.setup.has_onward_light:
+            return None
+        transmitted = np.flatnonzero(visible.transmits)
+        rows = np.concatenate([transmitted, np.flatnonzero(visible.mirrors)])
+        if not len(rows):
+            return None
+        reflected = np.arange(len(rows)) >= len(transmitted)
+        order = along_rings(light.ray[rows] // subrays_per_beam, self.setup.sensor.channels)
+        rows, reflected, share = self._divide(light, surface_hits, rows[order], reflected[order])
+        onward = light.take(rows)
+        onward.share = share
+        crossings = Crossings(
+            surface_hits.step_m[rows],
+            surface_hits.distance[rows],
+            surface_hits.triangle[rows],
+            surface_hits.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
+            surface_hits.cosines[rows],
+            reflected,
+            None if light.range_rate is None else surface_hits.velocities[rows],
+        )
+        return self._cross(onward, crossings)
+
+    def _divide(
+        self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
+    ) -> OnwardRows:
+        """Compute the share of light that surfaces transmit or mirror; drop faint light.
+
+        `rows` are rows of the light; `reflected` says which of them are mirrored. Both are
+        overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
+        light is refracted, its energy may exceed the limit that is computed here.
+        """
+        from ..casting import surface_loops  # not before: numba takes half a second to import
+
+        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        bright = None
+        if materials.textured and surface_hits.colour is not None:
+            bright = luminance(surface_hits.colour[rows])
+        in_media = light.in_media
+        drops_faint = light.mirrored is not None and not (
+            in_media is not None and in_media.differentials
+        )
+        share = np.empty(len(rows))
+        film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
+        count = surface_loops.divide_light(
+            rows,
+            reflected,
+            surface_loops.OnwardHits(
+                surface_hits.kinds,
+                surface_hits.cosines,
+                film,
+                light.share,
+                surface_hits.distance,
+            ),
+            materials.shares(surface_hits.kinds[rows], bright),
+            surface_loops.OnwardOptics(
+                materials.specular, materials.passes, ~materials.refracts, materials.leafy
+            ),
+            surface_loops.OnwardLimits(
+                self._light.wet,
+                self._brightest,
+                self._light.extinction,
+                self._faintest if drops_faint else -1.0,
+            ),
+            share,
+        )
+        return OnwardRows(rows[:count], reflected[:count], share[:count])
+
+    def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
+        """Cast the light behind surfaces; return the light that hits a surface within the range.
+
+        With crowns, hits beyond the range are returned too: there may be leaves before them.
+        """
+        light, start_m, path = onward
+        max_range_m = self.setup.sensor.max_range_m
+        # Light takes no time: it travels 300 m in a microsecond.
+        clock = Clock(light.times, np.zeros(1), actor_trajectories)
+        poses = CastPoses(np.zeros(3), clock=clock)
+        hits = self.caster.scan(path, poses, t_max=self._reach_m)
+        rows = hits.ray
+        cast = CastLight(light.take(rows), start_m[rows], hits.distance, hits.triangle)
+        if self._leafy or max_range_m == np.inf:
+            return cast
+        in_range = np.flatnonzero(cast.light.optical_end(cast.step_m) <= max_range_m)
+        if len(in_range) == len(cast.step_m):
+            return cast
+        return CastLight(
+            cast.light.take(in_range),
+            cast.start_m[in_range],
+            cast.step_m[in_range],
+            cast.triangle[in_range],
+        )
+
+    def _join(
+        self, batch: PulseBatch, parts: list[VisibleHits], rays: Floats, first_light: LightPaths
+    ) -> PulseReturns:
+        """Return the hits of all passes in the order of sub-rays, and set them in the batch.
+
+        `parts` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams have
+        several sub-rays. `rays` are all sub-rays, see `_cast_first`; `first_light` is the light of
+        those that hit a surface.
+        """
+        hits = joined([part.hits for part in parts])
+        normals = parts[0].normals
+        if parts[1:]:
+            order = np.argsort(hits.ray, kind="stable")
+            hits = hits.take(order)
+            if batch.subrays_per_beam > 1:
+                normals = np.concatenate([part.normals for part in parts])[order]
+        batch.hits = hits
+        if batch.subrays_per_beam > 1:
+            directions = first_light.directions
+            # The rows differ from `first_light` after several passes, or if hits were left out.
+            if parts[1:] or len(hits.ray) != len(first_light.ray):
+                directions = rays[-3:].take(hits.ray, axis=1).T
+            batch.planes = normals, directions
+        return hits
+
+    def _cross(self, light: LightPaths, crossings: Crossings) -> OnwardLight:
+        """Return the light behind surfaces that transmit or mirror the light.
+
+        The new origins are a small distance behind the surfaces, so as not to hit them again.
+        """
+        incoming_index = light.index
+        deflection = self._deflect(light, crossings)
+        outgoing = deflection.directions
+        normals = crossings.normals
+        mirror_matrices = light.mirror_matrices
+        if mirror_matrices is not None:
+            normals_as_seen = into_axes(normals, mirror_matrices)
+            reflections = deflection.twice_normals[:, :, None] * normals_as_seen[:, None]
+            mirror_matrices = mirror_matrices - reflections
+        cosines = np.abs(crossings.cosines)
+        in_media = light.in_media
+        if in_media is not None:
+            in_media.deflect(light.directions, outgoing, normals, deflection.mirrored)
+            cosines = np.abs(products(normals.T, outgoing.T))
+        range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
+        clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
+        path, origins = _path_behind(light, crossings.step_m, clear_m, outgoing)
+        optical_m = clear_m if in_media is None else in_media.optical(clear_m)
+        if in_media is not None:
+            in_media.advance(clear_m)
+        behind = LightPaths(
+            light.ray,
+            light.times,
+            origins,
+            path.directions,
+            deflection.share,
+            crossings.distance + optical_m,
+            mirror_matrices,
+            None if light.mirrored is None else light.mirrored + crossings.reflected,
+            in_media,
+            range_rate,
+        )
+        return OnwardLight(behind, -clear_m, path)
+
+    def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
+        """Return the directions and shares of light behind surfaces that refract or mirror.
+
+        Moves the light into the media behind the surfaces.
+        """
+        outgoing = light.directions
+        share = light.share
+        mirrored = crossings.reflected
+        if light.in_media is not None:
+            refraction = light.in_media.cross(
+                self.surfaces.kinds(crossings.triangle),
+                crossings.triangle,
+                outgoing,
+                crossings.normals,
+                crossings.cosines,
+                crossings.reflected,
+            )
+            outgoing = refraction.directions
+            share = share * refraction.shares**2  # on the way out and back
+            mirrored = mirrored | refraction.totally_reflected
+        twice_normals = 2 * mirrored[:, None] * crossings.normals
+        outgoing = outgoing - crossings.cosines[:, None] * twice_normals
+        return Deflection(outgoing, share, mirrored, twice_normals)
+
+
+def _range_rate_behind(
+    light: LightPaths,
+    incoming_index: Floats | float,
+    velocities: Floats | None,
+    outgoing: Floats,
+) -> Floats | None:
+    """Return `LightPaths.range_rate` behind moving surfaces that bend or mirror light, m/s: (n,).
+
+    `light` has the directions before the surfaces, `outgoing` (n, 3) are those behind the surfaces.
+    `velocities` (n, 3) are the velocities of the surfaces, m/s. `incoming_index` is the refractive
+    index before the surfaces, `light.index` behind them.
+    """
+    if light.range_rate is None or velocities is None:
+        return light.range_rate
+    incoming_speed = products(velocities.T, light.directions.T)
+    outgoing_speed = products(velocities.T, outgoing.T)
+    return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
+
+
+def _path_behind(
+    light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
+) -> tuple[Pattern, Floats]:
+    """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).
+
+    Light ends at distances `step_m` (n,) from its origins, metres. `outgoing` (n, 3) are the
+    directions of the rays, of any length close to 1.
+    """
+    from ..casting import surface_loops
+
+    origins = np.empty((3, len(clear_m)))
+    directions = owned(outgoing.T)
+    surface_loops.start_behind(
+        owned(light.origins.T),
+        owned(light.directions.T),
+        owned(step_m),
+        clear_m,
+        origins,
+        directions,
+    )
+    return Pattern(directions.T, origins.T), origins.T

@@ -1,0 +1,176 @@
+"""Parts that loops over pulses share; each loop is compiled when it is first called."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from raybeam.compiled import compiled, inlined, stage
+
+from ...base.arrays import Bools, Floats, Ints
+
+SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between neighbouring hits
+
+
+class SampledHits(NamedTuple):
+    """Arrays to which loops write sampled hits of sub-rays: (k,) each."""
+
+    ray: Ints  # sub-ray
+    distance: Floats  # metres
+    energy: Floats
+
+    def first(self, count: int) -> SampledHits:
+        """Return the first hits, which a loop has written."""
+        return SampledHits(self.ray[:count], self.distance[:count], self.energy[:count])
+
+
+class Neighbours(NamedTuple):
+    """Neighbouring sub-rays of a beam, and planes of hits; without pairs no surface continues."""
+
+    subrays: int  # of a beam
+    pairs: Ints  # (k, 2): neighbouring sub-rays of a beam
+    normals: Floats  # (3, n): of the surfaces of hits
+    directions: Floats  # (3, n): of the rays of hits
+
+
+class SurfaceMarks(NamedTuple):
+    """Marks of hits in the order of `PulseHits`: (n,) each."""
+
+    solid: Bools  # whether the hit is on a surface that may continue
+    starts_return: Bools  # whether a return starts at the hit
+    apart: Bools  # whether the surface of the hit before does not continue; may be `starts_return`
+
+
+class PulseHits(NamedTuple):
+    """Hits of beams in the order of beams and distances, (n,) each, and scratch memory."""
+
+    subray: Ints  # number among the sub-rays of all beams
+    distance: Floats  # metres
+    row: Ints  # (n, 2): row among the hits of `Neighbours`, and scratch memory
+    subray_hits: Ints  # scratch memory (n * sub-rays of a beam,)
+    changes: Ints  # scratch memory (n + 1,)
+
+
+@inlined
+def beam_of(ray, subrays):
+    """Return the beam of a sub-ray."""
+    return ray if subrays == 1 else ray // subrays  # a division takes as long as all else
+
+
+@inlined
+def scan_row(scan_starts, beam, row):
+    """Return the row of the scan of a beam, searched from the row of an earlier beam."""
+    while row + 1 < len(scan_starts) and scan_starts[row + 1] <= beam:
+        row += 1
+    return row
+
+
+@compiled()
+def thin_out(ray, scan_starts, keep_every, counts, rows, number, returns):
+    """Count the returns of each scan, and write every `keep_every`-th return of a scan.
+
+    Scans begin at rays `scan_starts`; their `counts` are added to. Of kept returns, writes the
+    `rows`, the `number` in the pulse, from 1, and the number of `returns` of the pulse, both at
+    most 255. Returns the number of kept returns.
+    """
+    count = 0
+    scan = 0
+    begin = 0
+    stop = 0
+    for k in range(len(ray)):
+        if k == stop:
+            begin = k
+            scan = scan_row(scan_starts, ray[k], scan)
+            while stop < len(ray) and ray[stop] == ray[begin]:
+                stop += 1
+        if keep_every == 1 or counts[scan] % keep_every == 0:
+            rows[count] = k
+            number[count] = min(k + 1 - begin, 255)
+            returns[count] = min(stop - begin, 255)
+            count += 1
+        counts[scan] += 1
+    return count
+
+
+@inlined
+def _half_way(hit, neighbour, inverse_distance, neighbours):
+    """Return the range of the plane of a hit half-way to a neighbouring hit, metres.
+
+    `hit` and `neighbour` are rows in `Neighbours`; `inverse_distance` is of the hit, 1/m.
+    """
+    normals = neighbours.normals
+    directions = neighbours.directions
+    x = normals[0, hit]
+    y = normals[1, hit]
+    z = normals[2, hit]
+    neighbour_cosine = (
+        x * directions[0, neighbour] + y * directions[1, neighbour] + z * directions[2, neighbour]
+    )
+    hit_cosine = x * directions[0, hit] + y * directions[1, hit] + z * directions[2, hit]
+    ratio = 1 + neighbour_cosine / hit_cosine
+    if ratio < 1e-9:  # and not if it is unknown
+        ratio = 1e-9
+    return 2 / (inverse_distance * ratio)
+
+
+@stage
+def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901, PLR0914 - a compiled loop
+    """Clear `marks.apart` at the hits of a beam where the surface of the hit before continues.
+
+    The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,
+    `SurfaceMarks`; only `solid` hits are considered. Two neighbouring sub-rays hit one surface if
+    the planes through the two hits meet half-way between the hits, within `gap_m` or half of the
+    distance between the hits. The inverse range of a plane is linear in the ray's direction, so two
+    hits on one plane always meet, whatever the angle; half of the distance allows for rough ground.
+
+    A sub-ray may have several hits, each behind the panes of glass that it hit before: the hits of
+    neighbouring sub-rays behind the same number of panes are compared.
+    """
+    subrays = neighbours.subrays
+    solid = marks.solid
+    starts_return = marks.starts_return
+    apart = marks.apart
+    distance = hits.distance
+    row = hits.row
+    subray_hits = hits.subray_hits
+    changes = hits.changes
+    count = stop - begin
+    panes = 0
+    for k in range(count * subrays):
+        subray_hits[k] = -1
+    # subray_hits: row of the hit of each sub-ray behind 0, 1, … panes of glass, or -1; a block of
+    # `subrays` for each number of panes.
+    for k in range(begin, stop):
+        changes[k - begin] = 0
+        if solid[k]:
+            pane = 0
+            while subray_hits[pane * subrays + hits.subray[k] % subrays] >= 0:
+                pane += 1
+            subray_hits[pane * subrays + hits.subray[k] % subrays] = k
+            panes = max(panes, pane + 1)
+    changes[count] = 0  # changes[k]: change of the number of surfaces that continue at hit k
+    first_hit = begin
+    for k in range(begin, stop):  # row[k, 1]: the first hit of the return of hit k
+        if starts_return[k]:
+            first_hit = k
+        row[k, 1] = first_hit
+    for pane in range(panes):
+        for pair in range(len(neighbours.pairs)):
+            hit = subray_hits[pane * subrays + neighbours.pairs[pair, 0]]
+            neighbour = subray_hits[pane * subrays + neighbours.pairs[pair, 1]]
+            if hit < 0 or neighbour < 0 or row[hit, 1] == row[neighbour, 1]:
+                continue
+            hit_m = _half_way(row[hit, 0], row[neighbour, 0], 1 / distance[hit], neighbours)
+            neighbour_m = _half_way(
+                row[neighbour, 0], row[hit, 0], 1 / distance[neighbour], neighbours
+            )
+            between_m = abs(distance[hit] - distance[neighbour])
+            if abs(hit_m - neighbour_m) <= max(gap_m, SLOPE * between_m):
+                changes[min(hit, neighbour) + 1 - begin] += 1
+                changes[max(hit, neighbour) + 1 - begin] -= 1
+    continuing = 0
+    for k in range(begin, stop):
+        continuing += changes[k - begin]
+        if continuing > 0:
+            apart[k] = False

@@ -1,0 +1,55 @@
+"""Random numbers for compiled loops: as `lidarsim.sensor.random_numbers`, number by number."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import inlined
+
+from ...base.arrays import AnyArray, Ints
+
+SHIFT_TO_INDEX = np.uint64(48)  # leaves the upper 16 of 64 bits, an index below 65,536
+
+_30 = np.uint64(30)
+_27 = np.uint64(27)
+_31 = np.uint64(31)
+_11 = np.uint64(11)
+_FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
+_GAMMA = np.uint64(0x9E3779B97F4A7C15)
+_NUMBERS = np.uint64(256)  # random numbers that a ray may have for a purpose
+_NEXT = np.uint64(1)
+
+
+class RandomKeys(NamedTuple):
+    """Keys of the random numbers of consecutive beams."""
+
+    starts: AnyArray  # uint64 (purposes,), see `random_numbers.starts`; empty without numbers
+    scan: int  # number of the first scan
+    scan_starts: Ints  # (scans,): number of the first beam of each scan
+    first: int  # number of the first beam
+
+
+@inlined
+def _mixed(x):
+    """Return a 64-bit number after the last step of SplitMix64, as `random_numbers._mixed`."""
+    x = (x ^ (x >> _30)) * _FIRST_FACTOR
+    x = (x ^ (x >> _27)) * _SECOND_FACTOR
+    return x ^ (x >> _31)
+
+
+@inlined
+def bits(start, scan, ray, number):
+    """Return the 64 random bits of a purpose, by the start of its hashes, a ray and a number."""
+    scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
+    return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
+
+
+@inlined
+def uniform(start, scan, ray, number):
+    """Return a number uniform in [0, 1), a multiple of 2**-53."""
+    return np.float64(bits(start, scan, ray, number) >> _11) * 2.0**-53

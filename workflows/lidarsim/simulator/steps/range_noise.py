@@ -1,0 +1,90 @@
+"""Errors of ranges: noise, also of weak returns, range walk, and lasting errors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...base.arrays import Floats, Integers, Ints
+from ...base.elementary import exp, log
+from ...sensor.noise import Noise
+from ...sensor.random_numbers import Purpose, normal
+from ..returns import PulseReturns, required
+from .step import PulseBatch, PulseStep, Role, Setup
+
+RANGE = Purpose(1, "noise of a return's range")
+CHANNEL = Purpose(60, "a channel's error of range")
+
+
+class RangeNoiseStep(PulseStep):
+    """Adds errors to the ranges of reported returns."""
+
+    role = Role.ON_REPORTED
+    effects = "Weak returns and range walk", "Errors that last"
+    reads = "ray", "distance", "energy", "amplitude", "number"
+    writes = ("reported",)
+    purposes = RANGE, CHANNEL
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the noise changes ranges."""
+        return setup.noise.moves_ranges
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns with their reported ranges."""
+        # The leading edge of a clipped pulse is that of the whole pulse.
+        height = returns.height if self.setup.in_waveforms else returns.energy
+        scan, ray = batch.keys.scan_and_number(returns.ray)
+        noise = self.setup.noise
+        distance = returns.distance
+        if noise.channel_bias_m or noise.warm_up_m:
+            channel = returns.ray % self.setup.sensor.channels
+            distance = distance + lasting_errors(noise, channel, batch.firings.times(returns.ray))
+        reported = noisy_ranges(noise, distance, height, scan, ray, required(returns.number))
+        return returns._replace(reported=reported)
+
+
+def noisy_ranges(
+    noise: Noise,
+    distance: Floats,
+    energy: Floats | None,
+    scan: Integers,
+    ray: Integers,
+    number: Integers,
+) -> Floats:
+    """Return the reported ranges of returns (n,), metres, at least 0.
+
+    `distance` (n,) is in metres; `energy` (n,) is the energy, or the height of the return in a
+    waveform, and may be None if neither noise nor walk depends on it. `scan`, `ray` and `number`
+    (n,) count scans, rays in the scan, and returns of the ray.
+    """
+    sigma = noise.range_m + noise.range_per_m * distance
+    if noise.range_at_threshold_m and energy is not None:
+        weak = noise.range_at_threshold_m * noise.threshold / energy
+        sigma = np.sqrt(sigma * sigma + weak * weak)
+    if noise.walk_m and energy is not None:
+        distance = distance - range_walk(noise, energy)
+    if sigma.any():  # random numbers take time
+        distance = distance + sigma * normal(noise.seed, RANGE, scan, ray, number)
+    return np.maximum(distance, 0)
+
+
+def range_walk(noise: Noise, energy: Floats) -> Floats:
+    """Return by how much returns (n,) appear nearer than a return at the threshold, metres.
+
+    A Gaussian pulse that is `energy / threshold` times as high as a fixed threshold crosses the
+    threshold √(2 ln(energy / threshold)) standard deviations before its maximum.
+    """
+    ratio = np.maximum(energy / noise.threshold, 1)
+    return np.asarray(noise.walk_m * np.sqrt(2 * log(ratio)))
+
+
+def lasting_errors(noise: Noise, channel: Integers, times_ns: Ints) -> Floats:
+    """Return lasting errors of range by channels (n,) and times since the survey's start, m."""
+    biases = np.asarray(noise.channel_bias_m, np.float64)
+    if not biases.ndim:
+        channels = np.arange(channel.max(initial=0) + 1)
+        biases = biases * normal(noise.seed, CHANNEL, 0, channels)
+    errors = biases[channel]
+    if noise.warm_up_m:
+        errors = errors + noise.warm_up_m * exp(times_ns * (-1e-9 / noise.warm_up_s))
+    return errors

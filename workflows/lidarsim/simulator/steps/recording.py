@@ -1,0 +1,159 @@
+"""Recorded waveforms: the samples around each return."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...base.arrays import Floats, Ints
+from ...base.elementary import exp
+from ...columns.waveforms import SILENT, ZERO, record
+from ...sensor.noise import THRESHOLD_SIGMAS
+from ...sensor.optics import CUT
+from ...sensor.random_numbers import Purpose, normal, raw
+from ..returns import Keys, PulseReturns, numbers, required
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+from .waveform import Digitizer
+
+SAMPLES = Purpose(50, "stream of the samples of a waveform")
+SAMPLE = Purpose(51, "noise of a sample")
+BLOCK_SAMPLES = 1 << 20  # samples that are computed at a time
+
+
+class Windows(NamedTuple):
+    """Windows of consecutive samples of waveforms: arrays (n,)."""
+
+    beam: Ints  # counted from the first beam of the batch
+    begin: Ints  # first sample, counted in samples from the firing
+    first_hit: Ints  # row of the first hit of the beam
+    stop_hit: Ints  # one past the row of the last hit of the beam
+
+    def take(self, rows: slice) -> Windows:
+        """Return the windows of a slice of rows."""
+        return Windows(*(column[rows] for column in self))
+
+
+class RecordingStep(PulseStep):
+    """Records the waveforms of returns, with the noise of the receiver."""
+
+    role = Role.CHANGES
+    effects = ("Waveforms",)
+    reads = "ray", "distance"
+    writes = ("waveform",)
+    purposes = SAMPLES, SAMPLE
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if waveforms are recorded."""
+        return setup.waveform_samples > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of a block of samples, and of all records, in bytes."""
+        recorded = record(setup.waveform_samples).itemsize * sizes.returns
+        sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
+        return Memory(casting=sampled + recorded, counting=2.3 * recorded)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns with their recorded waveforms.
+
+        A window starts where the signal of the window's first return starts. Later returns of the
+        pulse share the window if their signals stop within it. Overlapping windows of a pulse hold
+        the same samples.
+        """
+        digitizer = Digitizer.for_sensor(self.setup)
+        count = self.setup.waveform_samples
+        records = np.zeros(len(returns.ray), record(count))
+        records["sample_ps"] = round(1000 * digitizer.sample_ns)
+        windows, window_of_return = _windows(returns, batch, digitizer, count)
+        records["begin"] = windows.begin[window_of_return]
+        samples_per_window = max(count, batch.subrays_per_beam * (2 * digitizer.reach + 1))
+        size = max(1, BLOCK_SAMPLES // samples_per_window)
+        for start in range(0, len(windows.beam), size):
+            block = windows.take(slice(start, start + size))
+            samples = _signal_samples(batch, digitizer, block, count)
+            steps, exponents = digitised(self._received(samples, block, batch))
+            first, stop = np.searchsorted(window_of_return, [start, start + size])
+            rows = window_of_return[first:stop] - start
+            records["samples"][first:stop] = steps[rows]
+            records["exponent"][first:stop] = exponents[rows]
+        return returns._replace(waveform=records)
+
+    def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
+        """Add the receiver's noise to samples (windows, count) in place; return clipped samples."""
+        noise = self.setup.noise
+        if noise.threshold:
+            keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
+            scan, ray = keys.scan_and_number(windows.beam)
+            stream = raw(noise.seed, SAMPLES, scan, ray)[:, None]
+            number = windows.begin[:, None] + np.arange(samples.shape[1])
+            errors = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
+            samples += (noise.threshold / THRESHOLD_SIGMAS) * errors
+        return np.minimum(samples, noise.full)
+
+
+def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, count: int) -> Ints:
+    """Return the first sample of the window of each return (n,), in samples after firing.
+
+    `distance` (n,) is in metres, `return_number` (n,) counts the returns of each pulse from 0;
+    windows have `count` samples. Returns that share a window have the same first sample.
+    """
+    time = distance * digitizer.samples_per_m
+    first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
+    last = np.ceil(time).astype(np.int64) + digitizer.reach
+    begin = first.copy()
+    for number in range(1, int(return_number.max(initial=0)) + 1):
+        rows = np.flatnonzero(return_number == number)
+        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+    return begin
+
+
+def _windows(
+    returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
+) -> tuple[Windows, Ints]:
+    """Return windows of `count` samples, and the row of each return's window: (n,)."""
+    return_number = numbers(returns.ray)
+    begin = _window_starts(returns.distance, return_number, digitizer, count)
+    starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
+    beam = returns.ray[starts_window] - batch.start
+    ray = required(batch.hits).ray
+    first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
+    stop_hit = np.searchsorted(ray, (beam + 1) * batch.subrays_per_beam)
+    windows = Windows(beam, begin[starts_window], first_hit, stop_hit)
+    return windows, np.cumsum(starts_window) - 1
+
+
+def _signal_samples(
+    batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int
+) -> Floats:
+    """Return samples of all hits' signals, summed, in windows, without noise: (windows, count)."""
+    hits = required(batch.hits)
+    hit_counts = windows.stop_hit - windows.first_hit
+    window = np.repeat(np.arange(len(hit_counts)), hit_counts)
+    first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
+    rows = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
+    time = hits.distance[rows] * digitizer.samples_per_m
+    first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
+    sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
+    height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
+    height *= required(hits.energy)[rows, None] / batch.subrays_per_beam
+    sample = sample_times - windows.begin[window, None]
+    inside = (sample >= 0) & (sample < count)
+    sample += count * window[:, None]
+    samples = np.bincount(sample[inside], height[inside], minlength=len(hit_counts) * count)
+    return samples.reshape(len(hit_counts), count).astype(np.float64)
+
+
+def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+    """Round samples (n, k) to integers around `ZERO`, in steps of a power of two for each row.
+
+    Returns the integers, uint16 (n, k), and the exponents of the steps (n,).
+    """
+    scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
+    _, exponents = np.frexp(scale)
+    exponents = np.clip(np.where(scale > 0, exponents, SILENT), SILENT, 127)
+    steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
+    return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)

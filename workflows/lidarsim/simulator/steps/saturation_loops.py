@@ -1,0 +1,56 @@
+"""Loop that joins pulses which fill the receiver with hidden pulses: see saturation.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from raybeam.compiled import compiled
+
+from ...base.arrays import Bools, Floats, Ints
+
+
+class Pulses(NamedTuple):
+    """Returns of pulses in the order of rays and distances: (n,) each."""
+
+    ray: Ints
+    clipped: Bools  # whether the return fills the receiver
+    height: Floats  # before clipping
+    front: Floats  # leading edge of the return, metres
+    back: Floats  # trailing edge of the return, metres
+    distance: Floats  # metres
+    energy: Floats
+
+
+@compiled()
+def join_clipped(pulses, remains):
+    """Join overlapping returns of a pulse where a return is clipped; mark the returns that remain.
+
+    Of joined returns the highest remains, with the energy of all joined returns, and with the
+    outermost edges and the smallest distance of the clipped returns. These are written to `pulses`,
+    `Pulses`, and marks to `remains` (n,).
+    """
+    height = pulses.height
+    front = pulses.front
+    back = pulses.back
+    clipped = pulses.clipped
+    begin = 0
+    for k in range(len(pulses.ray)):
+        if pulses.ray[k] != pulses.ray[begin]:
+            begin = k
+        remains[k] = True
+        last = k
+        for j in range(k - 1, begin - 1, -1):
+            if not (remains[j] and (clipped[j] or clipped[last]) and back[j] >= front[last]):
+                continue
+            hidden = j
+            if height[j] >= height[last]:
+                hidden = last
+                last = j
+            remains[hidden] = False
+            pulses.energy[last] += pulses.energy[hidden]
+            if clipped[hidden]:
+                front[last] = min(front[last], front[hidden])
+                back[last] = max(back[last], back[hidden])
+                pulses.distance[last] = min(pulses.distance[last], pulses.distance[hidden])

@@ -1,0 +1,251 @@
+"""Returns of pulses: joins hits that a receiver cannot tell apart, and selects reported returns."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Bools, owned
+from ...scene.colours import GREY, packed
+from ...sensor.disc import neighbours
+from ...sensor.noise import THRESHOLD_SIGMAS, Noise
+from ...sensor.optics import Mode
+from ...sensor.random_numbers import quantiles, starts
+from ..returns import (
+    NO_SURFACE,
+    RETURN_COLUMNS,
+    SURFACE,
+    Keys,
+    Planes,
+    PulseReturns,
+    required,
+    returns_without_surface,
+    selected,
+)
+from .detection import DETECTION, LOSS
+from .step import PulseBatch, PulseStep, Role, Setup
+
+if TYPE_CHECKING:
+    from .pulse_loops import Neighbours
+    from .random_loops import RandomKeys
+    from .separation_loops import Receiver, ReturnArrays, SubrayHits
+
+# In the order of the numbers in `separation_loops`.
+MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual", "two_strongest"
+_NO_VALUES = np.zeros(0)
+
+
+class Reporting(NamedTuple):
+    """Detection and selection of returns."""
+
+    mode: Mode = "all"
+    noise: Noise | None = None  # by which returns are lost; None if all are detected
+    keys: Keys | None = None
+    first: int = 0  # number, counted as in `keys`, of the beam of sub-ray 0 of the hits
+
+
+def separated(
+    hits: PulseReturns,
+    gap_m: float,
+    subrays: int = 1,
+    planes: Planes | None = None,
+    air: PulseReturns | None = None,
+    reporting: Reporting | None = None,
+) -> PulseReturns:
+    """Join the hits of each beam that a receiver cannot tell apart, and return the returns.
+
+    A beam's hits within `gap_m` of the next hit are a single return.
+
+    So are hits of neighbouring sub-rays on one surface, however far apart the hits are: a beam that
+    grazes a road illuminates all of the road between the hits. The energy of a return is the sum
+    over the hits, the distance and velocity are means weighted by energy, the triangle and colour
+    come from the strongest hit. Hits without energy are dropped.
+
+    Parameters
+    ----------
+    hits
+        Hits of sub-rays on surfaces, in the order of sub-rays.
+    gap_m
+        Half of the pulse's length, metres.
+    subrays
+        Sub-rays of a beam.
+    planes
+        Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+    air
+        Hits in the air, in the order of sub-rays.
+    reporting
+        Detection and selection; None if all returns are detected and reported.
+
+    Returns
+    -------
+    The returns in the order of beams and distances; their `ray` is the beam.
+    """
+    from . import separation_loops  # not before: numba takes half a second to import
+
+    air_hits = PulseReturns.empty()._replace(energy=_NO_VALUES) if air is None else air
+    reporting = reporting or Reporting()
+    with_velocity = hits.velocity is not None
+    size = len(hits.ray) + len(air_hits.ray)
+    output = separation_loops.ReturnArrays(
+        beam=np.empty(size, np.int64),
+        row=np.empty(size, np.int64),
+        distance=np.empty(size),
+        energy=np.empty(size),
+        velocity=np.empty(size),
+    )
+    count = separation_loops.separate(
+        _subray_hits(hits, hits.triangle != NO_SURFACE, with_velocity=with_velocity),
+        _subray_hits(air_hits, np.zeros(0, np.bool_), with_velocity=with_velocity),
+        neighbours_of(subrays, planes),
+        _receiver(subrays, gap_m, reporting, with_velocity=with_velocity),
+        _detection_keys(reporting),
+        output,
+    )
+    output = output.first(count)
+    returns = _columns(hits, air_hits, output)
+    return returns._replace(
+        ray=output.beam + reporting.first,
+        velocity=output.velocity if with_velocity else None,
+    )
+
+
+def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity: bool) -> Receiver:
+    """Return the settings of a receiver for loops."""
+    from .separation_loops import Receiver
+
+    noise = reporting.noise
+    detects = noise is not None and noise.loses
+    return Receiver(
+        subrays=subrays,
+        gap_m=gap_m,
+        mode=MODES.index(reporting.mode),
+        with_velocity=with_velocity,
+        dropout=float(noise.dropout) if noise is not None and detects else 0.0,
+        threshold=float(noise.threshold) if noise is not None and detects else 0.0,
+        threshold_sigmas=THRESHOLD_SIGMAS,
+        quantiles=quantiles() if detects else _NO_VALUES,
+    )
+
+
+def _detection_keys(reporting: Reporting) -> RandomKeys:
+    """Return the keys by which returns are detected, for loops; without starts if none are lost."""
+    from .random_loops import RandomKeys
+
+    noise = reporting.noise
+    keys = reporting.keys
+    detects = noise is not None and noise.loses
+    return RandomKeys(
+        starts=starts(noise.seed, LOSS, DETECTION)
+        if noise is not None and detects
+        else np.zeros(0, np.uint64),
+        scan=0 if keys is None else keys.scan,
+        scan_starts=np.zeros(1, np.int64) if keys is None else owned(keys.scan_starts, np.int64),
+        first=reporting.first,
+    )
+
+
+def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -> PulseReturns:
+    """Return the columns of returns by their strongest hits, on surfaces or in the air."""
+    row = output.row
+    if len(hits.ray):
+        columns = hits.triangle, hits.colour, hits.cause
+        triangle, colour, cause = selected(columns, np.maximum(row, 0))
+        returns = PulseReturns(output.beam, output.distance, triangle, output.energy, colour, cause)
+    else:
+        returns = returns_without_surface(
+            hits, output.beam, output.distance, output.energy, SURFACE
+        )
+    if not len(air_hits.ray):
+        return returns
+    from_air = np.flatnonzero(row < 0)
+    cause = np.full(len(row), SURFACE, np.uint8) if returns.cause is None else returns.cause
+    cause[from_air] = required(air_hits.cause)[-1 - row[from_air]]
+    returns.triangle[from_air] = NO_SURFACE
+    if returns.colour is not None:
+        returns.colour[from_air] = packed(GREY[0])[0]
+    return returns._replace(cause=cause)
+
+
+def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> SubrayHits:
+    """Return hits for loops, with velocities on request.
+
+    `solid` (n,) says whether hits are on surfaces; empty for hits in the air.
+    """
+    from .separation_loops import SubrayHits
+
+    velocity = hits.velocity if with_velocity else None
+    return SubrayHits(
+        ray=owned(hits.ray, np.int64),
+        distance=owned(hits.distance),
+        energy=owned(required(hits.energy)),
+        velocity=_NO_VALUES if velocity is None else owned(velocity),
+        solid=solid,
+    )
+
+
+def neighbours_of(subrays: int, planes: Planes | None) -> Neighbours:
+    """Return neighbouring sub-rays and planes for loops; without planes no surface continues."""
+    from .pulse_loops import Neighbours
+
+    if planes is None or subrays == 1:
+        no_planes = np.zeros((3, 0))
+        return Neighbours(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
+    normals, directions = planes
+    pairs = owned(neighbours(subrays), np.int64)
+    return Neighbours(subrays, pairs, owned(normals.T), owned(directions.T))
+
+
+class SeparationStep(PulseStep):
+    """Makes returns of hits by their distances, and keeps the detected and reported returns."""
+
+    role = Role.FRAME
+    reads = "ray", "distance", "triangle", "energy", "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
+    purposes = LOSS, DETECTION
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether rays may have no return or several, and there are no waveforms."""
+        return setup.has_several_returns and not setup.in_waveforms
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns of the hits of a batch."""
+        setup = self.setup
+        # If the receiver adds or joins returns, `SelectionStep` selects.
+        mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
+        reporting = Reporting(mode, setup.noise, batch.keys, batch.start)
+        return separated(
+            returns,
+            setup.half_pulse_m,
+            batch.subrays_per_beam,
+            batch.planes,
+            batch.air,
+            reporting,
+        )
+
+
+class SelectionStep(PulseStep):
+    """Selects the reported returns of a pulse, after waveforms and receivers made returns."""
+
+    role = Role.FRAME
+    reads = "ray", "energy", "amplitude"
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether the receiver adds or joins returns before the selection."""
+        return setup.has_received_returns
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the reported returns of a batch."""
+        return returns.take(chosen(returns, self.setup.reporting.mode))
+
+
+def chosen(returns: PulseReturns, mode: Mode) -> Bools:
+    """Return whether a mode reports each return: (n,)."""
+    from . import separation_loops
+
+    shown = np.empty(len(returns.ray), np.bool_)
+    ray = owned(returns.ray, np.int64)
+    separation_loops.mark_reported(ray, owned(returns.height), MODES.index(mode), shown)
+    return shown

@@ -1,0 +1,493 @@
+"""Loops over pulses that make, detect and select the returns of hits: see separation.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined, stage
+from raybeam.embree_memory import float64s, int64s, uint8s
+
+from ...base.arrays import Bools, Floats, Ints
+from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
+from .random_loops import SHIFT_TO_INDEX, bits, uniform
+
+# Modes, in the order of `separation.MODES`.
+ALL, FIRST, LAST, STRONGEST, DUAL, TWO_STRONGEST = range(6)
+
+
+class SubrayHits(NamedTuple):
+    """Hits in the order of sub-rays: (n,) each."""
+
+    ray: Ints  # sub-ray
+    distance: Floats  # metres
+    energy: Floats  # as if all of the beam were in the hit's sub-ray
+    velocity: Floats  # radial, m/s; empty if returns have none
+    solid: Bools  # False for hits of no surface; empty for the table of hits in the air
+
+
+class Receiver(NamedTuple):
+    """Resolution, detection and reporting of a receiver."""
+
+    subrays: int  # of a beam
+    gap_m: float  # half of the pulse's length: closer hits are one return
+    mode: int  # which returns are reported
+    with_velocity: bool  # whether returns have velocities
+    dropout: float  # share of returns that are lost
+    threshold: float  # energy at which half of the returns are detected; 0 without detection
+    threshold_sigmas: float  # the threshold in standard deviations of the noise
+    quantiles: Floats  # of the normal distribution; empty without detection
+
+
+class _Detection(NamedTuple):
+    """Detection by a `Receiver`, and the starts of its random numbers."""
+
+    dropout: float  # share of returns that are lost
+    threshold: float  # energy at which half of the returns are detected; 0 without detection
+    threshold_sigmas: float  # the threshold in standard deviations of the noise
+    quantiles: Floats  # pointer to those of the normal distribution
+    lowest: float  # first and last of the quantiles
+    highest: float
+    loss_start: np.uint64  # starts of hashes, see `random_numbers.starts`
+    detection_start: np.uint64
+
+
+class ReturnArrays(NamedTuple):
+    """Arrays to which returns are written: (k,) each."""
+
+    beam: Ints  # number of the ray of the scans, from 0 at sub-ray 0
+    row: Ints  # of the strongest hit; of hits in the air -1, -2, …
+    distance: Floats  # metres
+    energy: Floats  # of the whole beam
+    velocity: Floats  # radial, m/s
+
+    def first(self, count: int) -> ReturnArrays:
+        """Return copies of the first returns, which a loop has written."""
+        return ReturnArrays(
+            self.beam[:count].copy(),
+            self.row[:count].copy(),
+            self.distance[:count].copy(),
+            self.energy[:count].copy(),
+            self.velocity[:count].copy(),
+        )
+
+
+class _BeamRows(NamedTuple):
+    """Rows of the hits of a beam, on surfaces and in the air."""
+
+    start: int
+    stop: int
+    air_start: int
+    air_stop: int
+
+
+class _BeamScratch(NamedTuple):
+    """Scratch memory for the hits and returns of a beam."""
+
+    hits: PulseHits  # row[k, 0] is the row on surfaces, or -1, -2, … in the air
+    marks: SurfaceMarks
+    energy: Floats
+    velocity: Floats
+    shown: Bools  # whether the mode reports a return
+
+
+# Loops over all beams read and write by pointers: numba counts references of arrays in tuples, and
+# that takes as long as the rest of the loop.
+@inlined
+def _pointers_to_hits(hits):
+    """Return `SubrayHits` of pointers to the arrays of `SubrayHits`, which must stay alive."""
+    return SubrayHits(
+        int64s(hits.ray.ctypes.data),
+        float64s(hits.distance.ctypes.data),
+        float64s(hits.energy.ctypes.data),
+        float64s(hits.velocity.ctypes.data),
+        uint8s(hits.solid.ctypes.data),
+    )
+
+
+@inlined
+def _pointers_to_returns(output):
+    """Return `ReturnArrays` of pointers to `ReturnArrays`, which must stay alive."""
+    return ReturnArrays(
+        int64s(output.beam.ctypes.data),
+        int64s(output.row.ctypes.data),
+        float64s(output.distance.ctypes.data),
+        float64s(output.energy.ctypes.data),
+        float64s(output.velocity.ctypes.data),
+    )
+
+
+@stage
+def _max_hits(ray, subrays):
+    """Return the largest number of hits of a beam."""
+    max_count = 0
+    begin = 0
+    end = -1
+    for k in range(len(ray)):
+        if ray[k] >= end:
+            begin = k
+            end = (beam_of(ray[k], subrays) + 1) * subrays
+        max_count = max(max_count, k + 1 - begin)
+    return max_count
+
+
+@stage
+def _room_for_hits(size, subrays):
+    """Return scratch memory for up to `size` hits of a beam."""
+    pulse_hits = PulseHits(
+        np.empty(size, np.int64),
+        np.empty(size),
+        np.empty((size, 2), np.int64),
+        np.empty(size * subrays, np.int64),
+        np.empty(size + 1, np.int64),
+    )
+    starts_return = np.empty(size, np.bool_)
+    return _BeamScratch(
+        pulse_hits,
+        SurfaceMarks(np.empty(size, np.bool_), starts_return, starts_return),
+        np.empty(size),
+        np.empty(size),
+        np.empty(size, np.bool_),
+    )
+
+
+@inlined
+def _end_of_beam(ray, size, row, end_ray):
+    """Return the first row from `row` on, of `size`, whose sub-ray is not below `end_ray`."""
+    while row < size and ray[row] < end_ray:
+        row += 1
+    return row
+
+
+@inlined
+def _single_return(hits, rows, beam, receiver, count, output):
+    """Write the return of a beam if its hits on surfaces are within the receiver's gap.
+
+    Returns whether the hits are within the gap, and the number of returns that are written.
+    """
+    nearest_m = np.inf
+    farthest_m = -np.inf
+    strongest = rows.start
+    has_energy = False
+    sum_energy = 0.0
+    sum_distance = 0.0
+    sum_velocity = 0.0
+    for k in range(rows.start, rows.stop):
+        if hits.energy[k] > 0:
+            nearest_m = min(nearest_m, hits.distance[k])
+            farthest_m = max(farthest_m, hits.distance[k])
+            sum_energy += hits.energy[k]
+            sum_distance += hits.energy[k] * hits.distance[k]
+            if receiver.with_velocity:
+                sum_velocity += hits.energy[k] * hits.velocity[k]
+            if not has_energy or hits.energy[k] > hits.energy[strongest]:
+                strongest = k
+            has_energy = True
+    if not farthest_m - nearest_m <= receiver.gap_m:
+        return False, count
+    if has_energy:
+        output.beam[count] = beam
+        output.row[count] = strongest
+        output.distance[count] = sum_distance / sum_energy
+        output.energy[count] = sum_energy / receiver.subrays
+        if receiver.with_velocity:
+            output.velocity[count] = sum_velocity / sum_energy
+        count += 1
+    return True, count
+
+
+@inlined
+def _collect_hits(hits, air, rows, scratch):
+    """Write the hits of a beam that have energy to `scratch`, in the order of sub-rays.
+
+    Hits in the air come first in a sub-ray. Returns the number of hits, and the distance between
+    the nearest and the farthest hit, metres.
+    """
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    energy = scratch.energy
+    surface_row = rows.start
+    air_row = rows.air_start
+    count = 0
+    nearest_m = np.inf
+    farthest_m = -np.inf
+    while surface_row < rows.stop or air_row < rows.air_stop:
+        in_air = air_row < rows.air_stop
+        if in_air and (surface_row == rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
+            row[count, 0] = -1 - air_row
+            distance[count] = air.distance[air_row]
+            energy[count] = air.energy[air_row]
+            air_row += 1
+        else:
+            row[count, 0] = surface_row
+            distance[count] = hits.distance[surface_row]
+            energy[count] = hits.energy[surface_row]
+            surface_row += 1
+        if energy[count] > 0:
+            nearest_m = min(nearest_m, distance[count])
+            farthest_m = max(farthest_m, distance[count])
+            count += 1
+    return count, farthest_m - nearest_m
+
+
+@inlined
+def _sort_by_distance(pulse_hits, count):
+    """Sort the first hits of `pulse_hits` by distance; equally far hits keep their order."""
+    row = pulse_hits.row
+    distance = pulse_hits.distance
+    for k in range(1, count):
+        row_k = row[k, 0]
+        distance_k = distance[k]
+        index = k
+        while index > 0 and distance[index - 1] > distance_k:
+            row[index, 0] = row[index - 1, 0]
+            distance[index] = distance[index - 1]
+            index -= 1
+        row[index, 0] = row_k
+        distance[index] = distance_k
+
+
+@inlined
+def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
+    """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
+
+    `count` is the number of hits, and `apart` says whether hits are farther apart than the
+    receiver's gap. A surface that continues from sub-ray to sub-ray is in a single return.
+    """
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    solid = scratch.marks.solid
+    starts_return = scratch.marks.starts_return
+    several = False
+    surface_number = -1
+    number = 0
+    for k in range(count):
+        row_k = row[k, 0]
+        solid[k] = row_k >= 0 and hits.solid[row_k] != 0
+        scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
+        scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
+        if receiver.with_velocity:
+            velocity_k = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
+            scratch.velocity[k] = velocity_k
+        starts_return[k] = k == 0 or (apart and distance[k] - distance[k - 1] > receiver.gap_m)
+        number += int(starts_return[k])
+        if solid[k]:  # surfaces can only continue if they are in several returns
+            several |= surface_number >= 0 and surface_number != number
+            surface_number = number
+    if several and len(neighbours.pairs):
+        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbours)
+
+
+@inlined
+def _write_returns(hit_count, beam, receiver, scratch, count, output):
+    """Write the returns of the first hits in `scratch`; return the number of written returns."""
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    starts_return = scratch.marks.starts_return
+    energy = scratch.energy
+    velocity = scratch.velocity
+    k = 0
+    while k < hit_count:
+        strongest = k
+        sum_energy = 0.0
+        sum_distance = 0.0
+        sum_velocity = 0.0
+        while True:
+            sum_energy += energy[k]
+            sum_distance += energy[k] * distance[k]
+            if receiver.with_velocity:
+                sum_velocity += energy[k] * velocity[k]
+            if energy[k] > energy[strongest]:
+                strongest = k
+            k += 1
+            if k == hit_count or starts_return[k]:
+                break
+        output.beam[count] = beam
+        output.row[count] = row[strongest, 0]
+        output.distance[count] = sum_distance / sum_energy
+        output.energy[count] = sum_energy / receiver.subrays
+        if receiver.with_velocity:
+            output.velocity[count] = sum_velocity / sum_energy
+        count += 1
+    return count
+
+
+@inlined
+def _keep(output, k, count):
+    """Move return `k` to the end of the `count` kept returns; return the new number of these."""
+    output.beam[count] = output.beam[k]
+    output.row[count] = output.row[k]
+    output.distance[count] = output.distance[k]
+    output.energy[count] = output.energy[k]
+    output.velocity[count] = output.velocity[k]
+    return count + 1
+
+
+@inlined
+def _detection_of(receiver, starts):
+    """Return the `_Detection` of a receiver; `starts` are of `RandomKeys`, empty without losses."""
+    loses = len(starts) > 0
+    count = len(receiver.quantiles)
+    return _Detection(
+        receiver.dropout,
+        receiver.threshold,
+        receiver.threshold_sigmas,
+        float64s(receiver.quantiles.ctypes.data),
+        receiver.quantiles[0] if count else 0.0,
+        receiver.quantiles[count - 1] if count else 0.0,
+        starts[0] if loses else np.uint64(0),
+        starts[1] if loses else np.uint64(0),
+    )
+
+
+@inlined
+def _detected(energy, scan, number_in_scan, return_index, detection):
+    """Return whether a return is detected, as `detection.detected` does.
+
+    `scan`, the beam's `number_in_scan` and the `return_index` within the beam, from 0, are the key
+    of the random numbers.
+    """
+    detected = (
+        detection.dropout == 0
+        or uniform(detection.loss_start, scan, number_in_scan, return_index) >= detection.dropout
+    )
+    if detected and detection.threshold > 0:
+        signal = detection.threshold_sigmas * (energy / detection.threshold - 1)
+        detected = signal + detection.lowest > 0  # whatever is drawn
+        if not detected and signal + detection.highest > 0:
+            index = np.int64(
+                bits(detection.detection_start, scan, number_in_scan, return_index)
+                >> SHIFT_TO_INDEX
+            )
+            detected = signal + detection.quantiles[index] > 0
+    return detected
+
+
+@inlined
+def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
+    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row.
+
+    `scan` and the beam's `number_in_scan` are keys of random numbers, see `_detected`.
+    """
+    count = begin
+    for k in range(begin, stop):
+        if _detected(output.energy[k], scan, number_in_scan, k - begin, detection):
+            count = _keep(output, k, count)
+    return count
+
+
+@stage
+def _mark(energy, begin, stop, mode, shown):
+    """Mark which returns of a pulse a mode reports; the nearest of equally strong returns.
+
+    "Dual" reports the strongest and the last return; if the strongest is the last, also the
+    second strongest. "Two strongest" reports the strongest and the second strongest.
+    """
+    strongest = begin
+    second_strongest = -1
+    for k in range(begin + 1, stop):
+        if energy[k] > energy[strongest]:
+            strongest = k
+    if mode == TWO_STRONGEST or (mode == DUAL and strongest == stop - 1):
+        for k in range(begin, stop):
+            if k != strongest and (second_strongest < 0 or energy[k] > energy[second_strongest]):
+                second_strongest = k
+    for k in range(begin, stop):
+        shown[k] = mode == ALL or k == second_strongest
+    shown[begin] |= mode == FIRST
+    shown[stop - 1] |= mode in (LAST, DUAL)
+    shown[strongest] |= mode in (STRONGEST, DUAL, TWO_STRONGEST)
+
+
+@inlined
+def _start_of_scan(scan_starts, row):
+    """Return the first beam of a scan by its row; a greater number after the last scan."""
+    return scan_starts[row] if row < len(scan_starts) else np.iinfo(np.int64).max
+
+
+@inlined
+def _keep_reported(begin, stop, mode, scratch, output):
+    """Keep the returns of a beam that a mode reports; return the next free row."""
+    for k in range(begin, stop):
+        scratch.energy[k - begin] = output.energy[k]
+    _mark(scratch.energy, 0, stop - begin, mode, scratch.shown)
+    count = begin
+    for k in range(begin, stop):
+        if scratch.shown[k - begin]:
+            count = _keep(output, k, count)
+    return count
+
+
+@compiled()
+def mark_reported(ray, energy, mode, shown):
+    """Mark in `shown` (n,) which returns, in the order of rays, a mode reports."""
+    begin = 0
+    while begin < len(ray):
+        stop = begin + 1
+        while stop < len(ray) and ray[stop] == ray[begin]:
+            stop += 1
+        _mark(energy, begin, stop, mode, shown)
+        begin = stop
+
+
+@compiled()
+def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
+
+    `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
+    `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost. Beams
+    are numbered from 0 at sub-ray 0; beam 0 is beam `keys.first` of the scans in `keys`.
+    Returns the number of returns.
+    """
+    subrays = receiver.subrays
+    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
+    scratch = _room_for_hits(size, subrays)
+    hit_count = len(hits.ray)
+    air_count = len(air.ray)
+    hits = _pointers_to_hits(hits)
+    air = _pointers_to_hits(air)
+    output = _pointers_to_returns(output)
+    loses = len(keys.starts) > 0
+    detection = _detection_of(receiver, keys.starts)
+    row = 0
+    air_row = 0
+    count = 0
+    scan_index = 0
+    scan_stop = -1  # first beam of the next scan
+    scan_start = 0
+    while row < hit_count or air_row < air_count:
+        beam = beam_of(hits.ray[row] if row < hit_count else air.ray[air_row], subrays)
+        if air_row < air_count:
+            beam = min(beam, beam_of(air.ray[air_row], subrays))
+        end_ray = (beam + 1) * subrays
+        stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
+        air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
+        rows = _BeamRows(row, stop, air_row, air_stop)
+        row = stop
+        air_row = air_stop
+        begin = count
+        single = False
+        if rows.air_start == rows.air_stop:  # mostly, there is one surface, and no hit in the air
+            single, count = _single_return(hits, rows, beam, receiver, count, output)
+        if not single:
+            collected, extent_m = _collect_hits(hits, air, rows, scratch)
+            apart = extent_m > receiver.gap_m
+            if apart:  # few beams hit an edge or graze a surface
+                _sort_by_distance(scratch.hits, collected)
+            _mark_returns(hits, air, collected, apart, receiver, neighbours, scratch)
+            count = _write_returns(collected, beam, receiver, scratch, count, output)
+        if loses and count > begin:
+            number = keys.first + beam
+            if number >= scan_stop:
+                scan_index = scan_row(keys.scan_starts, number, scan_index)
+                scan_start = keys.scan_starts[scan_index]
+                scan_stop = _start_of_scan(keys.scan_starts, scan_index + 1)
+            count = _keep_detected(
+                begin, count, keys.scan + scan_index, number - scan_start, detection, output
+            )
+        if receiver.mode != ALL and count - begin > 1:
+            count = _keep_reported(begin, count, receiver.mode, scratch, output)
+    return count

@@ -1,0 +1,223 @@
+"""Spray: clumps of drops that vehicles leave behind them on wet ground.
+
+Each vehicle leaves a box of spray in every tenth of a second, as wide and high as itself, and as
+long as the vehicle drives meanwhile. A box stays where it is, and its drops fall to the ground.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from raybeam.moving import near_boxes
+
+from ...base.arrays import Floats, Ints, owned
+from ...base.vectors import into_axes, length
+from ...columns.table import CAUSES
+from ...scene.actors import check_spray
+from ...sensor.random_numbers import Purpose
+from ...sensor.weather import FAINTEST, LARGE, reach, spray
+from ..casting.actor_trajectories import ActorTrajectories
+from ..casting.motion import along_rings
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..returns import RETURN_COLUMNS, PulseReturns, joined, required, returns_without_surface
+from .air import add_air_hits, exponential, light_reach, random_keys, room_for_hits, seen_by_range
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+if TYPE_CHECKING:
+    from .spray_loops import Crossings, SprayBoxes
+
+SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
+SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
+SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
+SPRAY = CAUSES.index("spray")
+BOX_NS = 1e8  # time between boxes of a vehicle
+BOXES = 10  # boxes of a vehicle that exist at a time
+LASTS_NS = BOXES * BOX_NS  # time after which a box is gone
+DECAY_NS = 4e8  # time in which exp(-1) of the spray is left: drops of a few 0.1 mm fall
+FULL_SPEED_M_S = 25.0  # speed at which spray has the stated density
+MIN_SPEED_M_S = 3.0  # speed below which there is no spray
+STEP_NS = 5e5  # time between the two poses that give the velocity of a vehicle
+
+
+class SprayStep(PulseStep):
+    """Samples the returns of spray behind vehicles, and attenuates the light behind spray.
+
+    Raises
+    ------
+    LidarError
+        If an actor that raises spray has no size.
+    """
+
+    role = Role.CHANGES
+    effects = ("Spray",)
+    reads = "ray", "distance", "triangle", "energy", "cause", "velocity"
+    writes = *RETURN_COLUMNS, "velocity"
+    causes = (SPRAY,)
+    purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        survey = setup.survey
+        sensor = setup.sensor
+        noise = setup.noise
+        check_spray(setup.scene.actors)
+        air = survey.air(setup.number)
+        range_limits_m = reach(sensor.min_range_m, sensor.max_range_m)
+        clump_kind = spray(survey.spray_g_m3)
+        # 1/m: cross-sections of clumps, of whose extinction half is diffraction.
+        self._extinction = clump_kind.extinction / LARGE
+        self._step_mm = 1 / clump_kind.slope
+        self._clump_distribution = seen_by_range(
+            air, clump_kind, FAINTEST * noise.threshold, *range_limits_m
+        )
+        self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
+        # (actors, 2, 3), actor frame, metres: lowest corner of the box around a mesh, and halves of
+        # the box's sides.
+        meshes = [actor.mesh.vertices for actor in setup.scene.actors]
+        self._mesh_boxes = np.array(
+            [(mesh.min(axis=0), np.ptp(mesh, axis=0) / 2) for mesh in meshes]
+        )
+        self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return a copy for a scene in which instances have moved."""
+        return self.repointed(setup, surfaces)
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether spray is on, and an actor raises spray."""
+        actors = setup.scene.actors
+        return setup.survey.spray_g_m3 > 0 and any(actor.spray for actor in actors)
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """Return the mean number of clumps in a pulse that meets spray."""
+        return 1.0  # an estimate
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of central rays, ranges of light, and clumps, in bytes."""
+        return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the hits of a batch after spray, which attenuates light and adds hits."""
+        if self._clump_distribution is None:
+            return returns
+        from . import pulse_loops, spray_loops  # not before: numba takes half a second to import
+
+        subrays = batch.subrays_per_beam
+        count = (batch.stop - batch.start) * subrays
+        reach_m = light_reach(self._materials, self.surfaces, returns, count)
+        crossings = self._crossings(batch, reach_m.reshape(-1, subrays).max(axis=1))
+        if not len(crossings.beam):
+            return returns
+        energy = required(returns.energy).copy()
+        ray = returns.ray.astype(np.int64)
+        surface_hits = pulse_loops.SampledHits(ray, owned(returns.distance), energy)
+        spray_loops.attenuate(crossings, subrays, self._extinction, reach_m, surface_hits)
+        batch.hits = returns = returns._replace(energy=energy)
+        clumps = self._sample_clumps(returns, batch, crossings, reach_m)
+        return add_air_hits(self.setup, returns, batch, clumps)
+
+    def _sample_clumps(
+        self, returns: PulseReturns, batch: PulseBatch, crossings: Crossings, reach_m: Floats
+    ) -> PulseReturns:
+        """Return the hits of clumps in the boxes that beams cross, in the order of sub-rays."""
+        from . import spray_loops
+
+        assert self._clump_distribution is not None
+        mean, by_range = self._clump_distribution
+        tables = spray_loops.ClumpTables(mean, by_range, self._step_mm, exponential())
+        keys = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
+        parts: list[PulseReturns] = []
+        row = 0
+        while row < len(crossings.beam):
+            hits = room_for_hits(1024 + len(crossings.beam))
+            row, count = spray_loops.sample_clumps(
+                row, crossings, batch.subrays_per_beam, tables, keys, reach_m, hits
+            )
+            parts.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
+        clumps = joined(parts)
+        return clumps.take(np.argsort(clumps.ray, kind="stable"))
+
+    def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:
+        """Return where the central rays of beams cross boxes.
+
+        `reach_m` (beams,) is the range at which each beam ends, metres. The crossings of a beam are
+        consecutive, in the order of vehicles, then of the times at which vehicles leave boxes.
+        """
+        from . import spray_loops
+
+        assert self._clump_distribution is not None
+        # Cells of consecutive rays are narrow if neighbours along a ring are consecutive.
+        ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
+        times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
+        spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
+        rays = np.concatenate(
+            [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
+        )
+        reach_m = np.minimum(reach_m[ring_order], self._clump_distribution[1][0, -1])
+        cell, box, cell_rays = near_boxes(
+            rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
+        )
+        order = np.argsort(cell, kind="stable")
+        pairs = spray_loops.CellPairs(cell[order], box[order], cell_rays)
+        room = 0
+        count = 1 + cell_rays * len(cell) // 4
+        while room < count:  # mostly, some rays of a cell meet a box
+            room = count
+            crossings = spray_loops.Crossings(np.empty(room, np.int64), np.empty((3, room)))
+            count = spray_loops.find_crossings(rays, times, reach_m, pairs, spray_boxes, crossings)
+        return spray_loops.Crossings(
+            ring_order[crossings.beam[:count]], owned(crossings.spans[:, :count])
+        )
+
+    def _boxes(self, trajectories: ActorTrajectories, begin_ns: float, end_ns: float) -> SprayBoxes:
+        """Return the boxes of spray that are in the scene between two times.
+
+        A vehicle leaves a box at each multiple of `BOX_NS`, `created_ns`. Its pose is taken at
+        `pose_ns`: at `created_ns`, or, if that is before the vehicle is in the scene, at the first
+        time at which the vehicle has a velocity.
+        """
+        from . import spray_loops
+
+        numbers = np.arange(math.floor(begin_ns / BOX_NS) - BOXES, math.floor(end_ns / BOX_NS) + 1)
+        moving = np.array([k for k in self._raising if trajectories[k].moves], np.int64)
+        actor = np.repeat(moving, len(numbers))
+        created_ns = np.tile(BOX_NS * numbers, len(moving))
+        first_ns, last_ns = trajectories.presence_ns[actor].T
+        # Before a vehicle is in the scene, it is assumed to drive as when it appears.
+        pose_ns = np.maximum(created_ns, np.maximum(first_ns, 0.0) + STEP_NS)
+        rows = np.flatnonzero((created_ns <= end_ns) & (pose_ns <= last_ns))
+        created_ns = created_ns[rows]
+        first_ns = first_ns[rows]
+        boxes, speed_m_s = self._boxes_of(trajectories, actor[rows], created_ns, pose_ns[rows])
+        presence_ns = np.stack([np.maximum(created_ns, first_ns), created_ns + LASTS_NS], axis=1)
+        fast = np.flatnonzero(speed_m_s >= MIN_SPEED_M_S)
+        density = self.setup.survey.wet * np.square(speed_m_s[fast] / FULL_SPEED_M_S)
+        return spray_loops.SprayBoxes(boxes[fast], presence_ns[fast], density, LASTS_NS, DECAY_NS)
+
+    def _boxes_of(
+        self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, pose_ns: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the boxes that actors leave at `created_ns` (b,), and the actors' speeds, m/s.
+
+        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame, metres.
+        A box starts at the rear of the actor, and is as long along the actor's x axis, forward, as
+        the actor drives in `BOX_NS`. The actor drives straight on from `pose_ns` to `created_ns`.
+        """
+        positions, rotations = trajectories.poses(actor, pose_ns)
+        earlier, _ = trajectories.poses(actor, pose_ns - STEP_NS)
+        velocity = (positions - earlier) / (STEP_NS / 1e9)
+        speed_m_s = length(velocity)
+        axes = rotations.transpose(0, 2, 1)  # rows: axes of the actor, in the scene frame
+        lowest_corner, half_sides = self._mesh_boxes[actor].transpose(1, 0, 2).copy()
+        half_sides[:, 0] = speed_m_s * (BOX_NS / 2e9)
+        driven_m = velocity * ((created_ns - pose_ns) / 1e9)[:, None]
+        middle = positions + driven_m + into_axes(lowest_corner + half_sides, axes)
+        boxes = np.concatenate([middle, (axes * half_sides[:, :, None]).reshape(-1, 9)], axis=1)
+        return boxes, speed_m_s

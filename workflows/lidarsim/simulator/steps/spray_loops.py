@@ -1,0 +1,269 @@
+"""Loops over pulses that cross boxes of spray: see spray.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined, stage
+
+from ...base.arrays import Floats, Ints
+from ...base.elementary_loops import exp
+from .air_loops import write_particle
+from .pulse_loops import beam_of, scan_row
+from .random_loops import SHIFT_TO_INDEX, bits, uniform
+
+MAX_CLUMPS = 255  # clumps of spray that a beam meets: a ray has so many random numbers
+_GUIDE_PARTS = 1024  # parts of a table in which a column is looked up
+
+
+class CellPairs(NamedTuple):
+    """Pairs of a cell of consecutive rays and a box that may meet, in the order of cells."""
+
+    cell: Ints  # (p,): number of the cell
+    box: Ints  # (p,): row of `SprayBoxes`
+    cell_rays: int  # rays of a cell
+
+
+class SprayBoxes(NamedTuple):
+    """Boxes of spray."""
+
+    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, metres
+    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box is left behind.
+    presence_ns: Floats
+    # (b,): when the box is left behind, as a multiple of `Survey.spray_g_m3`.
+    density: Floats
+    lasts_ns: float  # time after which a box is gone
+    decay_ns: float  # time in which exp(-1) of the density is left
+
+
+class Crossings(NamedTuple):
+    """Crossings of beams and boxes; the crossings of a beam are consecutive."""
+
+    beam: Ints  # (k,): number of the beam in the batch
+    # (3, k): ranges at which the beam enters and leaves the box, metres, and the density of the box
+    # at that time, as a multiple of `Survey.spray_g_m3`.
+    spans: Floats
+
+
+class ClumpTables(NamedTuple):
+    """Tables of clumps of spray that may be detected, see `air.DetectableParticles`."""
+
+    mean: float  # detectable clumps that a beam would meet in air of density `Survey.spray_g_m3`
+    by_range: Floats  # (5, shares): columns, ascending in range, that hold equal shares of `mean`
+    step_mm: float  # diameter that exp(-1) of the drops exceed
+    exponential: Floats  # quantiles of the exponential distribution
+
+
+@stage
+def _ball_radii(boxes):
+    """Return the radii of balls around boxes (b, 12): (b,), metres."""
+    radii = np.zeros(len(boxes))
+    for b in range(len(boxes)):
+        for side in range(3, 12):
+            radii[b] += boxes[b, side] * boxes[b, side]
+        radii[b] = 1.001 * np.sqrt(radii[b])
+    return radii
+
+
+@inlined
+def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
+    """Return where a ray enters and leaves a box, metres, in this order if the ray meets the box.
+
+    `to_middle` is the vector from the ray's start to the middle of the box.
+    """
+    p, q, r = to_middle
+    u, v, w = direction
+    enters = 0.0
+    leaves = reach_m
+    for side in range(3, 12, 3):
+        x = boxes[b, side]
+        y = boxes[b, side + 1]
+        z = boxes[b, side + 2]
+        half = (x * x + y * y) + z * z
+        pace = (x * u + y * v) + z * w
+        middle = (x * p + y * q) + z * r
+        if pace != 0:
+            near_side = (middle - half) / pace
+            far_side = (middle + half) / pace
+            enters = max(enters, min(near_side, far_side))
+            leaves = min(leaves, max(near_side, far_side))
+        elif abs(middle) > half:
+            leaves = -1.0
+    return enters, leaves
+
+
+@inlined
+def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
+    """Write a crossing of ray `k` and box `b` as row `count`, if `crossings` has room.
+
+    `span` is the result of `_span_in_box`, `time` that of the ray, ns.
+    """
+    if count < len(crossings.beam):
+        negative_age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
+        enters, leaves = span
+        crossings.beam[count] = k
+        crossings.spans[0, count] = enters
+        crossings.spans[1, count] = leaves
+        density = spray_boxes.density[b] * exp(negative_age_ns / spray_boxes.decay_ns)
+        crossings.spans[2, count] = density
+
+
+@compiled()
+def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
+    """Write where rays (6, n), which end at `reach` (n,), metres, cross boxes; return the number.
+
+    Rows of rays are origins and directions, `times` (n,) are in ns; `pairs` are `CellPairs`, and
+    `spray_boxes` `SprayBoxes`. As many crossings are written as `crossings` has room for; all are
+    counted.
+    """
+    boxes = spray_boxes.boxes
+    presence_ns = spray_boxes.presence_ns
+    cell = pairs.cell
+    count = 0
+    begin = 0
+    radii = _ball_radii(boxes)
+    while begin < len(cell):
+        end = begin
+        while end < len(cell) and cell[end] == cell[begin]:
+            end += 1
+        first_ray = cell[begin] * pairs.cell_rays
+        for k in range(first_ray, min((cell[begin] + 1) * pairs.cell_rays, len(times))):
+            u = rays[3, k]
+            v = rays[4, k]
+            w = rays[5, k]
+            for pair in range(begin, end):
+                b = pairs.box[pair]
+                p = boxes[b, 0] - rays[0, k]
+                q = boxes[b, 1] - rays[1, k]
+                r = boxes[b, 2] - rays[2, k]
+                ahead = (p * u + q * v) + r * w
+                radius = radii[b]
+                aside_square = (p * p + q * q) + r * r - ahead * ahead
+                if aside_square > radius * radius or ahead > reach[k] + radius:
+                    continue  # the ray misses the ball around the box
+                if not presence_ns[b, 0] <= times[k] <= presence_ns[b, 1]:
+                    continue
+                span = _span_in_box(boxes, b, (p, q, r), (u, v, w), reach[k])
+                if span[0] < span[1]:
+                    _write_crossing(k, b, times[k], span, spray_boxes, crossings, count)
+                    count += 1
+        begin = end
+    return count
+
+
+@stage
+def _column(ranges, guide, part_m, distance):
+    """Return the first column at a distance or farther; numba's search takes long to compile.
+
+    `ranges` are those of the columns, metres, ascending. The search starts at the column of `guide`
+    for the distance, see `_guide`; a part of the guide is `part_m` long.
+    """
+    column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
+    while column < len(ranges) and ranges[column] < distance:
+        column += 1
+    return column
+
+
+@stage
+def _guide(ranges, part_m):
+    """Return columns at which searches for distances start: (_GUIDE_PARTS + 4,).
+
+    `guide[k]` is the first column at `(k - 1) * part_m` or farther: a part early, so that rounding
+    of a distance never starts its search too late.
+    """
+    guide = np.zeros(_GUIDE_PARTS + 4, np.int64)
+    for part in range(1, len(guide)):
+        guide[part] = _column(ranges, guide[part - 1 :], np.inf, part_m * (part - 1))
+    return guide
+
+
+@compiled()
+def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
+
+    `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
+    that the light of each sub-ray reaches, metres. The depth between two clumps, as the mean number
+    of clumps in it, is exponential. Writes `SampledHits`; returns the first crossing that is not
+    sampled yet, and the number of hits.
+    """
+    beam = crossings.beam
+    spans = crossings.spans
+    exponential = tables.exponential
+    starts = keys.starts
+    ranges = tables.by_range[0]
+    part_m = ranges[-1] / _GUIDE_PARTS
+    clumps_per_column = tables.mean / len(ranges)
+    guide = _guide(ranges, part_m)
+    count = 0
+    scan_index = 0
+    while k < len(beam) and count + MAX_CLUMPS <= len(hits.ray):
+        this_beam = beam[k]
+        key = keys.first + this_beam
+        scan_index = scan_row(
+            keys.scan_starts, key, scan_index if keys.scan_starts[scan_index] <= key else 0
+        )
+        scan = keys.scan + scan_index
+        number_in_scan = key - keys.scan_starts[scan_index]
+        clump = 0
+        depth = exponential[np.int64(bits(starts[0], scan, number_in_scan, 0) >> SHIFT_TO_INDEX)]
+        begin = k
+        max_depth = 0.0  # in columns
+        while k < len(beam) and beam[k] == this_beam:
+            first_part = min(spans[0, k] / part_m, _GUIDE_PARTS)
+            last_part = min(spans[1, k] / part_m, _GUIDE_PARTS)
+            columns = guide[np.int64(last_part) + 3] - guide[np.int64(first_part)]
+            max_depth += spans[2, k] * columns
+            k += 1
+        if depth > 1.001 * max_depth * clumps_per_column:
+            continue  # most beams meet too little, by a rough bound
+        k = begin
+        while k < len(beam) and beam[k] == this_beam:
+            rate = spans[2, k] * clumps_per_column  # depth of a column in this box
+            end = _column(ranges, guide, part_m, spans[1, k])
+            position = np.float64(_column(ranges, guide, part_m, spans[0, k]))  # in columns
+            while depth < (end - position) * rate and clump < MAX_CLUMPS:
+                position += depth / rate
+                column = np.int64(position)
+                ray = this_beam * subrays
+                if subrays > 1:
+                    ray += np.int64(
+                        bits(starts[1], scan, number_in_scan, clump) % np.uint64(subrays)
+                    )
+                if ranges[column] < reach[ray]:
+                    quantile = uniform(starts[2], scan, number_in_scan, clump)
+                    write_particle(ray, column, quantile, subrays, tables, hits, count)
+                    count += 1
+                clump += 1
+                index = np.int64(bits(starts[0], scan, number_in_scan, clump) >> SHIFT_TO_INDEX)
+                depth = exponential[index]
+            depth -= (end - position) * rate
+            k += 1
+    return k, count
+
+
+@compiled()
+def attenuate(crossings, subrays, extinction, reach, hits):
+    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray, both ways.
+
+    `extinction` is that of spray of density 1, 1/m; `reach` (beams * subrays,) is the range that
+    the light of each sub-ray reaches, metres.
+    """
+    beam = crossings.beam
+    spans = crossings.spans
+    first = np.full(len(reach) // subrays, len(beam))  # first crossing of each beam
+    for c in range(len(beam)):
+        first[beam[c]] = min(c, first[beam[c]])
+    for k in range(len(hits.ray)):
+        hit_beam = beam_of(hits.ray[k], subrays)
+        depth = 0.0
+        c = first[hit_beam]
+        while c < len(beam) and beam[c] == hit_beam:
+            end = min(min(hits.distance[k], reach[hits.ray[k]]), spans[1, c])
+            depth += spans[2, c] * max(end - spans[0, c], 0.0)
+            c += 1
+        if depth > 0:
+            hits.energy[k] *= exp(-2 * extinction * depth)

@@ -1,0 +1,353 @@
+"""Steps of the simulation: a step is one effect on the pulses of a sensor.
+
+`step_list.py` lists the steps in their order. A step is a class that declares its role, when it
+applies, the columns that it reads and writes, its random numbers and its memory. Nothing else
+decides whether a step acts: how rays are cast follows from the roles of the steps that apply.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from copy import copy
+from dataclasses import dataclass
+from enum import Flag, auto
+from functools import cached_property
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+
+from raybeam import Pattern, SubRays
+
+from ...base.arrays import Floats, Indices, Ints
+from ...base.vectors import turned
+from ...columns.table import VELOCITY
+from ...scene.scene import Scene
+from ...sensor import Fault, Noise, Returns, Sensor, Survey
+from ...sensor.faults import FaultKind
+from ...sensor.random_numbers import Purpose
+from ..casting.motion import CastPoses, Firings
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces
+from ..returns import Keys, Planes, PulseReturns
+
+
+class Role(Flag):
+    """Kinds of effects of a step on pulses; each step declares a flag or several."""
+
+    AIMS = auto()  # deflects beams before they are cast
+    ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
+    CHANGES = auto()  # a ray may then have no return, several, a changed energy or a waveform
+    # as CHANGES, by returns that the receiver adds or joins before `SelectionStep`
+    RECEIVES = auto()
+    # acts once on the selected and thinned-out returns of all pulses that are cast together
+    ON_REPORTED = auto()
+    FRAME = auto()  # casts rays, makes returns of hits or selects returns, for the other steps
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A sensor of a survey in a scene, by which the steps are chosen."""
+
+    scene: Scene
+    survey: Survey
+    number: int  # of the sensor
+    # Roles of all steps that apply, without `Role.FRAME`; None until the steps are chosen.
+    roles: Role | None
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor."""
+        return self.survey.carried[self.number].sensor
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of the sensor."""
+        return self.survey.noise_each[self.number]
+
+    @property
+    def reporting(self) -> Returns:
+        """Beam of the sensor, and the mode that selects the reported returns."""
+        return self.survey.returns_each[self.number]
+
+    @property
+    def half_pulse_m(self) -> float:
+        """Half of the pulse's length in space, metres: the smallest gap between two returns."""
+        return self.reporting.min_gap_m(self.sensor.optics)
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether a stored column needs the radial velocities of returns."""
+        return any(column.name == VELOCITY for column in self.survey.stored_columns)
+
+    @property
+    def leafy(self) -> bool:
+        """Whether the scene has crowns: bodies or voxels with leaves."""
+        crowns = any(m.leaf_area_density is not None for m in self.survey.materials)
+        return crowns or bool(self.scene.has_voxels.any())
+
+    @property
+    def has_onward_light(self) -> bool:
+        """Whether surfaces transmit or mirror light."""
+        glass = any(m.transparent == "pass" for m in self.survey.materials)
+        return glass or self.has_mirrors or self.leafy
+
+    @property
+    def has_mirrors(self) -> bool:
+        """Whether surfaces mirror light."""
+        return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
+
+    @property
+    def refracts(self) -> bool:
+        """Whether light is refracted."""
+        return any(m.refractive_index is not None for m in self.survey.materials)
+
+    @property
+    def in_waveforms(self) -> bool:
+        """Whether returns are found in waveforms."""
+        return self.reporting.waveform != "none"
+
+    @property
+    def waveform_samples(self) -> int:
+        """Samples of the recorded waveform of each return."""
+        return self.survey.waveform_samples
+
+    @property
+    def has_several_returns(self) -> bool:
+        """Whether a ray that hits a surface may have no return or several, instead of a single."""
+        if self.has(Role.CHANGES | Role.RECEIVES):
+            return True
+        dark = any(material.reflectance == 0 for material in self.survey.materials)
+        return self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses
+
+    @property
+    def has_received_returns(self) -> bool:
+        """Whether the receiver adds or joins returns of a pulse before the selection."""
+        return self.has(Role.RECEIVES)
+
+    def has(self, roles: Role) -> bool:
+        """Return True if a step that applies has a role among `roles`.
+
+        Raises
+        ------
+        RuntimeError
+            If the steps are not chosen yet.
+        """
+        if self.roles is None:
+            raise RuntimeError("only a step of Role.FRAME may apply because others do")
+        return bool(self.roles & roles)
+
+    def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
+        """Return the faults of the sensor of these kinds, by their numbers in the survey."""
+        return self.survey.faults_of(self.number, *kinds)
+
+
+class Sizes(NamedTuple):
+    """Numbers of rays and returns in memory, if all rays hit a surface."""
+
+    rays: int  # of all scans whose memory is estimated
+    beams: float  # of one `PulseBatch`
+    subrays: int  # of one `PulseBatch`
+    returns: float  # of `rays`
+    points: float  # returns that become points: every n-th, see `Survey.keep_every`
+
+
+class Memory(NamedTuple):
+    """Peak memory of casting, in bytes."""
+
+    retained: float = 0.0  # from the step until columns are made of the returns
+    casting: float = 0.0  # while the beams of a `PulseBatch` are cast
+    # after all are cast: while returns are counted, and every n-th is kept
+    counting: float = 0.0
+
+
+class Emitter:
+    """Divides the beams of a sensor into sub-rays."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.beam = setup.reporting.beam(setup.sensor.optics)
+        carried = setup.survey.carried[setup.number]
+        # Axis of the head's revolutions, carrier frame: the sub-rays of an oval beam lie across
+        # the axis and towards the axis.
+        axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
+        self._axis = turned(axis, carried.mount.rotation)[0]
+        self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
+
+    def __len__(self) -> int:
+        """Return the number of sub-rays of a beam."""
+        return len(self.beam)
+
+    def subrays_of(
+        self,
+        pattern: Pattern,
+        offsets: Floats | None = None,
+        rows: Ints | None = None,
+        *,
+        by_head: bool = False,
+    ) -> Pattern:
+        """Return the sub-rays of beams.
+
+        Parameters
+        ----------
+        pattern
+            Rays in the middles of the beams.
+        offsets
+            (n, 2): angles that are added to the directions of the n divided beams, radians, see
+            `PulseBatch.deflect`.
+        rows
+            (n,): rows of `pattern` that are divided; by default all.
+        by_head
+            Whether the beams are in the frame of the head, not of the carrier.
+        """
+        if len(self) == 1 and offsets is None:
+            return pattern
+        axis = np.array([0.0, 0, 1]) if by_head else self._axis
+        sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self._about_axis else None)
+        return pattern.divided(sub_rays, offsets, rows)
+
+
+@dataclass(eq=False)
+class PulseBatch:
+    """Consecutive rays of scans that are cast together, and results of steps for later steps.
+
+    `PulseCaster.scan` divides the rays of its scans into such batches. A beam is here a ray of the
+    scans, numbered from 0 at the first scan; a batch has the beams `start` to `stop`.
+    """
+
+    keys: Keys  # scans and ray numbers of all beams of the scans, for random numbers
+    start: int  # number of the batch's first beam
+    stop: int  # one past the last
+    pattern: Pattern  # rays of beams, in the frame of the head or the carrier
+    first: int  # row of beam 0 in the pattern, which repeats
+    poses: CastPoses  # of all beams of the scans
+    firings: Firings  # of all beams of the scans
+    emitter: Emitter
+    # (stop - start, 2): angles added to the directions of beams, radians, see `deflect`
+    offsets: Floats | None = None
+    # Hits of sub-rays on surfaces, with waveforms also in the air, in the order of sub-rays, which
+    # are numbered from 0 at the batch's start.
+    hits: PulseReturns | None = None
+    planes: Planes | None = None  # of `hits`; None if beams have a single sub-ray
+    air: PulseReturns | None = None  # hits in the air that are not among `hits`
+
+    def deflect(self, offsets: Floats) -> None:
+        """Add angles to the directions of the batch's beams before they are cast: (n, 2), radians.
+
+        With `Role.ABOUT_AXIS` the angles are azimuth and elevation, else across and up.
+        """
+        earlier = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
+        self.offsets = earlier + offsets
+
+    def select(self, rows: Indices) -> PulseReturns:
+        """Keep the selected rows of `hits` and `planes`; return the remaining hits."""
+        assert self.hits is not None
+        self.hits = self.hits.take(rows)
+        if self.planes is not None:
+            normals, directions = self.planes
+            self.planes = normals[rows], directions[rows]
+        return self.hits
+
+    @property
+    def subrays_per_beam(self) -> int:
+        """Number of sub-rays of a beam."""
+        return len(self.emitter)
+
+    @cached_property
+    def beams(self) -> Pattern:
+        """Sub-rays of the batch's beams; without offsets, of all rays of the pattern.
+
+        The rows of the batch are those of `window`.
+        """
+        rows = np.arange(self.first + self.start, self.first + self.stop)
+        pattern_rows = None if self.offsets is None else rows
+        return self.emitter.subrays_of(
+            self.pattern, self.offsets, pattern_rows, by_head=self.poses.by_head
+        )
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the batch's firings in `firings`; a batch consists of complete firings."""
+        channels = self.firings.sensor.channels
+        return slice(self.start // channels, self.stop // channels)
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Start and stop of the batch's sub-rays in the rows of `beams`, which repeat."""
+        row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
+        return row, row + (self.stop - self.start) * self.subrays_per_beam
+
+    @cached_property
+    def subray_poses(self) -> CastPoses:
+        """Poses of the batch's sub-rays, which are numbered from 0."""
+        return self.poses.part(self.start, self.stop, self.subrays_per_beam)
+
+    @cached_property
+    def central_rays(self) -> tuple[Floats, Floats]:
+        """Origins (n, 3), metres, and directions (n, 3) of the first sub-ray of each beam.
+
+        The first sub-ray is in the middle of the beam. In the scene frame.
+        """
+        rows = np.arange(self.stop - self.start) * self.subrays_per_beam
+        origins, directions = self.subray_poses.rays(self.beams, rows, self.window[0])
+        return np.broadcast_to(origins, directions.shape), directions
+
+
+class PulseStep(ABC):
+    """An effect on the pulses of a sensor.
+
+    A subclass without a `role` is a TypeError: the role decides how rays are cast.
+    """
+
+    role: ClassVar[Role]
+    effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about the step
+    reads: ClassVar[tuple[str, ...]] = ()  # fields of `PulseReturns` that the step uses
+    writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
+    causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` of the returns that the step adds
+    purposes: ClassVar[tuple[Purpose, ...]] = ()  # of the random numbers of the step
+
+    def __init_subclass__(cls) -> None:
+        if not getattr(cls, "role", None):
+            raise TypeError(f"step {cls.__name__} states no role: set `role` to flags of `Role`")
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        self.setup = setup
+        self.caster = caster
+        self.surfaces = surfaces
+
+    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+        """Return the step for a scene in which instances have moved, with its setup and surfaces.
+
+        By default, a new step is made; a step that takes long to make, and stores no positions of
+        surfaces, returns `repointed`.
+        """
+        return type(self)(setup, self.caster, surfaces)
+
+    def repointed(self, setup: Setup, surfaces: Surfaces) -> Self:
+        """Return a copy of the step with another setup and other surfaces."""
+        step = copy(self)
+        step.setup = setup
+        step.surfaces = surfaces
+        return step
+
+    @staticmethod
+    @abstractmethod
+    def applies(setup: Setup) -> bool:
+        """Return True if the step acts on a sensor, else False."""
+
+    @staticmethod
+    def added(setup: Setup) -> float:
+        """Return the mean number of returns that the step adds to a pulse, or an upper bound."""
+        return 0.0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory that the step takes, in bytes."""
+        return Memory()
+
+    @abstractmethod
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns of a batch after the step.
+
+        Before `SeparationStep` or `WaveformStep` makes returns of hits, `returns` are the hits of
+        sub-rays, with sub-ray numbers in `ray`. A step that changes the hits assigns the result to
+        `batch.hits` as well, and selects hits by `batch.select`.
+        """

@@ -1,0 +1,138 @@
+"""The steps of the simulation, in the order in which pulses pass them."""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+
+from ...scene.scene import Scene
+from ...sensor import Survey
+from .air import WeatherStep
+from .angle_noise import AngleNoiseStep, RippleStep
+from .crosstalk import CrosstalkStep
+from .detection import DetectionStep
+from .false_alarms import FalseAlarmStep
+from .losses import DirtStep, LossStep
+from .paths import CastStep
+from .range_noise import RangeNoiseStep
+from .recording import RecordingStep
+from .saturation import SaturationStep
+from .separation import SelectionStep, SeparationStep
+from .spray import SprayStep
+from .step import PulseStep, Role, Setup
+from .stray_light import StrayLightStep
+from .waveform import WaveformStep
+
+# If no step applies, each ray has one return, its hit.
+STEPS: list[type[PulseStep]] = [
+    AngleNoiseStep,
+    RippleStep,
+    CastStep,  # with mirrors, glass, water and leaves
+    WeatherStep,  # rain, snow, fog and dust
+    SprayStep,
+    DirtStep,  # on the window
+    SeparationStep,  # makes returns of hits, if there are no waveforms
+    WaveformStep,  # makes returns of hits otherwise
+    DetectionStep,
+    StrayLightStep,
+    FalseAlarmStep,
+    CrosstalkStep,
+    SaturationStep,
+    LossStep,  # dead channels and lost packets
+    SelectionStep,
+    RecordingStep,
+    RangeNoiseStep,
+]
+
+
+def setup_of(scene: Scene, survey: Survey, number: int) -> Setup:
+    """Return the setup of a sensor, with the roles of the steps that apply to the sensor."""
+    setup = Setup(scene, survey, number, None)
+    effects = [step for step in STEPS if Role.FRAME not in step.role and step.applies(setup)]
+    roles = reduce(or_, (step.role for step in effects), Role(0))
+    return Setup(scene, survey, number, roles)
+
+
+def steps_of(setup: Setup) -> list[type[PulseStep]]:
+    """Return the steps that apply to a sensor."""
+    return [step for step in STEPS if step.applies(setup)]
+
+
+def received_causes() -> list[int]:
+    """Return the causes, indices into `CAUSES`, of returns that steps of `Role.RECEIVES` add.
+
+    At the points of such returns is nothing that sent light back, so they have no velocity.
+    """
+    return [cause for step in STEPS if Role.RECEIVES in step.role for cause in step.causes]
+
+
+def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> None:
+    """Let the simulation in this process apply a step of another package.
+
+    Parameters
+    ----------
+    step
+        A subclass of `PulseStep`.
+    before
+        The step before which pulses pass the new step. By default, beams are deflected just before
+        they are cast, hits of sub-rays changed just before returns are made of the hits, returns
+        received just before they saturate the receiver, and reported returns changed at the end.
+
+    Raises
+    ------
+    ValueError
+        If the step would have no effect at its position, is of `Role.FRAME`, or is a step already.
+
+    Examples
+    --------
+    >>> class Dimmer(PulseStep):
+    ...     role = Role.CHANGES
+    ...     reads = writes = ("energy",)
+    ...
+    ...     @staticmethod
+    ...     def applies(setup):
+    ...         return setup.sensor.max_range_m > 100
+    ...
+    ...     def apply(self, returns, batch):
+    ...         batch.hits = returns._replace(energy=returns.energy / 2)
+    ...         return batch.hits
+    >>> add_step(Dimmer)
+    >>> STEPS.index(Dimmer) == STEPS.index(SeparationStep) - 1
+    True
+    >>> remove_step(Dimmer)
+    """
+    if step in STEPS:
+        raise ValueError(f"step {step.__name__} is among the steps already")
+    if Role.FRAME in step.role:
+        raise ValueError(f"step {step.__name__} of {Role.FRAME} cannot be added: set other roles")
+    if before is None:
+        before = next((following for role, following in _POSITIONS if role in step.role), None)
+    position = len(STEPS) if before is None else STEPS.index(before)
+    for role, first, last in _SPANS:
+        if role in step.role and not STEPS.index(first) < position <= STEPS.index(last):
+            raise ValueError(
+                f"step {step.__name__} of {role} must be after {first.__name__} and not after "
+                f"{last.__name__}"
+            )
+    if Role.AIMS in step.role and position > STEPS.index(CastStep):
+        raise ValueError(f"step {step.__name__} of {Role.AIMS} must be before {CastStep.__name__}")
+    STEPS.insert(position, step)
+
+
+def remove_step(step: type[PulseStep]) -> None:
+    """Undo `add_step`."""
+    STEPS.remove(step)
+
+
+# {role: the step before which a step of the role is inserted}, the first that matches.
+_POSITIONS = (
+    (Role.AIMS, CastStep),
+    (Role.RECEIVES, SaturationStep),
+    (Role.CHANGES, SeparationStep),
+)
+# (role, first, last): a step of the role acts only after step `first` and not after step `last`.
+# Returns are received once there are returns, and before `SelectionStep` selects returns.
+_SPANS = (
+    (Role.RECEIVES, DetectionStep, SelectionStep),
+    (Role.CHANGES, CastStep, RangeNoiseStep),
+)

@@ -1,0 +1,240 @@
+"""Stray light: a receiver gets a little light of retro-reflectors beside its beam."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
+from ...base.vectors import into_axes, length, products, turned
+from ...columns.table import CAUSES
+from ...scene.scene import Scene
+from ...sensor.materials import MaterialTable
+from ...sensor.random_numbers import Purpose
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import Surfaces, light_of
+from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
+from .detection import passes
+from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
+
+if TYPE_CHECKING:
+    from .stray_loops import RayCells, RetroTriangles, StrayLight
+
+STRAY = Purpose(22, "noise of stray light's energy")
+BLOOMING = CAUSES.index("blooming")
+NEAREST_TRIANGLES = 4  # number of triangles of a cluster, nearest by angle, compared with a ray
+CLUSTER_M = 1.0  # size of a cluster of triangles, which are compared with rays together
+FAINTEST = 0.1  # share of the detection threshold: fainter light is never detected
+
+
+class StrayLightStep(PulseStep):
+    """Adds stray light of retro-reflectors beside beams."""
+
+    role = Role.RECEIVES
+    effects = ("Blooming",)
+    reads = "ray", "distance"
+    writes = RETURN_COLUMNS
+    causes = (BLOOMING,)
+    purposes = (STRAY,)
+
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
+        self._light = light_of(setup.survey, setup.sensor)
+        self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether the noise of the sensor has stray light."""
+        return setup.noise.stray_light > 0
+
+    @staticmethod
+    def memory(setup: Setup, sizes: Sizes) -> Memory:
+        """Return the memory of the causes of returns, and of central rays, in bytes."""
+        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns of a batch with the returns of stray light.
+
+        A beam adds its strongest stray light if the light is detected, in range, visible from the
+        beam's origin, and not within the gap of another return of the beam.
+        """
+        if not self._clusters:
+            return returns
+        noise = self.setup.noise
+        sensor = self.setup.sensor
+        rays = np.arange(batch.start, batch.stop)
+        times = batch.subray_poses.times((rays - batch.start) * batch.subrays_per_beam)
+        light = self._strongest(batch, times)
+        row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
+        scan, number = batch.keys.scan_and_number(rays[row])
+        row = row[passes(noise, STRAY, light.energy[row], scan, number)]
+        distance = np.sqrt(products(light.points[row].T, light.points[row].T))
+        in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
+        row = row[in_range]
+        distance = distance[in_range]
+        origins, _ = batch.central_rays
+        trajectories = batch.subray_poses.actor_trajectories
+        visible = self.caster.is_visible(
+            origins[row], light.points[row], distance, times[row], trajectories
+        )
+        visible &= ~self._has_return(returns, rays[row], distance)
+        row = row[visible]
+        stray = returns_without_surface(
+            returns, rays[row], distance[visible], light.energy[row], BLOOMING
+        )
+        return merged(returns, stray)
+
+    def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
+        """Return the strongest stray light of the central rays of beams.
+
+        `times` (n,) are those of the beams, ns. Points are in the axes of the scene frame.
+        """
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        origins, directions = batch.central_rays
+        count = batch.stop - batch.start
+        light = stray_loops.StrayLight(
+            np.zeros(count), np.zeros((count, 3)), np.zeros(count, np.bool_)
+        )
+        limits = stray_loops.StrayLimits(
+            float(self.setup.sensor.min_range_m),
+            float(self.setup.noise.stray_light),
+            float(FAINTEST * self.setup.noise.threshold),
+            float(self._light.extinction),
+        )
+        chosen = np.zeros(NEAREST_TRIANGLES, np.int64)
+        table = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        for actor, clusters in groupby(self._clusters, key=lambda cluster: cluster.actor):
+            rotations = None
+            positions = np.zeros(3)
+            if actor is not None:
+                positions, rotations = batch.subray_poses.actor_trajectories[actor].poses(0, times)
+            cells = _ray_cells(
+                into_axes(origins - positions, rotations), into_axes(directions, rotations)
+            )
+            light.new[:] = False
+            for cluster in clusters:
+                triangles = self._triangles(cluster, table)
+                stray_loops.find_stray_light(cells, triangles, limits, chosen, light)
+            if rotations is not None:  # back to the scene frame
+                rows = np.flatnonzero(light.new)
+                to_scene = rotations[rows].transpose(0, 2, 1)
+                light.points[rows] = into_axes(light.points[rows], to_scene)
+        return light
+
+    def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
+        """Return the triangles of a cluster for loops, with the light that they return head-on."""
+        from .stray_loops import RetroTriangles
+
+        white = np.ones(len(cluster.triangles))
+        back = table.scattered(self.surfaces.kinds(cluster.triangles), white, white)
+        return RetroTriangles(cluster.corners, *cluster.bounds, back)
+
+    def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
+        """Return whether beams `ray` (n,) have a return near distances (n,), metres: (n,).
+
+        Near is within half of the pulse's length: the receiver cannot tell such returns apart.
+        """
+        first = np.searchsorted(returns.ray, ray, side="left")
+        last = np.searchsorted(returns.ray, ray, side="right")
+        close = np.zeros(len(ray), np.bool_)
+        for number in range(int((last - first).max(initial=0))):
+            rows = np.flatnonzero(first + number < last)
+            return_distance = returns.distance[first[rows] + number]
+            close[rows] |= np.abs(return_distance - distance[rows]) <= self.setup.half_pulse_m
+        return close
+
+
+def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
+    """Return rays (n, 3) for loops, with cones around cells of consecutive rays."""
+    from . import stray_loops
+
+    cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
+    cells = stray_loops.RayCells(owned(origins.T), owned(directions.T), cones)
+    stray_loops.bound_cells(*cells)
+    return cells
+
+
+class _Bounds(NamedTuple):
+    """Bounds of triangles."""
+
+    middles: Floats  # (k, 3)
+    centre: Floats  # (3,): of a ball around the triangles
+    radius: float  # of the ball, metres
+
+
+@dataclass(frozen=True)
+class _RetroCluster:
+    """A cluster of triangles of retro-reflectors."""
+
+    triangles: Ints32  # (k,): numbers among all triangles of the scene
+    corners: Floats  # (k, 3, 3): in the scene frame, or in the frame of an actor
+    actor: int | None = None  # number of the actor; None in the still scene
+
+    @cached_property
+    def bounds(self) -> _Bounds:
+        """Middles of the triangles, and a ball around the triangles."""
+        a, b, c = self.corners.transpose(1, 0, 2)
+        centre = self.corners.reshape(-1, 3).mean(axis=0)
+        radius = float(length(self.corners.reshape(-1, 3) - centre).max())
+        return _Bounds(((a + b) + c) / 3, centre, radius)
+
+
+def _retro_clusters(
+    scene: Scene, surfaces: Surfaces, unseen: Bools | None
+) -> Iterator[_RetroCluster]:
+    """Yield the retro-reflectors of a scene, its instances and actors, in clusters.
+
+    Objects of the mask `unseen` (objects,) are left out.
+    """
+    retro = surfaces.materials.retro
+    owners = surfaces.material_kinds.object
+    if unseen is not None:
+        retro = retro & ~unseen[owners]
+    has_retro = np.zeros(len(scene.all_names), np.bool_)  # by objects
+    has_retro[owners[retro]] = True
+
+    def clusters_of(
+        faces: Integers, vertices: Floats, first: int, actor: int | None = None
+    ) -> Iterator[_RetroCluster]:
+        """Yield the clusters of the retro-reflecting `faces`.
+
+        Triangles of the faces are numbered from `first` on.
+        """
+        rows = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
+        return _clusters(first + rows, vertices[faces[rows]], actor)
+
+    if has_retro[: len(scene.names)].any():
+        yield from clusters_of(scene.faces, scene.vertices, 0)
+    first = len(scene.faces)
+    shared = scene.instances
+    if shared is not None:
+        for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
+            mesh = shared.parts[part]
+            if has_retro[owner]:
+                vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
+                yield from clusters_of(mesh.faces, vertices, first)
+            first += len(mesh.faces)
+    for number, actor in enumerate(scene.actors):
+        faces = actor.mesh.faces
+        if has_retro[len(scene.names) + number]:
+            yield from clusters_of(faces, actor.mesh.vertices, first, number)
+        first += len(faces)
+
+
+def _clusters(
+    triangles: Integers, corners: Floats, actor: int | None = None
+) -> Iterator[_RetroCluster]:
+    """Divide triangles with corners (k, 3, 3) into clusters, by the cells of a grid."""
+    if not len(triangles):
+        return
+    cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)
+    cluster = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    for number in range(int(cluster.max()) + 1):
+        rows = np.flatnonzero(cluster == number)
+        yield _RetroCluster(triangles[rows].astype(np.int32), corners[rows], actor)

@@ -1,0 +1,735 @@
+"""Loops over pulses that sample waveforms and find returns in the samples: see waveform.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined, stage
+
+from ...base.arrays import Bools, Floats, Ints
+from ...base.elementary_loops import exp, log
+from ...sensor.optics import CUT
+from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
+
+# In standard deviations of the system waveform:
+# hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
+NARROW = 0.25
+# two neighbouring hits whose planes meet within this distance are on one surface, see
+# `continue_surfaces`
+MEET = 1.0
+# Gaussians that are farther apart are fitted separately
+APART = 6.0
+# Gaussians that are nearer are one return
+CLOSE = 1.0
+# largest distance that a fit moves a Gaussian from its first guess
+MOVES = 2.0
+
+FAINT = 0.01  # lowest peak that is found, as a share of the highest sample of the waveform
+CURVED = 0.005  # smallest curvature times variance of a Gaussian that is found, as such a share
+TOGETHER = 4  # largest number of Gaussians that are fitted together
+STEPS = 30  # largest number of steps of Levenberg and Marquardt
+GAIN = 1e-3  # share of the sum of squares that a step has to gain for the fit to go on
+ENOUGH = 1e-9  # sum of squares at which a fit stops
+HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
+_AREA = math.sqrt(2 * math.pi)  # of a Gaussian of height and standard deviation 1
+_KEY_STEPS = 1024  # steps of a sample in which times of hits and peaks are compared
+
+
+class WaveMarks(NamedTuple):
+    """Marks of hits in the order of beams and distances: (n,) each."""
+
+    solid: Bools  # whether the hit is on a surface, not in the air
+    # Whether a waveform starts at the hit, after `divide_into_waveforms`; in waveforms that
+    # `search_waveforms` searches, whether a peak does. `make_returns` clears the marks of hits that
+    # continue a surface: then a return starts at each mark.
+    starts: Bools
+    apart: Bools  # whether the surface of the hit before does not continue at the hit
+    searched: Bools  # whether the hit is `solid`, in a waveform too wide for the closed form
+    all_start: Bools  # always True: before a search, `continue_surfaces` takes each hit as a return
+
+
+class WaveHits(NamedTuple):
+    """Hits that have energy, in the order of beams and distances."""
+
+    beam: Ints  # (n,): number of the beam in the batch
+    pulses: PulseHits  # sub-rays, distances and original rows of the hits
+    energy: Floats  # (n,): as if all of the beam were in the hit's sub-ray
+    velocity: Floats  # (n,): radial, m/s; empty if returns have none
+    marks: WaveMarks
+
+
+class WaveLight(NamedTuple):
+    """Light of hits in the order of beams and distances: (n,) each."""
+
+    time: Floats  # samples from range 0
+    energy: Floats  # height of the hit's Gaussian: the hit's share of the energy of the beam
+
+
+class WaveSampling(NamedTuple):
+    """Sampling and search of waveforms."""
+
+    sigma: float  # standard deviation of the system waveform, samples
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
+
+
+class WavePeaks(NamedTuple):
+    """Peak to which each hit belongs, in the waveforms that `search_waveforms` searches."""
+
+    number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
+    # (3, n): time of the peak, samples from range 0, energy, and width as a multiple of that of the
+    # system waveform.
+    shapes: Floats
+
+
+class WaveReturnArrays(NamedTuple):
+    """Arrays to which returns are written: (k,) each."""
+
+    beam: Ints  # number of the beam in the batch
+    row: Ints  # of the strongest hit, in the table of hits before sorting
+    distance: Floats  # metres
+    energy: Floats
+    velocity: Floats  # radial, m/s
+    width: Floats  # as a multiple of the width of the system waveform
+
+    def first(self, count: int) -> WaveReturnArrays:
+        """Return copies of the first `count` returns, which a loop has written."""
+        return WaveReturnArrays(
+            self.beam[:count].copy(),
+            self.row[:count].copy(),
+            self.distance[:count].copy(),
+            self.energy[:count].copy(),
+            self.velocity[:count].copy(),
+            self.width[:count].copy(),
+        )
+
+
+class FitScratch(NamedTuple):
+    """Scratch memory for a fit of up to `TOGETHER` Gaussians to up to `length` samples.
+
+    Heights are shares of the highest sample, positions and widths are in standard deviations of
+    the system waveform.
+    """
+
+    best: Floats  # (3, TOGETHER): heights, positions and widths; first the guess, then the fit
+    guess: Floats  # (3, TOGETHER): the same of the guess
+    trial: Floats  # (3, TOGETHER): the same after the step that is tried
+    lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): Cholesky's lower triangle
+    slopes: Floats  # (3 * TOGETHER, length): derivatives of the sum by each parameter
+    new_slopes: Floats  # (3 * TOGETHER, length)
+    residual: Floats  # (length,)
+    new_residual: Floats  # (length,)
+    step: Floats  # (3 * TOGETHER,)
+
+
+class GaussianScratch(NamedTuple):
+    """Scratch memory for a decomposition of `length` samples into Gaussians: (length,) each."""
+
+    curvature: Floats  # second differences of the samples
+    minima: Ints  # samples where the curvature has a minimum
+    x: Floats  # samples of a piece, in standard deviations of the system waveform
+    y: Floats  # samples of a piece, as shares of the highest sample
+    time: Floats  # of the Gaussians, samples from range 0
+    height: Floats  # in units of the samples
+    width: Floats  # in standard deviations of the system waveform
+    fit: FitScratch
+
+
+class SearchScratch(NamedTuple):
+    """Scratch memory for waveforms of up to `length` samples."""
+
+    samples: Floats  # (length,)
+    peaks: Floats  # (3, length): peaks of a waveform, as in `WavePeaks.shapes`
+    stops: Ints  # (length,): where peaks end, in `_KEY_STEPS` of a sample, from the first sample
+    gaussians: GaussianScratch
+
+
+class SampledWaveform(NamedTuple):
+    """Samples of a part of a waveform."""
+
+    samples: Floats  # (length or more,)
+    length: np.int64
+    first: np.int64  # number of the first sample, counted from range 0
+    top: float  # highest sample
+    sigma: float  # standard deviation of the system waveform, samples
+
+
+@stage
+def _sample(light, begin, stop, first, length, sigma, samples):
+    """Write the sum of the pulses of hits `begin` to `stop`; return the highest sample.
+
+    `samples` are numbered from `first` on; `length` samples are written.
+    """
+    time = light.time
+    energy = light.energy
+    pulse_samples = np.int64(2 * CUT * sigma) + 1
+    for s in range(length):
+        samples[s] = 0.0
+    for k in range(begin, stop):
+        first_of_pulse = np.int64(math.ceil(time[k] - CUT * sigma))
+        for s in range(first_of_pulse - first, first_of_pulse - first + pulse_samples):
+            z = (s + first - time[k]) / sigma
+            samples[s] += energy[k] * exp(-0.5 * (z * z))
+    top = samples[0]
+    for s in range(length):
+        top = max(top, samples[s])
+    return top
+
+
+@inlined
+def _is_peak(samples, s, top):
+    """Return whether a sample is a local maximum that is not too faint."""
+    w = samples[s]
+    return w > samples[s - 1] and w >= samples[s + 1] and w >= FAINT * top
+
+
+@inlined
+def _vertex(samples, peak):
+    """Return the shift (in samples) and the height of the Gaussian through three samples."""
+    if not (samples[peak - 1] > 0 and samples[peak + 1] > 0):
+        return 0.0, samples[peak]
+    log_before = log(samples[peak - 1])
+    log_peak = log(samples[peak])
+    log_behind = log(samples[peak + 1])
+    curve = min(log_before - 2 * log_peak + log_behind, -1e-12)
+    shift = min(max((log_before - log_behind) / (2 * curve), -0.5), 0.5)
+    height = exp(log_peak - (log_behind - log_before) * (log_behind - log_before) / (8 * curve))
+    return shift, height
+
+
+@stage
+def _peaks(wave, stops, peaks):
+    """Write the local maxima of a waveform to `stops` and `peaks`; return their number.
+
+    See `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
+    are the areas between the lowest samples to both sides.
+    """
+    samples = wave.samples
+    length = wave.length
+    top = wave.top
+    count = 0
+    begin = 0
+    s = 1
+    while s < length - 1:
+        if not _is_peak(samples, s, top):
+            s += 1
+            continue
+        peak = s
+        last = s
+        s += 1
+        while s < length:  # to the next peak, or the end
+            if samples[s] < samples[last]:
+                last = s
+            if s < length - 1 and _is_peak(samples, s, top):
+                break
+            s += 1
+        area = 0.0
+        for k in range(begin, last + 1):
+            area += samples[k]
+        shift, height = _vertex(samples, peak)
+        energy = area / (wave.sigma * _AREA)
+        stops[count] = _KEY_STEPS * last
+        peaks[0, count] = peak + wave.first + shift
+        peaks[1, count] = energy
+        peaks[2, count] = energy / height
+        begin = last + 1
+        count = count + 1
+    return count
+
+
+@stage
+def _residual(x, y, sample_count, gaussians, count, residual, slopes):
+    """Write the residual of a sum of `count` Gaussians, and slopes; return the sum of squares.
+
+    `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
+    a `FitScratch`.
+    """
+    for s in range(sample_count):
+        residual[s] = y[s]
+    for k in range(count):
+        height = gaussians[0, k]
+        position = gaussians[1, k]
+        width = gaussians[2, k]
+        for s in range(sample_count):
+            z = (x[s] - position) / width
+            bell = exp(-0.5 * (z * z))
+            residual[s] -= height * bell
+            slope = height * bell * z / width
+            slopes[k, s] = bell
+            slopes[count + k, s] = slope
+            slopes[2 * count + k, s] = slope * z
+    cost = 0.0
+    for s in range(sample_count):
+        cost += residual[s] * residual[s]
+    return cost
+
+
+@stage
+def _solve(lower, size, step):
+    """Solve equations by their Cholesky factor; `step` holds the right side, then the result."""
+    for row in range(size):
+        for k in range(row):
+            step[row] -= lower[row, k] * step[k]
+        step[row] /= lower[row, row]
+    for from_last in range(size):
+        row = size - 1 - from_last
+        for k in range(row + 1, size):
+            step[row] -= lower[k, row] * step[k]
+        step[row] /= lower[row, row]
+
+
+@stage
+def _step(residual, slopes, sample_count, count, damping, lower, step):
+    """Write a step of Levenberg and Marquardt for `count` Gaussians, by Cholesky's method."""
+    size = 3 * count
+    for row in range(size):
+        gradient = 0.0
+        for s in range(sample_count):
+            gradient += slopes[row, s] * residual[s]
+        step[row] = gradient
+        for column in range(row + 1):
+            element = 0.0
+            for s in range(sample_count):
+                element += slopes[row, s] * slopes[column, s]
+            if row == column:
+                element = element * (1 + damping) + 1e-12
+            for k in range(column):
+                element -= lower[row, k] * lower[column, k]
+            if row == column:
+                lower[row, row] = math.sqrt(max(element, 1e-30))
+            else:
+                lower[row, column] = element / lower[column, column]
+    _solve(lower, size, step)
+
+
+@stage
+def _fit(x, y, sample_count, count, scratch):
+    """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x`, by least squares.
+
+    The method is that of Levenberg and Marquardt; the fit stops when a step gains too little, or
+    after `STEPS`. Heights are at most `HIGHEST`, positions within `MOVES` of the guess, and widths,
+    standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess, and
+    receives the fit.
+    """
+    best = scratch.best
+    guess = scratch.guess
+    trial = scratch.trial
+    step = scratch.step
+    slopes = scratch.slopes
+    new_slopes = scratch.new_slopes
+    residual = scratch.residual
+    new_residual = scratch.new_residual
+    for row in range(3):
+        for k in range(count):
+            guess[row, k] = best[row, k]
+    widest = max((x[sample_count - 1] - x[0]) / (4 * count), 1.5)
+    damping = 1e-3
+    cost = _residual(x, y, sample_count, best, count, residual, slopes)
+    for _ in range(STEPS):
+        _step(residual, slopes, sample_count, count, damping, scratch.lower, step)
+        for k in range(count):
+            position = best[1, k] + step[count + k]
+            trial[0, k] = min(max(best[0, k] + step[k], 0.0), HIGHEST)
+            trial[1, k] = min(max(position, guess[1, k] - MOVES), guess[1, k] + MOVES)
+            trial[2, k] = min(max(best[2, k] + step[2 * count + k], 1.0), widest)
+        new_cost = _residual(x, y, sample_count, trial, count, new_residual, new_slopes)
+        better = new_cost < cost
+        converged = better and cost - new_cost <= GAIN * cost
+        converged = converged or new_cost <= ENOUGH or damping >= 1e6
+        if better:
+            for k in range(count):
+                best[0, k] = trial[0, k]
+                best[1, k] = trial[1, k]
+                best[2, k] = trial[2, k]
+            residual, new_residual, slopes, new_slopes = new_residual, residual, new_slopes, slopes
+            cost = new_cost
+        if converged:
+            break
+        damping = damping / 10 if better else damping * 10
+
+
+@stage
+def _find_minima(wave, scratch):
+    """Write the samples at which the second derivative is minimal; return their number.
+
+    Each minimum is the first guess of a Gaussian. `scratch` is a `GaussianScratch`, whose `minima`
+    receive indices of samples.
+    """
+    samples = wave.samples
+    length = wave.length
+    variance = wave.sigma * wave.sigma
+    curvature = scratch.curvature
+    curvature[0] = curvature[length - 1] = 0.0
+    for s in range(1, length - 1):
+        curvature[s] = samples[s - 1] - 2 * samples[s] + samples[s + 1]
+    count = 0
+    for s in range(1, length - 1):
+        minimum = curvature[s] < curvature[s - 1] and curvature[s] <= curvature[s + 1]
+        visible = samples[s] >= FAINT * wave.top
+        if minimum and visible and -curvature[s] * variance >= CURVED * wave.top:
+            scratch.minima[count] = s
+            count += 1
+    return count
+
+
+@stage
+def _fit_piece(wave, begin, stop, first, end, scratch):
+    """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform.
+
+    Writes `time`, `height` and `width` of `scratch`, a `GaussianScratch`, whose `minima` are the
+    guess.
+    """
+    samples = wave.samples
+    sigma = wave.sigma
+    minima = scratch.minima
+    fit = scratch.fit.best
+    origin = minima[begin]
+    total = 0.0
+    area = 0.0
+    for s in range(first, end):
+        scratch.x[s - first] = (s - origin) / sigma
+        scratch.y[s - first] = samples[s] / wave.top
+        total += samples[s]
+    for k in range(begin, stop):
+        s = minima[k]
+        fit[0, k - begin] = min(samples[s], -scratch.curvature[s] * (sigma * sigma)) / wave.top
+        fit[1, k - begin] = (s - origin) / sigma
+        fit[2, k - begin] = 1.0
+    _fit(scratch.x, scratch.y, end - first, stop - begin, scratch.fit)
+    for k in range(stop - begin):
+        area += fit[0, k] * fit[2, k]
+    for k in range(begin, stop):
+        # Samples say nothing about what is beyond a cut, so the energies of a piece are scaled to
+        # the sum of its samples.
+        scratch.height[k] = fit[0, k - begin] * (total / area / (sigma * _AREA))
+        scratch.time[k] = fit[1, k - begin] * sigma + (origin + wave.first)
+        scratch.width[k] = fit[2, k - begin]
+
+
+@stage
+def _sort_gaussians(scratch, count, faintest):
+    """Sort Gaussians by time, without those lower than `faintest`; return their number.
+
+    A fit may move a Gaussian beyond its piece.
+    """
+    time = scratch.time
+    height = scratch.height
+    width = scratch.width
+    sorted_count = 0
+    for k in range(count):
+        if not height[k] >= faintest:
+            continue
+        time_k = time[k]
+        height_k = height[k]
+        width_k = width[k]
+        row = sorted_count
+        while row > 0 and time[row - 1] > time_k:
+            time[row] = time[row - 1]
+            height[row] = height[row - 1]
+            width[row] = width[row - 1]
+            row -= 1
+        time[row] = time_k
+        height[row] = height_k
+        width[row] = width_k
+        sorted_count += 1
+    return sorted_count
+
+
+@stage
+def _join_gaussians(wave, scratch, count, stops, peaks):
+    """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
+
+    See `SearchScratch`. A peak has the sum, mean and variance of its Gaussians, and ends half-way
+    to the next peak.
+    """
+    sigma = wave.sigma
+    time = scratch.time
+    height = scratch.height
+    width = scratch.width
+    peak = 0
+    begin = 0
+    while begin < count:
+        stop = begin
+        energy = 0.0
+        position = 0.0
+        spread = 0.0
+        while stop == begin or (stop < count and time[stop] - time[stop - 1] < CLOSE * sigma):
+            energy += height[stop] * width[stop]
+            position += height[stop] * width[stop] * time[stop]
+            stop += 1
+        position /= energy
+        for k in range(begin, stop):
+            offset = (time[k] - position) / sigma
+            spread += height[k] * width[k] * (width[k] * width[k] + offset * offset)
+        peaks[0, peak] = position
+        peaks[1, peak] = energy
+        peaks[2, peak] = math.sqrt(spread / energy)
+        if peak:
+            middle = (peaks[0, peak - 1] + position) / 2
+            stops[peak - 1] = np.int64(np.rint(middle * _KEY_STEPS)) - _KEY_STEPS * wave.first
+        stops[peak] = _KEY_STEPS * wave.length
+        begin = stop
+        peak = peak + 1
+    return peak
+
+
+@stage
+def _gaussians(wave, scratch, stops, peaks):
+    """Decompose a waveform into Gaussians; write and return the same as `_peaks`.
+
+    Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who take the
+    points of inflection around the minima), none narrower than the system waveform.
+    """
+    minima = scratch.minima
+    count = _find_minima(wave, scratch)
+    # A piece is fitted by itself: `begin` is its first Gaussian, `first` its first sample.
+    begin = 0
+    first = 0
+    while begin < count:
+        stop = begin + 1
+        while (
+            stop < count
+            and stop - begin < TOGETHER
+            and minima[stop] - minima[stop - 1] <= APART * wave.sigma
+        ):
+            stop += 1
+        end = (minima[stop] + minima[stop - 1]) // 2 + 1 if stop < count else wave.length
+        _fit_piece(wave, begin, stop, first, end, scratch)
+        begin = stop
+        first = end
+    count = _sort_gaussians(scratch, count, FAINT * wave.top)
+    return _join_gaussians(wave, scratch, count, stops, peaks)
+
+
+@compiled()
+def order_hits(subrays, ray, distance, energy, row):
+    """Write the rows of hits that have energy to `row[:, 0]`, by beam, then by distance.
+
+    Hits are in the order of rays, which are sub-rays: `subrays` of each beam. `row` is
+    `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
+    of hits that have energy, and the largest number of hits of a beam.
+    """
+    count = 0
+    begin = 0
+    max_hits = 0
+    beam = -1
+    for k in range(len(ray)):
+        if not energy[k] > 0:
+            continue
+        if ray[k] // subrays != beam:
+            begin = count
+            beam = ray[k] // subrays
+        index = count
+        while index > begin and distance[row[index - 1, 0]] > distance[k]:
+            row[index, 0] = row[index - 1, 0]
+            index -= 1
+        row[index, 0] = k
+        count += 1
+        max_hits = max(max_hits, count - begin)
+    return count, max_hits
+
+
+@inlined
+def _end_of_beam(beam, begin):
+    """Return the row after the last hit of a beam whose first hit is row `begin`."""
+    end = begin + 1
+    while end < len(beam) and beam[end] == beam[begin]:
+        end += 1
+    return end
+
+
+@inlined
+def _is_apart(apart, first, end):
+    """Return whether hits `first` to `end` are on more than one surface, by the marks `apart`."""
+    any_apart = False
+    for k in range(first + 1, end):
+        any_apart |= apart[k]
+    return any_apart
+
+
+@compiled()
+def divide_into_waveforms(hits, sigma_m, neighbours, parts):
+    """Mark where waveforms start, and write the waveforms to search; return their number.
+
+    A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
+    that of the hit before. A waveform is searched if its hits are farther apart than `NARROW`, and
+    not on one surface. `hits` are `WaveHits`, whose marks `starts`, `apart` and `searched` are
+    written; `sigma_m` is the standard deviation of the system waveform in range, and `neighbours`
+    are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the hit after the last,
+    of each waveform to search.
+    """
+    beam = hits.beam
+    distance = hits.pulses.distance
+    starts = hits.marks.starts
+    apart = hits.marks.apart
+    searched = hits.marks.searched
+    surface_marks = SurfaceMarks(searched, hits.marks.all_start, apart)
+    count = 0
+    begin = 0
+    while begin < len(beam):
+        end = _end_of_beam(beam, begin)
+        first_part = count
+        first = begin
+        for k in range(begin, end):
+            starts[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
+            apart[k] = True
+            searched[k] = False
+        for k in range(begin + 1, end + 1):
+            if k < end and not starts[k]:
+                continue
+            if distance[k - 1] - distance[first] > NARROW * sigma_m:
+                parts[count, 0] = first
+                parts[count, 1] = k
+                count += 1
+                for hit in range(first, k):
+                    searched[hit] = hits.marks.solid[hit]
+            first = k
+        if count > first_part and len(neighbours.pairs):
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
+        last_part = count
+        count = first_part
+        for part in range(first_part, last_part):
+            if _is_apart(apart, parts[part, 0], parts[part, 1]):
+                parts[count, 0] = parts[part, 0]
+                parts[count, 1] = parts[part, 1]
+                count += 1
+        begin = end
+    return count
+
+
+def scratch_for(length: int) -> SearchScratch:
+    """Return scratch memory for waveforms of up to `length` samples."""
+    size = 3 * TOGETHER
+    fit = FitScratch(
+        best=np.empty((3, TOGETHER)),
+        guess=np.empty((3, TOGETHER)),
+        trial=np.empty((3, TOGETHER)),
+        lower=np.empty((size, size)),
+        slopes=np.empty((size, length)),
+        new_slopes=np.empty((size, length)),
+        residual=np.empty(length),
+        new_residual=np.empty(length),
+        step=np.empty(size),
+    )
+    gaussians = GaussianScratch(
+        curvature=np.empty(length),
+        minima=np.empty(length, np.int64),
+        x=np.empty(length),
+        y=np.empty(length),
+        time=np.empty(length),
+        height=np.empty(length),
+        width=np.empty(length),
+        fit=fit,
+    )
+    peaks = np.empty((3, length))
+    return SearchScratch(np.empty(length), peaks, np.empty(length, np.int64), gaussians)
+
+
+@inlined
+def _peak_of_hit(time, wave, stops, count):
+    """Return the number of the peak, among `count`, to which a hit at a time belongs."""
+    key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
+    number = 0
+    while number < count - 1 and stops[number] < key:
+        number += 1
+    return number
+
+
+@compiled()
+def search_waveforms(light, parts, sampling, starts, peaks, scratch):
+    """Sample waveforms, and write the peak to which each of their hits belongs.
+
+    Waveform k is that of the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
+    `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. Writes `peaks`, `WavePeaks`,
+    and marks in `starts` (n,) the first hits of peaks.
+    """
+    sigma = sampling.sigma
+    time = light.time
+    first_number = 0
+    pulse_samples = np.int64(2 * CUT * sigma) + 1
+    for part in range(len(parts)):
+        begin = parts[part, 0]
+        stop = parts[part, 1]
+        first = np.int64(math.ceil(time[begin] - CUT * sigma)) - 1
+        last_first = np.int64(math.ceil(time[stop - 1] - CUT * sigma))
+        length = last_first + pulse_samples - first + 1
+        top = _sample(light, begin, stop, first, length, sigma, scratch.samples)
+        wave = SampledWaveform(scratch.samples, length, first, top, sigma)
+        if sampling.decomposes:
+            count = _gaussians(wave, scratch.gaussians, scratch.stops, scratch.peaks)
+        else:
+            count = _peaks(wave, scratch.stops, scratch.peaks)
+        for k in range(begin, stop):
+            number = _peak_of_hit(time[k], wave, scratch.stops, count)
+            peaks.number[k] = first_number + number if count else -1
+            for row in range(3):
+                peaks.shapes[row, k] = scratch.peaks[row, number]
+            if k > begin:
+                starts[k] = peaks.number[k] != peaks.number[k - 1]
+        first_number += count
+
+
+@compiled()
+def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+    """Write the returns of the waveforms of beams to `output`, see `waveform.returns_in`.
+
+    `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbours` `pulse_loops.Neighbours`, and `output`
+    is a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in range. A
+    return starts at each mark `starts`, unless the hit continues a surface: such marks are cleared.
+    Hits of a return are one Gaussian with their mean and variance. Returns the number of returns.
+
+    The arrays are taken from their tuples once: numba counts references at each access.
+    """
+    beam = hits.beam
+    energy = hits.energy
+    velocity = hits.velocity
+    distance = hits.pulses.distance
+    number = peaks.number
+    starts = hits.marks.starts
+    surface_marks = SurfaceMarks(hits.marks.solid, starts, starts)
+    count = 0
+    begin = 0
+    while begin < len(beam):
+        end = _end_of_beam(beam, begin)
+        has_several_returns = False
+        for k in range(begin + 1, end):
+            has_several_returns |= starts[k]
+        if has_several_returns and len(neighbours.pairs):
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
+        for k in range(begin + 1, end + 1):
+            if k < end and not starts[k]:
+                continue
+            best = begin
+            sum_energy = 0.0
+            mean_m = 0.0
+            sum_velocity = 0.0
+            spread = 0.0
+            for hit in range(begin, k):
+                sum_energy += energy[hit]
+                mean_m += energy[hit] * distance[hit]
+                if len(velocity):
+                    sum_velocity += energy[hit] * velocity[hit]
+                if energy[hit] > energy[best]:
+                    best = hit
+            mean_m /= sum_energy
+            for hit in range(begin, k):
+                offset = (distance[hit] - mean_m) / sigma_m
+                spread += energy[hit] * (offset * offset)
+            output.beam[count] = beam[begin]
+            output.row[count] = hits.pulses.row[best, 0]
+            output.distance[count] = mean_m
+            output.energy[count] = sum_energy / neighbours.subrays
+            output.velocity[count] = sum_velocity / sum_energy
+            output.width[count] = math.sqrt(1 + spread / sum_energy)
+            # A peak whose hits are all in the return replaces the Gaussian of the hits.
+            if number[begin] >= 0 and number[begin] == number[k - 1]:
+                output.distance[count] = peaks.shapes[0, begin] / samples_per_m
+                output.energy[count] = peaks.shapes[1, begin]
+                output.width[count] = peaks.shapes[2, begin]
+            count += 1
+            begin = k
+    return count

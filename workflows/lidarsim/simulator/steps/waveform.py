@@ -1,0 +1,205 @@
+"""Waveforms: the light of a pulse that a receiver gets over time, and the returns in a waveform.
+
+Pulse and receiver are Gaussian. So a waveform is a sum of Gaussians, one for each hit of a sub-ray,
+as wide as the pulse appears to the receiver: the system waveform (Wagner et al. 2006). Its height
+is in units of energy: a return that no slope has stretched is as high as its energy.
+
+Loops of wave_loops.py find the returns, pulse by pulse, so batches do not change the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...base.arrays import Floats, Ints, owned
+from ...sensor.optics import CUT, FWHM, LIGHT_M_NS
+from ..returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, required
+from .separation import neighbours_of
+from .step import PulseBatch, PulseStep, Role, Setup
+
+if TYPE_CHECKING:
+    from .wave_loops import WaveHits, WavePeaks
+
+
+class WaveformStep(PulseStep):
+    """Finds returns in the waveforms of pulses."""
+
+    role = Role.CHANGES | Role.RECEIVES
+    effects = ("Waveforms",)
+    reads = "ray", "distance", "triangle", "energy", "velocity"
+    writes = *RETURN_COLUMNS, "velocity", "width", "amplitude"
+
+    @staticmethod
+    def applies(setup: Setup) -> bool:
+        """Return whether the sensor finds returns in waveforms."""
+        return setup.in_waveforms
+
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Return the returns in the waveforms of the hits of a batch; their `ray` is the beam."""
+        digitizer = Digitizer.for_sensor(self.setup)
+        in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
+        return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
+
+
+@dataclass(frozen=True)
+class Digitizer:
+    """Settings of a receiver that samples waveforms and searches them for returns."""
+
+    sigma_ns: float  # standard deviation of the system waveform, ns
+    sample_ns: float  # time between samples, ns
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
+
+    @classmethod
+    def for_sensor(cls, setup: Setup) -> Digitizer:
+        """Return the digitizer of a sensor."""
+        reporting = setup.reporting
+        system_ns = reporting.system_ns(setup.sensor.optics)
+        return cls(system_ns, reporting.sample_ns, reporting.waveform == "gaussian")
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the system waveform in range, metres."""
+        return self.sigma_ns * LIGHT_M_NS / 2
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the system waveform, samples."""
+        return self.sigma_ns / self.sample_ns
+
+    @property
+    def reach(self) -> int:
+        """Number of samples before, and behind, the peak of a return where the return is not 0."""
+        return int(np.ceil(CUT * self.sigma))
+
+    @property
+    def samples_per_m(self) -> float:
+        """Samples in a metre of range."""
+        return 2 / LIGHT_M_NS / self.sample_ns
+
+    def amplitude(self, energy: Floats, width: Floats) -> Floats:
+        """Return heights of returns (n,) by energy and full width at half maximum, ns.
+
+        A return as wide as the system waveform is as high as its energy. A width of 0 is unknown,
+        and taken as that of the system waveform.
+        """
+        system_ns = FWHM * self.sigma_ns
+        return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
+
+
+def returns_in(
+    hits: PulseReturns, digitizer: Digitizer, subrays: int = 1, planes: Planes | None = None
+) -> PulseReturns:
+    """Return the returns in the waveforms of beams, in the order of beams and distances.
+
+    Hits that lie close together, or on one surface (see `pulse_loops.continue_surfaces`), are one
+    Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
+    and colour of a return come from its strongest hit.
+
+    Parameters
+    ----------
+    hits
+        Hits of sub-rays, in the order of sub-rays; `ray` is the sub-ray, counted in the batch.
+    digitizer
+        Sampling of the waveforms.
+    subrays
+        Sub-rays of a beam.
+    planes
+        Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+
+    Returns
+    -------
+    Returns whose `ray` is the beam, counted in the batch. Hits without energy are dropped.
+    """
+    from . import wave_loops  # not before: numba takes half a second to import
+
+    wave_hits = _wave_hits(hits, subrays)
+    count = len(wave_hits.beam)
+    neighbours = neighbours_of(subrays, planes)
+    parts = np.empty((count, 2), np.int64)
+    part_count = wave_loops.divide_into_waveforms(wave_hits, digitizer.sigma_m, neighbours, parts)
+    parts = parts[:part_count]
+    peaks = _search(wave_hits, digitizer, subrays, parts)
+    output = wave_loops.WaveReturnArrays(
+        beam=np.empty(count, np.int64),
+        row=np.empty(count, np.int64),
+        distance=np.empty(count),
+        energy=np.empty(count),
+        velocity=np.empty(count),
+        width=np.empty(count),
+    )
+    count = wave_loops.make_returns(
+        wave_hits, digitizer.sigma_m, digitizer.samples_per_m, neighbours, peaks, output
+    )
+    output = output.first(count)
+    width = output.width * (FWHM * digitizer.sigma_ns)
+    return hits.take(output.row)._replace(
+        ray=output.beam,
+        distance=output.distance,
+        energy=output.energy,
+        velocity=None if hits.velocity is None else output.velocity,
+        width=width,
+        amplitude=digitizer.amplitude(output.energy, width),
+    )
+
+
+def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
+    """Return the hits that have energy, sorted by beam, then by distance, for loops.
+
+    `marks.solid` and `marks.all_start` are filled in; loops write the other marks.
+    """
+    from . import pulse_loops, wave_loops
+
+    ray = owned(hits.ray, np.int64)
+    distance = owned(hits.distance)
+    energy = owned(required(hits.energy))
+    row = np.empty((len(ray), 2), np.int64)
+    count, max_hits = wave_loops.order_hits(subrays, ray, distance, energy, row)
+    row = row[:count]
+    order = row[:, 0]
+    pulse_hits = pulse_loops.PulseHits(
+        subray=ray[order],
+        distance=distance[order],
+        row=row,
+        # Scratch memory of `continue_surfaces`.
+        subray_hits=np.empty(max_hits * subrays, np.int64),
+        changes=np.empty(max_hits + 1, np.int64),
+    )
+    marks = wave_loops.WaveMarks(
+        solid=hits.triangle[order] != NO_SURFACE,
+        starts=np.empty(count, np.bool_),
+        apart=np.empty(count, np.bool_),
+        searched=np.empty(count, np.bool_),
+        all_start=np.ones(count, np.bool_),
+    )
+    return wave_loops.WaveHits(
+        beam=pulse_hits.subray // subrays,
+        pulses=pulse_hits,
+        energy=energy[order],
+        velocity=np.zeros(0) if hits.velocity is None else owned(hits.velocity[order]),
+        marks=marks,
+    )
+
+
+def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> WavePeaks:
+    """Return the peaks of hits in waveforms that are searched; mark where peaks start.
+
+    `parts` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
+    `hits.marks.starts`.
+    """
+    from . import wave_loops
+
+    count = len(hits.beam)
+    peaks = wave_loops.WavePeaks(np.full(count, -1), np.empty((3, count)))
+    if not len(parts):
+        return peaks
+    distance = hits.pulses.distance
+    lengths_m = distance[parts[:, 1] - 1] - distance[parts[:, 0]]
+    longest = int(float(lengths_m.max()) * digitizer.samples_per_m)
+    scratch = wave_loops.scratch_for(longest + 2 * digitizer.reach + 8)
+    sampling = wave_loops.WaveSampling(digitizer.sigma, digitizer.decomposes)
+    light = wave_loops.WaveLight(distance * digitizer.samples_per_m, hits.energy / subrays)
+    wave_loops.search_waveforms(light, parts, sampling, hits.marks.starts, peaks, scratch)
+    return peaks
