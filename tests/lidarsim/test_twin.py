@@ -17,6 +17,7 @@ from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.weather import Air, spray
 from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
+from lidarsim.simulator.steps import spray_loops
 from lidarsim.simulator.steps.air import AIR, WeatherStep, exponential, seen_by_range
 from lidarsim.simulator.steps.detection import detected
 from lidarsim.simulator.steps.pulse_loops import SampledHits
@@ -25,7 +26,7 @@ from lidarsim.simulator.steps.range_noise import noisy_ranges
 from lidarsim.simulator.steps.saturation import saturated
 from lidarsim.simulator.steps.separation import Reporting, separated
 from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
-from lidarsim.simulator.steps.step_list import setup_of, spray_loops
+from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
 
 GAP = 0.75
