@@ -1,5 +1,6 @@
 """Pool partitions and pipes for Dask clusters."""
 
+from .background import after_all
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .mapping import Results
@@ -22,6 +23,7 @@ __all__ = [
     "Rule",
     "StageStats",
     "WorkerInfo",
+    "after_all",
     "n_workers",
     "named",
     "own_device",

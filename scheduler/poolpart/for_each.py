@@ -1,10 +1,11 @@
-"""A task of a partition for each item of a pipe, with a bounded number of tasks."""
+"""A task of a partition for each item of a pipe or an iterable, with a bounded number of tasks."""
 
 from __future__ import annotations
 
 import reprlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -22,17 +23,68 @@ if TYPE_CHECKING:
 LOOK_S = 5.0  # between looks at the number of slots
 
 
+class _PipeItems:
+    """Items that come through a pipe, whose producers wait meanwhile."""
+
+    def __init__(self, pipe: Pipe) -> None:
+        self.name = f"pipe {pipe.name!r}"
+        self.closed = False  # no item can come later than now
+        self.drained = False  # there are no further items
+        self._pipe = pipe
+        _ = pipe.client  # a thread of a worker that runs no task would get another client
+
+    def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
+        """Return up to `limit` items, as soon as there are any or a task has ended."""
+        items, self.closed = self._pipe.take_beside(futures, limit, seconds)
+        self.drained = self.closed and not self._pipe.buffered and len(items) < limit
+        return items
+
+    def fail(self, reason: str) -> None:
+        """Let the producers end."""
+        with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
+            self._pipe.fail(reason)
+
+
+class _IterableItems:
+    """Items of an iterable, taken one by one, as a slot is free."""
+
+    name = "the iterable"
+    closed = True  # none comes by itself
+
+    def __init__(self, iterable: Iterable[Any]) -> None:
+        self.drained = False
+        self._iterator = iter(iterable)
+
+    def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
+        """Return the next item, as soon as the iterable has it."""
+        for item in self._iterator:
+            return [item]
+        self.drained = True
+        return []
+
+    def fail(self, reason: str) -> None:
+        """Do nothing: nobody waits."""
+
+
+def _items_of(source: object) -> _PipeItems | _IterableItems:
+    if isinstance(source, Pipe):
+        return _PipeItems(source)
+    if isinstance(source, Iterable):
+        return _IterableItems(source)
+    raise PoolError(f"for_each takes a pipe or an iterable of items, not {source!r}.")
+
+
 class ItemTasks:
-    """Tasks for the items of a pipe, of which at most `window` are under way.
+    """Tasks for the items of a pipe or an iterable, of which at most `window` are under way.
 
     No window is two tasks a slot, so that each slot has the next item at hand. Items that have no
-    task yet stay in the pipe, so that producers wait when the tasks are slower than they are.
+    task yet stay where they are, so that producers wait when the tasks are slower than they are.
     """
 
     def __init__(
         self,
         partition: Partition,
-        pipe: Pipe,
+        source: Pipe | Iterable[Any],
         function: Callable[..., Any],
         window: int | None,
         options: dict[str, Any],
@@ -41,9 +93,9 @@ class ItemTasks:
         check_wait(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
             raise ValueError(f"window is {window!r}; give a whole number, 1 or more.")
-        self.count = 0  # items that have a task, or had
+        self._count = 0  # items that have a task, or had
         self._partition = partition
-        self._pipe = pipe
+        self._items = _items_of(source)
         self._function = function
         self._given_window = window
         self._options = options  # of `Partition.submit`, and keyword arguments of the function
@@ -52,33 +104,40 @@ class ItemTasks:
         self._window = window or 1
         self._next_look = 0.0
         self._wait = WorkerWait(partition.name, "for_each", empty_s)
+        self._stopped = False
 
-    def run(self) -> None:
-        """Run tasks until the pipe is closed and all tasks have ended.
+    def run(self) -> int:
+        """Run tasks until the items and all tasks have ended; return the number of items.
 
-        An error of a task, or of the pipe, cancels the other tasks; the pipe fails with it.
+        An error of a task, or of the items, cancels the other tasks; the pipe fails with it.
         """
-        closed = drained = False
         try:
-            while self._running or not drained:
+            while self._running or not self._items.drained:
                 self._look()
                 free = max(0, self._window - len(self._running))
-                futures = [future for future, _, _ in self._running.values()]
-                if drained or (closed and not free):
+                futures = self._futures()
+                if self._items.drained or (self._items.closed and not free):
                     with suppress(TimeoutError):
                         wait(futures, timeout=LOOK_S, return_when="FIRST_COMPLETED")
                 else:
-                    items, closed = self._pipe.take_beside(futures, free, LOOK_S)
-                    drained = closed and not self._pipe.buffered and len(items) < free
+                    items = self._items.take(futures, free, LOOK_S)
                     self._submit(items)
                 self._check()
         except BaseException as error:
-            self._partition.client.cancel([future for future, _, _ in self._running.values()])
-            if not isinstance(error, PipeFailed):
-                reason = f"{funcname(self._function)} has failed: {error!r}"
-                with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
-                    self._pipe.fail(str(error) if isinstance(error, PoolError) else reason)
+            self._partition.client.cancel(self._futures())
+            reason = f"{funcname(self._function)} has failed: {error!r}"
+            self._items.fail(str(error) if isinstance(error, PoolError) else reason)
             raise
+        return self._count
+
+    def stop(self) -> None:
+        """End `run` in another thread: cancel the tasks, and fail the pipe."""
+        self._stopped = True
+        self._items.fail(f"for_each of {funcname(self._function)} was cancelled")
+        self._partition.client.cancel(self._futures())
+
+    def _futures(self) -> list[Future]:
+        return [future for future, _, _ in list(self._running.values())]
 
     def _look(self) -> None:
         """Read the number of slots: partitions grow, shrink, and lose workers.
@@ -98,14 +157,18 @@ class ItemTasks:
         self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self, items: Sequence[Any]) -> None:
-        """Submit a task for each item."""
+        """Submit a task for each item, unless this was stopped."""
         for item in items:
+            if self._stopped:
+                raise CancelledError
             future = self._partition.submit(self._function, item, **self._options)
-            self._running[future.key] = future, self.count, item
-            self.count += 1
+            self._running[future.key] = future, self._count, item
+            self._count += 1
 
     def _check(self) -> None:
-        """Forget tasks that have ended; raise the error of a failed task."""
+        """Forget tasks that have ended; raise the error of a failed task, or that this stopped."""
+        if self._stopped:
+            raise CancelledError
         ended = [key for key, (future, _, _) in self._running.items() if future.done()]
         for key in ended:
             future, number, item = self._running.pop(key)
@@ -115,6 +178,6 @@ class ItemTasks:
                 except Exception as error:
                     shown = reprlib.repr(item)
                     error.add_note(
-                        f"poolpart: this was item {number} of pipe {self._pipe.name!r}: {shown}"
+                        f"poolpart: this was item {number} of {self._items.name}: {shown}"
                     )
                     raise

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
-from typing import Any, Self
+from typing import Any, Literal, Self, overload
 
 import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
+from .background import in_background
 from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
 from .for_each import ItemTasks
@@ -289,30 +291,58 @@ class Partition:
         )
         return Results(stage, iterables)
 
+    @overload
     def for_each(
         self,
-        pipe: Pipe,
+        items: Pipe | Iterable[Any],
         function: Callable[..., Any],
         /,
         *,
+        wait: Literal[True] = ...,
+        **options: Any,
+    ) -> int: ...
+
+    @overload
+    def for_each(
+        self,
+        items: Pipe | Iterable[Any],
+        function: Callable[..., Any],
+        /,
+        *,
+        wait: Literal[False],
+        **options: Any,
+    ) -> concurrent.futures.Future[int]: ...
+
+    def for_each(
+        self,
+        items: Pipe | Iterable[Any],
+        function: Callable[..., Any],
+        /,
+        *,
+        wait: bool = True,
         window: int | None = None,
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
         empty_s: float = WAIT_S,
         **kwargs: Any,
-    ) -> int:
-        """Call a function for each item that comes through a pipe, in a task each.
+    ) -> int | concurrent.futures.Future[int]:
+        """Call a function for each item of a pipe or an iterable, in a task each.
 
-        It returns once the pipe is closed and all tasks are done. A bounded number of tasks is
-        under way. Further items wait in the pipe, so that producers wait when it is full. An item
-        whose worker dies is run on another; several `for_each` may share a pipe.
+        It ends once the pipe is closed, or the iterable is at its end, and all tasks are done. A
+        bounded number of tasks is under way. Further items wait in the pipe, so that producers wait
+        when it is full. An item whose worker dies is run on another; several `for_each` may share a
+        pipe.
 
         Parameters
         ----------
-        pipe, function
+        items, function
             The function gets an item, or the result of a future that a `distributed.Queue` has
-            put. Its result is dropped: it may put something into another pipe.
+            put or an iterable has. Its result is dropped: it may put something into another pipe.
+            The next item of an iterable is taken when a slot is free for it; an error of a task is
+            noticed after that. ``as_completed(futures)`` is an iterable of futures as they end.
+        wait
+            False returns a future at once; a thread of this process submits the tasks.
         window
             Tasks under way at most. By default two for each slot, whose number may change
             meanwhile.
@@ -326,8 +356,10 @@ class Partition:
 
         Returns
         -------
-        int
-            Number of items.
+        int or concurrent.futures.Future
+            Number of items, or without `wait` a future of this number. ``future.cancel()`` cancels
+            the tasks that have not started, and the pipe fails, so that producers end. It returns
+            False once all is done. The tasks go on if the future is dropped.
 
         Raises
         ------
@@ -338,20 +370,23 @@ class Partition:
             wait. The pipe fails with it.
         Exception
             What the function raises first; a note names the item. The pipe fails with it, so that
-            producers end, and tasks that have not started are cancelled.
+            producers end, and tasks that have not started are cancelled. Without `wait`, the future
+            has these errors.
 
         Examples
         --------
         >>> gpu.for_each(scans, cast, scene=scene)                       # doctest: +SKIP
+        36
+        >>> casting = gpu.for_each(scans, cast, wait=False)              # doctest: +SKIP
+        >>> casting.result()                                             # doctest: +SKIP
         36
         """
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_TASKS)
         self._taking(slots)
-        tasks = ItemTasks(self, pipe, function, window, options, empty_s)
-        tasks.run()
-        return tasks.count
+        tasks = ItemTasks(self, items, function, window, options, empty_s)
+        return tasks.run() if wait else in_background(tasks.run, tasks.stop)
 
     # -- collections and data ----------------------------------------------------------
 

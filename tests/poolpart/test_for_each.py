@@ -1,11 +1,12 @@
 """A function for each item of a pipe: each once, on its partition, no faster than it can."""
 
+import concurrent.futures
 import itertools
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client, Event, Queue
+from distributed import Client, Event, Queue, as_completed
 from tests.poolpart.helpers import LONG_S, join, leave, wait_for, worker_name
 
 from poolpart import Partition, Pipe, PipeClosed, PipeFailed, PoolError
@@ -203,3 +204,91 @@ def test_an_unreadable_item_ends_it_with_the_error_of_the_item(client, a, make_p
         a.for_each(pipe, abs)
     with pytest.raises(PipeFailed, match="not a number"):
         Pipe(pipe.name, client=client).get()
+
+
+def test_without_waiting_it_returns_a_future_of_the_number_of_items(client, a, make_pipe):
+    pipe = make_pipe(client, capacity=2)
+    squares = make_pipe(client, capacity=10)
+    count = a.for_each(pipe, put_square, squares=squares, wait=False)
+    pipe.put_many(range(5))  # more than the pipe holds
+    assert not count.done()
+    pipe.close()
+    assert count.result(LONG_S) == 5
+    assert sorted(squares.poll()) == [0, 1, 4, 9, 16]
+
+
+def test_a_future_has_the_first_error(client, a, make_pipe):
+    pipe = make_pipe(client)
+    count = a.for_each(pipe, invert, wait=False)
+    pipe.put_many([4, 0])
+    error = count.exception(LONG_S)
+    assert isinstance(error, ZeroDivisionError)
+    assert error.__notes__ == [f"poolpart: this was item 1 of pipe {pipe.name!r}: 0"]
+
+
+def test_a_cancelled_future_ends_tasks_and_producers(client, b, make_pipe, wait_until):
+    pipe = make_pipe(client)
+    event = Event(f"cancelled-{time.time()}", client)
+    count = b.for_each(pipe, wait_for, window=2, wait=False)
+    pipe.put_many([event.name] * 5)
+    wait_until(lambda: pipe.depth == 3)  # two have a task, one of which runs
+    assert count.cancel()
+    assert concurrent.futures.wait([count], LONG_S).done == {count}
+    with pytest.raises(PipeFailed, match="for_each of wait_for was cancelled"):
+        pipe.put("more")
+    event.set()
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+
+
+def test_items_of_an_iterable_are_taken_as_slots_are_free(client, b, make_pipe, wait_until):
+    event = Event(f"slow-{time.time()}", client)
+    taken = []
+
+    def names():
+        for number in range(9):
+            taken.append(number)
+            yield event.name
+
+    count = b.for_each(names(), wait_for, window=2, wait=False)
+    wait_until(lambda: len(taken) == 2)
+    wait_until(lambda: b.stats().running == 1)
+    assert len(taken) == 2
+    event.set()
+    assert count.result(LONG_S) == len(taken) == 9
+
+
+def test_an_endless_iterable_can_be_cancelled(client, a, wait_until):
+    numbers = itertools.count()
+    count = a.for_each(numbers, abs, wait=False)
+    wait_until(lambda: not repr(numbers).endswith("(0)"))
+    assert count.cancel()
+    concurrent.futures.wait([count], LONG_S)
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+
+
+def test_futures_as_they_end_are_items(client, a, b, make_pipe):
+    roots = make_pipe(client, capacity=10)
+    futures = [b.submit(pow, number, 2) for number in range(4)]
+    assert a.for_each(as_completed(futures), put_square, squares=roots) == 4
+    assert sorted(roots.poll()) == [0, 1, 16, 81]
+
+
+def test_an_error_of_an_iterable_or_of_its_items(client, a):
+    with pytest.raises(ZeroDivisionError):
+        a.for_each((1 / n for n in (1, 0)), abs)
+    with pytest.raises(ZeroDivisionError) as caught:
+        a.for_each([1, 0], invert)
+    assert caught.value.__notes__ == ["poolpart: this was item 1 of the iterable: 0"]
+    with pytest.raises(PoolError, match="takes a pipe or an iterable of items, not 5"):
+        a.for_each(5, abs)
+
+
+def test_the_pipe_fails_with_an_error_of_another_pipe_that_the_function_uses(client, a, make_pipe):
+    pipe = make_pipe(client)
+    outlet = make_pipe(client)
+    outlet.fail("the disk is full")
+    pipe.put(1)
+    with pytest.raises(PipeFailed, match="the disk is full"):
+        a.for_each(pipe, outlet.put)
+    with pytest.raises(PipeFailed, match="the disk is full"):
+        pipe.put(2)

@@ -1,0 +1,105 @@
+"""Calls in threads of this process, and futures of their results.
+
+The futures are those of `concurrent.futures`, so that `concurrent.futures.wait` and
+`asyncio.wrap_future` take them. A future of Dask has a task on the scheduler; these have none.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections.abc import Callable, Iterable
+from contextvars import copy_context
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, TypeVar
+
+from distributed import Future
+
+from .internals.client import when_done
+
+Result = TypeVar("Result")
+AnyFuture = Future | concurrent.futures.Future[Any]
+
+
+def in_background(
+    call: Callable[[], Result], stop: Callable[[], object] = lambda: None
+) -> concurrent.futures.Future[Result]:
+    """Make a call in a thread; return a future of its result or error.
+
+    `Future.cancel` takes effect at once, and calls `stop`, which should end the call. The thread
+    does not keep this process alive.
+    """
+    # The future is never marked as running: then it could not be cancelled any more.
+    future: concurrent.futures.Future[Result] = concurrent.futures.Future()
+    future.add_done_callback(lambda ended: stop() if ended.cancelled() else None)
+    context = copy_context()  # has the annotations of Dask
+
+    def run() -> None:
+        try:
+            result = context.run(call)
+        except BaseException as error:
+            _end(future, future.set_exception, error)
+        else:
+            _end(future, future.set_result, result)
+
+    Thread(target=run, name="poolpart-background", daemon=True).start()
+    return future
+
+
+def _end(
+    future: concurrent.futures.Future[Any], set_outcome: Callable[[Any], None], outcome: Any
+) -> None:
+    """Set the result or the error of a future, unless it was cancelled."""
+    try:
+        set_outcome(outcome)
+    except concurrent.futures.InvalidStateError:
+        future.set_running_or_notify_cancel()  # only now `concurrent.futures.wait` sees it
+
+
+def after_all(
+    futures: Iterable[AnyFuture], function: Callable[[list[Any]], Result]
+) -> concurrent.futures.Future[Result]:
+    """Call `function(results)` once all futures have succeeded; returns a future of its result.
+
+    The function is called in this process, in a thread. To call it on a partition, give the futures
+    to a task: ``partition.submit(function, futures)``.
+
+    Parameters
+    ----------
+    futures
+        Futures of Dask, and those that `Partition.for_each`, `after_all` and the executors of
+        Python return. The results are in the same order.
+    function
+        Is not called if a future fails or is cancelled: then the returned future fails at once,
+        with the same error.
+
+    Returns
+    -------
+    concurrent.futures.Future
+        Its `cancel` keeps the function from being called. It cancels none of `futures`.
+
+    Examples
+    --------
+    >>> best = after_all([other.submit(plan, t) for t in range(5)], min)   # doctest: +SKIP
+    >>> best.result()                                                      # doctest: +SKIP
+    7
+    """
+    futures = list(futures)
+    # Futures as they end; None once the call is cancelled.
+    ended: SimpleQueue[AnyFuture | None] = SimpleQueue()
+    for future in futures:
+        if isinstance(future, Future):
+            when_done(future, ended.put)
+        else:
+            future.add_done_callback(ended.put)
+
+    def wait_and_call() -> Result:
+        for _ in futures:
+            future = ended.get()
+            if future is None:
+                raise concurrent.futures.CancelledError
+            if not isinstance(future, Future) or future.status != "finished":
+                future.result()  # raises the error of the future
+        return function([future.result() for future in futures])
+
+    return in_background(wait_and_call, lambda: ended.put(None))
