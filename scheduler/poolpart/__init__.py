@@ -3,6 +3,7 @@
 from .background import after_all
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
+from .listening import Listener
 from .mapping import Results
 from .partition import Partition
 from .pipe import Pipe
@@ -12,6 +13,7 @@ from .stats import PartitionStats, StageStats
 from .workers import WorkerInfo
 
 __all__ = [
+    "Listener",
     "Partition",
     "PartitionStats",
     "Pipe",

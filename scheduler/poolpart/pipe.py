@@ -35,6 +35,7 @@ from .internals.client import ask
 from .internals.names import PIPES, require
 from .internals.queues import Packed, unpack
 from .internals.worker import task_of_thread
+from .listening import Listener
 from .pipe_states import (
     CHANGE,
     PUT,
@@ -470,6 +471,32 @@ class Pipe:
         with suppress(PipeClosed):
             while True:
                 yield self.get()
+
+    def listen(self, function: Callable[[Any], Any]) -> Listener:
+        """Call a function for each item, in this process, until the pipe ends; does not wait.
+
+        The calls are in the order of the items, in one thread. This process is any consumer of the
+        pipe: items that others take do not come here.
+
+        Parameters
+        ----------
+        function
+            If it raises an error, it is not called again, and the pipe fails with the error, so
+            that producers end.
+
+        Returns
+        -------
+        Listener
+            Its `close` waits for the end of the pipe and of the last call, and raises the error of
+            the function. A ``with`` block closes it.
+
+        Examples
+        --------
+        >>> with hits.listen(print):                                     # doctest: +SKIP
+        ...     gpu.submit(cast, scans, hits).result()
+        """
+        _ = self.client  # the thread of the listener would get another client on a worker
+        return Listener(self, function)
 
 
 def _deadline(timeout_s: float | None) -> float:
