@@ -1,6 +1,7 @@
 """Pool partitions and pipes for Dask clusters."""
 
 from .background import after_all
+from .cancelling import cancelled
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .listening import Listener
@@ -26,6 +27,7 @@ __all__ = [
     "StageStats",
     "WorkerInfo",
     "after_all",
+    "cancelled",
     "n_workers",
     "named",
     "own_device",

@@ -15,10 +15,11 @@ from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
 from .background import in_background
+from .cancelling import ask_to_cancel
 from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
 from .for_each import ItemTasks
-from .internals.names import MAP, require
+from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .notebook import table_of_partitions
@@ -387,6 +388,62 @@ class Partition:
         self._taking(slots)
         tasks = ItemTasks(self, items, function, window, options, empty_s)
         return tasks.run() if wait else in_background(tasks.run, tasks.stop)
+
+    def cancel(
+        self,
+        futures: Future | Iterable[Future],
+        *,
+        running: Literal["continue", "restart"] = "continue",
+    ) -> dict[Any, str]:
+        """Cancel tasks of this partition; returns what happened to each.
+
+        Parameters
+        ----------
+        futures
+            Futures of the tasks, also if they were cancelled before.
+        running
+            What to do with tasks that run. Dask does not stop them: they keep their slot until
+            their function returns, which can look whether it was `cancelled`. With "restart", a
+            worker that runs nothing but such tasks is restarted by its nanny, and comes back to
+            the partition. A worker is never restarted if it has another task, an actor, or a
+            result that no other worker has.
+
+        Returns
+        -------
+        dict
+            {key: what happened}, a text that begins with one of these words. ``cancelled``: it
+            will not run. ``ended``: it had ended before; its result is gone. ``running: …``: it
+            still runs, on which worker, and why that was not restarted. ``restarted: …``: its
+            worker was restarted. ``kept: …``: somebody else wants its result.
+
+        Raises
+        ------
+        PoolError
+            If a task is of another partition; then nothing is cancelled.
+
+        Examples
+        --------
+        >>> future = gpu.submit(time.sleep, 3600)                        # doctest: +SKIP
+        >>> gpu.cancel(future, running="restart")                        # doctest: +SKIP
+        {'sleep-1f3a': 'restarted: worker GPU-0'}
+        """
+        require(CANCELLING)
+        if running not in ("continue", "restart"):
+            raise ValueError(f'running is {running!r}; give "continue" or "restart".')
+        tasks = {}
+        for task in [futures] if isinstance(futures, Future) else futures:
+            if not isinstance(task, Future):
+                raise PoolError(f"Partition.cancel takes futures of Dask, not {task!r}.")
+            tasks[task.key] = task
+        outcomes = {
+            key: "ended" if task.status in ("finished", "error") else "cancelled"
+            for key, task in tasks.items()
+        }
+        outcomes |= ask_to_cancel(tasks, self, running == "restart")
+        self.client.cancel(
+            [task for key, task in tasks.items() if not outcomes[key].startswith("kept")]
+        )
+        return outcomes
 
     # -- collections and data ----------------------------------------------------------
 

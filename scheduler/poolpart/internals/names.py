@@ -34,6 +34,7 @@ FETCHING = "fetching results straight from workers"
 PAGE = "the page of partitions"
 CLUSTERS = "clusters with several kinds of workers"
 ADAPTING = "adaptive partitions"
+CANCELLING = "Partition.cancel"
 
 
 @dataclass(frozen=True)
@@ -267,6 +268,27 @@ PRIVATE_NAMES = (
             "test_adapting.py::test_no_task_is_lost_or_run_again_while_workers_come_and_go",
             "test_adapting.py::test_a_worker_is_kept_for_what_would_be_lost_with_it",
             "test_adapting.py::test_a_worker_whose_job_was_cancelled_too_late_gets_no_task",
+        ),
+    ),
+    PrivateNames(
+        CANCELLING,
+        (
+            f"{_SCHEDULER}.stimulus_cancel(keys, client, force, reason, msg)",
+            f"{_SCHEDULER}.restart_workers(workers, timeout, stimulus_id)",
+            f"{_SCHEDULER}.handle_worker_status_change",
+            f"{_SCHEDULER}.stream_comms",
+            f"{_SCHEDULER_TASK}.processing_on",
+            f"{_SCHEDULER_WORKER}.processing",
+            f"{_SCHEDULER_WORKER}.has_what",
+            f"{_SCHEDULER_WORKER}.actors",
+            f"{_SCHEDULER_WORKER}.nanny",
+            f"{_WORKER_STATE}.all_running_tasks",
+            f"{_WORKER_TASK}.state",
+        ),
+        "a worker that runs nothing but cancelled tasks is restarted",
+        (
+            "test_cancelling.py::test_a_worker_with_nothing_but_cancelled_tasks_is_restarted",
+            "test_cancelling.py::test_a_function_sees_that_it_was_cancelled",
         ),
     ),
 )

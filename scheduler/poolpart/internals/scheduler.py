@@ -166,8 +166,16 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set
 
 
 def is_idle(scheduler: Any, worker: Any) -> bool:
-    """Return whether a worker has no task, and no result that no further worker has."""
-    if worker.status is not Status.running or worker.processing or worker.actors:
+    """Return whether a running worker has no task, and no result that no further worker has."""
+    return worker.status is Status.running and holds_nothing(scheduler, worker)
+
+
+def holds_nothing(scheduler: Any, worker: Any) -> bool:
+    """Return whether a worker has no task, and no result that no further worker has.
+
+    It may still run tasks that the scheduler has forgotten.
+    """
+    if worker.processing or worker.actors:
         return False
     stealing = scheduler.extensions.get("stealing")
     moves = stealing.in_flight.values() if stealing else ()
@@ -207,6 +215,24 @@ def turn_away(scheduler: Any, worker: Any) -> None:
     """Close a joining worker before the worker gets tasks."""
     shut(scheduler, worker)
     scheduler.close_worker(worker.address)
+
+
+def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
+    """Cancel tasks for a client, by its id, as `Client.cancel` does; skip unknown tasks."""
+    scheduler.stimulus_cancel(
+        list(keys), client=client, force=False, reason="unknown", msg="by Partition.cancel"
+    )
+
+
+async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
+    """Have a worker restarted by its nanny; return False if it is not back in time."""
+    try:
+        await scheduler.restart_workers(
+            [worker.address], timeout=seconds, stimulus_id=f"poolpart-restart-{time.time()}"
+        )
+    except TimeoutError:
+        return False
+    return True
 
 
 def is_bound(task: Any) -> bool:

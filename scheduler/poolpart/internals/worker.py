@@ -14,6 +14,11 @@ def has_running_tasks(dask_worker: Any = None) -> bool:
     return bool(dask_worker.state.all_running_tasks)
 
 
+def running_keys(worker: Any) -> list[Any]:
+    """Return the keys of the tasks that a worker runs, also of cancelled tasks."""
+    return [task.key for task in worker.state.all_running_tasks]
+
+
 # -- what a worker declares --------------------------------------------------------------
 
 

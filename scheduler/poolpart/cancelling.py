@@ -1,0 +1,143 @@
+"""Cancelling tasks, also while they run.
+
+Dask does not stop a function that runs: its thread goes on, and keeps the task's slot. The function
+can look (`cancelled`), or the worker process can be restarted, if nothing else would be lost. The
+scheduler decides that in two steps, as for idle workers of `adapting.py`: it gives the worker no
+further tasks, and then asks the worker what it runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from distributed import Future, Status
+
+from .errors import PoolError
+from .fetch import holds_for_driver
+from .internals.scheduler import asks_for, call, cancel_keys, holds_nothing, reopen, restart, shut
+from .internals.worker import running_keys, task_of_thread
+from .workers import on_scheduler
+
+if TYPE_CHECKING:
+    from .partition import Partition
+
+Outcomes = dict[Any, str]  # {key of a task: what happened}
+
+ARRIVAL_S = 1.0  # for a task to arrive at the scheduler, by another connection than the request
+ANSWER_S = 5.0  # for a worker to say what it runs; a function may hold its interpreter
+RESTART_S = 60.0  # for a worker to come back
+
+
+def cancelled() -> bool:
+    """Return whether the task that calls this function was cancelled.
+
+    For functions that run long: Dask does not stop them, and they keep their slot. Call it now and
+    then, in the thread of the task, and return if it is True. Outside tasks it is False.
+
+    Examples
+    --------
+    >>> def search(start):                                               # doctest: +SKIP
+    ...     while not cancelled():
+    ...         start = improve(start)
+    """
+    running = task_of_thread()
+    return running is not None and running[1].state == "cancelled"
+
+
+def ask_to_cancel(tasks: Mapping[Any, Future], partition: Partition, restarts: bool) -> Outcomes:
+    """Cancel tasks of a partition, by key, on the scheduler; see `Partition.cancel`.
+
+    Returns {key: what happened}, without tasks that had not started, or had ended.
+    """
+    client = partition.client
+    outcomes, complaint = on_scheduler(
+        client,
+        _cancel_tasks,
+        keys=list(tasks),
+        pending_keys=[key for key, task in tasks.items() if task.status == "pending"],
+        name=partition.name,
+        asking=client.id,
+        restarts=restarts,
+    )
+    if complaint:
+        raise PoolError(complaint)
+    return dict(outcomes)
+
+
+async def _cancel_tasks(
+    keys: Collection[Any],
+    pending_keys: Collection[Any],
+    name: str,
+    asking: str,
+    restarts: bool,
+    dask_scheduler: Any = None,
+) -> tuple[Outcomes, str]:
+    """Return the outcomes and "", or no outcomes and the message of a PoolError."""
+    scheduler = dask_scheduler
+    deadline = time.monotonic() + ARRIVAL_S
+    while not scheduler.tasks.keys() >= {*pending_keys} and time.monotonic() < deadline:
+        await asyncio.sleep(0.01)
+    known = {key: scheduler.tasks[key] for key in keys if key in scheduler.tasks}
+    for key, task in known.items():
+        if not asks_for(task, [name]):
+            return {}, f"Task {key!r} is not of partition {name!r}: nothing was cancelled."
+    workers = {key: task.processing_on for key, task in known.items()}
+    cancel_keys(scheduler, keys, asking)
+    kept = [key for key in known if key in scheduler.tasks]
+    outcomes: Outcomes = dict.fromkeys(kept, "kept: another client wants its result")
+    members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
+    loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
+    affected: dict[Any, list[Any]] = {}  # {worker: keys of cancelled tasks that it runs}
+    for worker, load in zip(members, loads, strict=True):
+        if load is None:  # such a task may keep it from answering
+            silent = [key for key, at in workers.items() if at is worker and key not in outcomes]
+            outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not answer")
+        elif running := [key for key in load.running if key in keys and key not in outcomes]:
+            affected[worker] = running
+    ends = (_end(scheduler, worker, running, restarts) for worker, running in affected.items())
+    for running, outcome in zip(affected.values(), await asyncio.gather(*ends), strict=True):
+        outcomes |= dict.fromkeys(running, outcome)
+    return outcomes, ""
+
+
+async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
+    """Restart a worker, if it has nothing but cancelled tasks; return what happened."""
+    still_running = f"running: worker {worker.name}"
+    if not restarts:
+        return still_running
+    if not worker.nanny:
+        return f"{still_running} has no nanny to restart it"
+    if worker.status is not Status.running:
+        return f"{still_running} is {worker.status.name}"
+    shut(scheduler, worker)  # in this step of the event loop: no task can arrive before
+    load = await _load(scheduler, worker)
+    alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
+    if not alone or not holds_nothing(scheduler, worker):
+        reopen(scheduler, worker)
+        return f"{still_running} has another task or result"
+    if await restart(scheduler, worker, RESTART_S):
+        return f"restarted: worker {worker.name}"
+    return f"restarted: worker {worker.name}, which is not back after {RESTART_S:g} s"
+
+
+class _Load(NamedTuple):
+    """What a worker itself knows that it has."""
+
+    running: list[Any]  # keys of tasks, also of cancelled tasks that the scheduler has forgotten
+    holds_results: bool  # that a driver has not fetched yet
+
+
+async def _load(scheduler: Any, worker: Any) -> _Load | None:
+    """Ask a worker for its load; None if it does not answer."""
+    try:
+        load: _Load = await asyncio.wait_for(call(scheduler, worker.address, _load_here), ANSWER_S)
+    except (OSError, TimeoutError):
+        return None
+    return load
+
+
+def _load_here(dask_worker: Any = None) -> _Load:
+    return _Load(running_keys(dask_worker), holds_for_driver())
