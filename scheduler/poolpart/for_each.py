@@ -124,7 +124,7 @@ class ItemTasks:
                     self._submit(items)
                 self._check()
         except BaseException as error:
-            self._partition.client.cancel(self._futures())
+            self._cancel()
             reason = f"{funcname(self._function)} has failed: {error!r}"
             self._items.fail(str(error) if isinstance(error, PoolError) else reason)
             raise
@@ -134,7 +134,12 @@ class ItemTasks:
         """End `run` in another thread: cancel the tasks, and fail the pipe."""
         self._stopped = True
         self._items.fail(f"for_each of {funcname(self._function)} was cancelled")
-        self._partition.client.cancel(self._futures())
+        self._cancel()
+
+    def _cancel(self) -> None:
+        """Cancel the tasks that have not started."""
+        if self._partition.client.status == "running":  # else it has cancelled them itself
+            self._partition.client.cancel(self._futures())
 
     def _futures(self) -> list[Future]:
         return [future for future, _, _ in list(self._running.values())]

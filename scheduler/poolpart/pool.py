@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
@@ -12,6 +13,7 @@ from distributed import Client
 
 from .adapting import adaptive_names
 from .dashboard_page import leave_page, partitions_page
+from .deploy.local_pool import LocalPool
 from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
 from .notebook import table_of_partitions
@@ -31,7 +33,8 @@ class Pool:
     Start with all of them (`Pool.from_client`); `partition` takes some out under a name and also
     returns the rest, which can be divided again. If workers were started with
     ``--resources "GPU=1"`` and the like, the cluster is divided already: ``pool["GPU"]`` finds a
-    partition. At the end of a ``with pool:`` block, those that it made are dissolved.
+    partition. At the end of a ``with pool:`` block, those that it made are dissolved. `Pool.local`
+    starts a cluster of its own, which ends with its block.
 
     Examples
     --------
@@ -47,6 +50,7 @@ class Pool:
         self.client = client
         self.workers = tuple(workers)
         self._partition_names: list[str] = []  # made by this pool or its remainders
+        self._local: LocalPool | None = None  # the cluster that `local` has started
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
@@ -83,6 +87,49 @@ class Pool:
                     f"machine ({type(error).__name__}: {error}); is poolpart installed there?"
                 )
         return cls(client, [worker.with_gpus(answers[worker.address]) for worker in present])
+
+    @classmethod
+    def local(
+        cls,
+        partitions: Mapping[str, tuple[int, int]],
+        *,
+        idle_s: float = math.inf,
+        **options: Any,
+    ) -> Pool:
+        """Start a cluster on this machine, divided into partitions, and a client of it.
+
+        At the end of a ``with`` block, they end, whatever runs. The workers are processes; a script
+        needs no main guard.
+
+        Parameters
+        ----------
+        partitions
+            {name: (workers, slots of each worker)}. A worker has as many threads as slots.
+        idle_s
+            Everything also ends after so many seconds in which there was no task, no result that
+            somebody keeps, and no pipe. The log says so; the pool can then no longer be used.
+        options
+            Others of `poolpart.deploy.local_cluster`.
+
+        Raises
+        ------
+        PoolError
+            If there would be no worker, a number is not possible, or the workers do not start.
+
+        Examples
+        --------
+        >>> with Pool.local({"GPU": (1, 1), "IO": (1, 8)}) as pool:      # doctest: +SKIP
+        ...     pool["GPU"].submit(pow, 2, 10).result()
+        1024
+        """
+        started = LocalPool(partitions, idle_s, options)
+        try:
+            pool = cls.from_client(started.client)
+        except BaseException:
+            started.close()
+            raise
+        pool._local = started
+        return pool
 
     # -- looking -----------------------------------------------------------------------
 
@@ -173,6 +220,9 @@ class Pool:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if self._local is not None:
+            self._local.close()
+            return
         try:
             if self._partition_names:  # by now `dissolve` may have undone them
                 ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)

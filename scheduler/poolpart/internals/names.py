@@ -239,6 +239,7 @@ PRIVATE_NAMES = (
             "distributed.deploy.spec:SpecCluster.workers",
             "distributed.deploy.spec:SpecCluster.scheduler_comm",
             "distributed.deploy.ssh:Worker",
+            f"{_SCHEDULER}.transition_counter",
         ),
         "workers of several kinds, forked from one process, left to their nannies",
         (

@@ -217,6 +217,11 @@ def turn_away(scheduler: Any, worker: Any) -> None:
     scheduler.close_worker(worker.address)
 
 
+def number_of_transitions(scheduler: Any) -> int:
+    """Return how often tasks have changed their state: equal numbers mean that nothing happened."""
+    return int(scheduler.transition_counter)
+
+
 def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
     """Cancel tasks for a client, by its id, as `Client.cancel` does; skip unknown tasks."""
     scheduler.stimulus_cancel(

@@ -1,0 +1,79 @@
+"""A pool with a cluster of its own on this machine, which ends with its block or when idle."""
+
+import logging
+
+import psutil
+import pytest
+from tests.poolpart.helpers import LONG_S, worker_name
+
+from poolpart import Pipe, Pool, PoolError
+from poolpart.workers import on_scheduler
+
+
+def processes():
+    return {process.pid for process in psutil.Process().children(recursive=True)}
+
+
+def test_it_has_the_partitions_and_ends_with_its_block(wait_until):
+    before = processes()
+    with pytest.raises(ZeroDivisionError), Pool.local({"GPU": (1, 1), "IO": (1, 4)}) as pool:
+        assert {name: part.slots for name, part in pool.partitions().items()} == {"GPU": 1, "IO": 4}
+        assert pool["GPU"].submit(worker_name).result(LONG_S) == "GPU-0"
+        raise ZeroDivisionError
+    wait_until(lambda: processes() - before <= fork_servers())
+    with pytest.raises(PoolError, match="The client is closed"):
+        pool.partitions()
+
+
+def fork_servers():
+    """Return the helpers of multiprocessing, which stay until this process ends."""
+    words = ("forkserver", "resource_tracker")
+    return {
+        process.pid
+        for process in psutil.Process().children()
+        if any(word in "".join(process.cmdline()) for word in words)
+    }
+
+
+def test_it_ends_when_it_is_idle_but_not_under_results_and_pipes(wait_until, caplog, monkeypatch):
+    monkeypatch.setattr("poolpart.deploy.local_pool.LOOK_EVERY_S", 0.01)
+    looks = []
+
+    def look(*args, **kwargs):
+        looks.append(args)
+        return on_scheduler(*args, **kwargs)
+
+    monkeypatch.setattr("poolpart.deploy.local_pool.on_scheduler", look)
+
+    def many_looks():  # which take longer than the idle time
+        before = len(looks)
+        wait_until(lambda: len(looks) > before + 30)
+
+    with Pool.local({"IO": (1, 1)}, idle_s=0.2) as pool:
+        first = Pipe("first", 3, pool.client).create()
+        caplog.set_level(logging.WARNING)  # a cluster that is started silences it
+        io = pool["IO"]
+        kept = io.submit(abs, -1)
+        first.delete()
+        many_looks()
+        assert kept.result(LONG_S) == 1
+        second = Pipe("second", 3, pool.client).create()
+        kept.release()
+        many_looks()
+        second.put(1)
+        second.delete()
+        wait_until(lambda: pool.client.status == "closed")
+        assert "The local pool has ended: it had no task for 0.2 s." in caplog.text
+        with pytest.raises(PoolError, match="The client is closed"):
+            io.for_each([1], abs)
+
+
+@pytest.mark.parametrize("idle_s", [0, -1, "60", True])
+def test_an_idle_time_that_makes_no_sense(idle_s):
+    with pytest.raises(PoolError, match="give seconds above 0"):
+        Pool.local({"IO": (1, 1)}, idle_s=idle_s)
+
+
+def test_a_pool_without_workers():
+    with pytest.raises(PoolError, match="There would be no worker"):
+        Pool.local({"IO": (0, 1)})
