@@ -18,7 +18,6 @@ from distributed import Future
 from .internals.client import when_done
 
 Result = TypeVar("Result")
-AnyFuture = Future | concurrent.futures.Future[Any]
 
 
 def in_background(
@@ -57,7 +56,8 @@ def _end(
 
 
 def after_all(
-    futures: Iterable[AnyFuture], function: Callable[[list[Any]], Result]
+    futures: Iterable[Future | concurrent.futures.Future[Any]],
+    function: Callable[[list[Any]], Result],
 ) -> concurrent.futures.Future[Result]:
     """Call `function(results)` once all futures have succeeded; returns a future of its result.
 
@@ -86,7 +86,7 @@ def after_all(
     """
     futures = list(futures)
     # Futures as they end; None once the call is cancelled.
-    ended: SimpleQueue[AnyFuture | None] = SimpleQueue()
+    ended: SimpleQueue[Any] = SimpleQueue()
     for future in futures:
         if isinstance(future, Future):
             when_done(future, ended.put)
