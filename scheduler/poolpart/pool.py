@@ -7,13 +7,12 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from distributed import Client
 
 from .adapting import adaptive_names
 from .dashboard_page import leave_page, partitions_page
-from .deploy.local_pool import LocalPool
 from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
 from .notebook import table_of_partitions
@@ -23,6 +22,9 @@ from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
 from .workers import WorkerInfo, all_workers, ask_workers, on_scheduler
+
+if TYPE_CHECKING:
+    from .deploy.local_pool import LocalPool
 
 logger = logging.getLogger(__name__)
 
@@ -122,6 +124,8 @@ class Pool:
         ...     pool["GPU"].submit(pow, 2, 10).result()
         1024
         """
+        from .deploy.local_pool import LocalPool  # dividing a cluster needs nothing that starts one
+
         started = LocalPool(partitions, idle_s, options)
         try:
             pool = cls.from_client(started.client)
