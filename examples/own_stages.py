@@ -1,0 +1,100 @@
+"""A pipeline of four stages and 100 trials beside it, on one pool, with functions of your own.
+
+The partitions are those of MATLAB's example: a worker for each GPU, four workers for the pipeline,
+and the rest for other work. Replace the bodies of the functions; the queues between them stay.
+
+    python examples/own_stages.py
+"""
+
+import math
+
+import numpy as np
+import open3d as o3d
+
+from poolpart import Pipe, Pool
+
+SCANS = 36
+RAYS = 500
+ROOM = np.array([8.0, 6.0, 3.0])  # metres, around the sensor in its middle
+TRIALS = 100
+
+
+def generate(scans):
+    """Stage 1: the parameters of each scan, here the direction of the sensor's head in degrees."""
+    for scan in range(SCANS):
+        scans.put((scan, 360 / SCANS * scan))
+    scans.close()
+
+
+def intersect(scans, hits, frames):
+    """Stage 2, on the GPU partition: where the rays of each scan meet the walls of the room."""
+    elevations = np.radians(np.linspace(-45, 45, RAYS))
+    for scan, azimuth_deg in scans:
+        azimuth = math.radians(azimuth_deg)
+        directions = np.column_stack(
+            [
+                np.cos(elevations) * math.cos(azimuth),
+                np.cos(elevations) * math.sin(azimuth),
+                np.sin(elevations),
+            ]
+        )
+        with np.errstate(divide="ignore"):
+            ranges = (ROOM / 2 / np.abs(directions)).min(axis=1)
+        hits.put((scan, directions * ranges[:, None]))
+        frames.put((scan, ranges.mean()))
+    hits.close()
+    frames.close()
+
+
+def sort_frames(frames, shown):
+    """Stage 3: the frames in the order of the scans, also if several workers intersect."""
+    waiting = {}
+    following = 0
+    for scan, frame in frames:
+        waiting[scan] = frame
+        while following in waiting:
+            shown.put((following, waiting.pop(following)))
+            following += 1
+    shown.close()
+
+
+def collect(hits):
+    """Stage 4, in two collectors at once: the points of the scans that come to this one."""
+    return dict(hits)
+
+
+def plan(trial):
+    """Return the length of the shorter way around a pillar, by a point chosen at random."""
+    beside = np.random.default_rng(trial).uniform(-3, 3)
+    if abs(beside) < 1:  # within the pillar
+        return math.inf
+    return 2 * math.hypot(4, beside)
+
+
+def main():
+    with Pool.local({"GPU": (1, 1), "LIDAR": (4, 1), "OTHER": (2, 1)}) as pool:
+        gpu, lidar, other = pool["GPU"], pool["LIDAR"], pool["OTHER"]
+        pipes = [Pipe(name, 4, pool.client) for name in ("scans", "hits", "frames", "shown")]
+        scans, hits, frames, shown = [pipe.create() for pipe in pipes]
+        stages = [
+            lidar.submit(generate, scans),
+            gpu.submit(intersect, scans, hits, frames),
+            lidar.submit(sort_frames, frames, shown),
+        ]
+        collectors = [lidar.submit(collect, hits) for _ in range(2)]
+        lengths = other.map(plan, range(TRIALS), ordered=False)
+        with shown.listen(lambda frame: print(f"scan {frame[0]}: {frame[1]:.2f} m on average")):
+            best = min(lengths)
+        for stage in stages:
+            stage.result()  # raises the error of a stage that has failed
+        points = {}
+        for collector in collectors:
+            points |= collector.result()
+
+    cloud = o3d.t.geometry.PointCloud(np.vstack([points[scan] for scan in range(SCANS)]))
+    o3d.t.io.write_point_cloud("own-stages.ply", cloud)
+    print(f"{SCANS * RAYS:,} points in own-stages.ply; the best of {TRIALS} ways is {best:.2f} m")
+
+
+if __name__ == "__main__":
+    main()
