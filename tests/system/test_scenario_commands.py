@@ -139,8 +139,9 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     assert max(map(len, outcome.out.splitlines())) <= 116
     outcome = lidarpool("sensors", "velodyne/vlp16")
     assert outcome.out.startswith("Velodyne VLP-16\nangles ")
-    draw = "lidarpool sensors velodyne/vlp16 --out beams.png"
-    assert outcome.out.endswith(f"\nto draw its beams: {draw}\n")
+    out = "lidarpool sensors velodyne/vlp16 --out"
+    draw = f"to draw its beams: {out} beams.png"
+    assert outcome.out.endswith(f"\n{draw}\nfor other programs: {out} rays.npz\n")
     assert list(tmp_path.iterdir()) == []
     pictures = {"livox/mid40": "rose.png", "airborne/riegl-vq780i": "lines.png", "vlp16": "v.png"}
     for name, target in pictures.items():
@@ -149,3 +150,18 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     assert lidarpool("sensors", "").code == 2
     outcome = lidarpool("sensors", "velodyne/vlp61")
     assert outcome.code == 2 and "Did you mean 'velodyne/vlp16'?" in outcome.err
+
+
+def test_sensors_writes_a_file_and_says_what_the_file_lacks(tmp_path, lidarpool):
+    options = ("--max-range", "50", "--seconds", "0.001", "--out", "v.csv")
+    outcome = lidarpool("sensors", "vlp16", *options)
+    assert outcome.code == 0, outcome.err
+    lacks = "width of the beams; rays after 0.001051 s, which do not repeat these"
+    assert outcome.out.endswith(f"\n304 rays: v.csv\nnot in the file: {lacks}\n")
+    assert "# max_range_m: 50.0" in (tmp_path / "v.csv").read_text()
+    again = lidarpool("sensors", "vlp16", "--out", "v.csv")
+    assert again.code == 2 and "v.csv exists: give another name, or --overwrite." in again.err
+    outcome = lidarpool("sensors", "--calibration", "v.csv", "--out", "v.npz")
+    assert outcome.code == 0 and (tmp_path / "v.npz").exists()
+    assert lidarpool("sensors", "vlp16", "--seconds", "1").code == 2
+    assert lidarpool("sensors", "--out", "v.npz").code == 2

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         Spin,
         Survey,
     )
+    from .sensor.export import export_sensor
     from .sensor.models import load_sensor
     from .sensor.trajectory import Track
     from .sensor.trajectory_files import load_trajectory
@@ -71,6 +72,7 @@ __all__ = [
     "Survey",
     "Track",
     "__version__",
+    "export_sensor",
     "load_sensor",
     "load_trajectory",
 ]
@@ -88,6 +90,7 @@ _MODULES = {
     "scene.scene": ("Scene",),
     "scene.scene_instances": ("SceneInstance",),
     "scene.scene_mesh": ("SceneMesh",),
+    "sensor.export": ("export_sensor",),
     "sensor.models": ("load_sensor",),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),

@@ -18,6 +18,7 @@ import click
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, without_common_prefix
+from lidarsim.sensor_files.format_table import FORMATS
 
 from . import completion
 from . import shared_options as options
@@ -27,6 +28,7 @@ from .shared_options import WARNED, Command, combine, overwrite
 if TYPE_CHECKING:
     from lidarsim.base.storage import Storage
     from lidarsim.scene.scene import Scene
+    from lidarsim.sensor import Sensor
     from lidarsim.sensor.models import SensorModel
 
     from ..base.tls_files import TlsFiles
@@ -39,6 +41,7 @@ MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
 _SHOWN_OBJECTS = 12
+_SENSOR_FORMATS = "Format of the file: " + ", ".join(row.name for row in FORMATS) + "."
 
 
 @click.command()
@@ -431,29 +434,121 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 @click.argument(
     "model", required=False, metavar="[MODEL|FILE.yaml]", shell_complete=completion.sensors
 )
-@options.path("--out", metavar="FILE.png", help="Draw the model's beams into this file.")
-def sensors(model: str | None, out: Path | None) -> None:
-    """List sensor models, or show the figures of a model and draw its beams.
+@options.path(
+    "--out",
+    metavar="FILE",
+    help="Write the sensor for other programs, in the format of the ending or of --as; .png draws "
+    "its beams.",
+)
+@click.option("--as", "file_format", metavar="FORMAT", help=_SENSOR_FORMATS)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, 1e6, min_open=True),
+    metavar="S",
+    help="Duration of the pattern in the file.  [default: one revolution or frame]",
+)
+@click.option(
+    "--revolutions",
+    type=click.IntRange(1, 10_000_000),
+    metavar="N",
+    help="Revolutions or frames in the file instead.",
+)
+@options.path("--calibration", help="The unit's calibration, as in a scenario.")
+@click.option("--columns", type=click.IntRange(1, 100_000), metavar="N", help="As in a scenario.")
+@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="rate_hz of a scenario.")
+@click.option("--min-range", "min_range_m", type=float, metavar="M", help="As in a scenario.")
+@click.option("--max-range", "max_range_m", type=float, metavar="M", help="As in a scenario.")
+@options.overwrite
+def sensors(
+    model: str | None,
+    out: Path | None,
+    file_format: str | None,
+    seconds: float | None,
+    revolutions: int | None,
+    overwrite: bool,
+    **settings: Any,
+) -> None:
+    """List sensor models, show the figures of a model, or write it as a file.
+
+    Files are rays in the order of firing: docs/how-to/other-simulators.md has their conventions.
+    What a format does not hold is printed.
 
     \b
     Examples:
       lidarpool sensors
       lidarpool sensors velodyne/vlp16
       lidarpool sensors velodyne/vlp16 --out vlp16.png
+      lidarpool sensors livox/mid360 --seconds 4 --out mid360.csv --as livox
+      lidarpool sensors --calibration unit.json --out unit.npz
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.base.model_names import model_names, plugin_model_names
-    from lidarsim.sensor.models import load_sensor, read_model, shown_noise
+    from lidarsim.sensor.models import load_sensor
 
-    if model is None:
-        heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
-        rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        for row in rows:
-            click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
+    settings = {name: value for name, value in settings.items() if value is not None}
+    writing = [file_format, seconds, revolutions, *settings]
+    if out is None and any(value is not None for value in writing):
+        raise click.UsageError("These options are for a file: name it, --out FILE.")
+    if model is None and "calibration" not in settings:
+        if out is not None:
+            raise click.UsageError("Name the model that is to be written, or --calibration FILE.")
+        _list_models()
         return
-    described = read_model(model)
-    if out is not None and out.suffix.lower() != ".png":
-        raise click.UsageError(f"{out} is not a picture: give a name that ends in .png.")
+    if model is not None:
+        _show_model(model)
+    if out is None:
+        assert model is not None  # without a file there is no calibration
+        command = f"lidarpool sensors {shlex.quote(model)} --out"
+        click.echo(f"to draw its beams: {command} beams.png")
+        click.echo(f"for other programs: {command} rays.npz")
+        return
+    sensor = load_sensor(model, **settings)
+    if out.suffix.lower() != ".png" or file_format is not None:
+        _write_sensor(sensor, out, overwrite, file_format, seconds, revolutions)
+        return
+    if seconds is not None or revolutions is not None:
+        raise click.UsageError("A picture shows fixed durations: leave the duration out.")
+    from lidarview.render.beam_picture import (
+        draw_beams,  # imports Matplotlib, which figures do not need
+    )
+
+    draw_beams(out, sensor)
+    click.echo(click.format_filename(out))
+
+
+def _write_sensor(
+    sensor: Sensor,
+    out: Path,
+    overwrite: bool,
+    file_format: str | None,
+    seconds: float | None,
+    revolutions: int | None,
+) -> None:
+    """Write a sensor as a file, and print what the file does not hold."""
+    from lidarsim.sensor.export import export_sensor
+
+    if out.exists() and not overwrite:
+        raise LidarError(f"{out} exists: give another name, or --overwrite.")
+    file = export_sensor(sensor, out, format=file_format, seconds=seconds, revolutions=revolutions)
+    click.echo(f"{plural(len(file.rays), 'ray')}: {click.format_filename(out)}")
+    if file.left_out:
+        click.echo(f"not in the file: {'; '.join(file.left_out)}")
+
+
+def _list_models() -> None:
+    """Print the models with their main figures."""
+    from lidarsim.base.model_names import model_names, plugin_model_names
+
+    heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
+    rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
+
+
+def _show_model(name: str) -> None:
+    """Print the figures of a model and their sources."""
+    from lidarsim.sensor.models import read_model, shown_noise
+
+    described = read_model(name)
     click.echo(described.name)
     lines = [*described.sources.items()]
     if described.typical:
@@ -465,15 +560,6 @@ def sensors(model: str | None, out: Path | None) -> None:
         lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []
     for figure, words in lines:
         click.echo(f"{figure:<11}  {words}")
-    if out is None:
-        click.echo(f"to draw its beams: lidarpool sensors {shlex.quote(model)} --out beams.png")
-        return
-    from lidarview.render.beam_picture import (
-        draw_beams,  # imports Matplotlib, which figures do not need
-    )
-
-    draw_beams(out, load_sensor(model))
-    click.echo(click.format_filename(out))
 
 
 def _row(name: str) -> tuple[str, ...]:

@@ -18,6 +18,9 @@ from ..base.errors import LidarError, message_of
 from ..base.textfile import read_text
 from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
+from ..sensor_files.fired_rays import FiredRays
+from ..sensor_files.format_table import read_rays
+from ..sensor_files.ray_csv import is_ray_table, rays_of_text
 from .beams import Beams
 
 # Errors of files that users write.
@@ -36,6 +39,10 @@ class Calibration:
     beams: Beams | None = None  # in the maker's order, with the times in the file, if any
     rays: Floats | None = None  # instead of beams, unit directions (n, 3) in the order of firing
     shot_ns: Floats | None = None  # times (n,) of the rays, if the file has times
+    starts: Floats | None = None  # of the rays (n, 3), metres; None for the sensor's centre
+    cycle_ns: float | None = None  # duration of the list of rays, if the file states it
+    range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
+    sensor: str = ""  # name of the sensor, if the file states it
     head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
 
 
@@ -49,7 +56,8 @@ def read_calibration(path: Path) -> Calibration:
         angle corrections (Channel, Elevation, Azimuth), RoboSense's angle.csv (vertical and
         horizontal angle, no header), Livox's list of rays (Time/s, Azimuth/deg, Zenith/deg), or
         a table of beams with columns elevation_deg and any of azimuth_deg (counter-clockwise),
-        time_us, x_m, y_m, z_m.
+        time_us, x_m, y_m, z_m. Or rays of a sensor as `export_sensor` writes: .npz, .parquet, and
+        .csv with a column time_offset_ns.
 
     Raises
     ------
@@ -58,6 +66,10 @@ def read_calibration(path: Path) -> Calibration:
         order.
     """
     try:
+        if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
+            rays = read_rays(path)
+            if rays is not None:
+                return _calibration_of(path.name, rays)
         text = read_text(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _velodyne(path.name, load_yaml(text))
@@ -173,8 +185,31 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     return np.asarray(origin_mm, np.float64)
 
 
+def _calibration_of(name: str, rays: FiredRays) -> Calibration:
+    """Return the rays of a file of a sensor as a calibration, with their times."""
+    rays = rays.timed()
+    assert rays.times_ns is not None  # of timed rays
+    shot_ns = rays.times_ns.astype(np.float64)
+    interval_ns = float(shot_ns[-1]) / max(len(rays) - 1, 1) or 1e9 / rays.rate_hz / len(rays)
+    cycle_ns = rays.cycle_ns or float(shot_ns[-1]) + interval_ns
+    interval_us = Fraction(cycle_ns) / len(rays) / 1000
+    return Calibration(
+        name,
+        None,
+        rays=rays.directions,
+        shot_ns=shot_ns,
+        starts=rays.origins,
+        cycle_ns=cycle_ns,
+        range_m=rays.range_m,
+        sensor=rays.name,
+        head={"listed": True, "firing_us": interval_us, "rate_hz": rays.rate_hz},
+    )
+
+
 def _table(name: str, text: str) -> Calibration:
     """Read a comma-separated calibration in the format of its header."""
+    if is_ray_table(text):
+        return _calibration_of(name, rays_of_text(text))
     header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
     if header == ["time/s", "azimuth/deg", "zenith/deg"]:
         return _livox(name, _rows(text, 1, 3))

@@ -416,7 +416,8 @@ def load_sensor(
         whose beams are nearest to the calibration.
     calibration
         File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
-        angle.csv, Livox list of rays, or a table of beams; see `read_calibration`.
+        angle.csv, Livox list of rays, a table of beams, or rays of a sensor that `export_sensor`
+        wrote; see `read_calibration`.
     columns
         Firings in a revolution, if the model, or a table of beams, leaves a choice.
     rate_hz
@@ -458,7 +459,8 @@ def load_sensor(
             f"({next(iter(sensor_model.sources.values()), 'of the unit')})."
         )
     firings, rate = sensor_model.firing_rates(rate_hz, columns)
-    shortest_m, longest_m = sensor_model.range_m or (0.0, float("inf"))
+    unit_range_m = None if unit is None else unit.range_m
+    shortest_m, longest_m = unit_range_m or sensor_model.range_m or (0.0, float("inf"))
     common_fields: dict[str, Any] = {
         "min_range_m": shortest_m if min_range_m is None else min_range_m,
         "max_range_m": longest_m if max_range_m is None else max_range_m,
@@ -511,7 +513,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
             f"{unit.file} fits no known model, and has no firing times: give model:"
             f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
         )
-    return SensorModel(name=(unit.maker or "beams").title(), sources={}, **head)
+    return SensorModel(name=unit.sensor or (unit.maker or "beams").title(), sources={}, **head)
 
 
 def _listed(
@@ -529,9 +531,14 @@ def _listed(
     times = unit.shot_ns
     if times is None:
         times = interval_ns * np.arange(len(unit.rays), dtype=np.float64)
-    cycle_ns = float(times[-1]) + interval_ns
+    cycle_ns = unit.cycle_ns or float(times[-1]) + interval_ns
     return ListedSensor(
-        head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common_fields
+        head=head,
+        rays=unit.rays,
+        shot_ns=times,
+        cycle_ns=cycle_ns,
+        starts=unit.starts,
+        **common_fields,
     )
 
 

@@ -162,6 +162,7 @@ class ListedSensor(Sensor):
     rays: Floats = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
     shot_ns: Floats = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8  # duration of the list
+    starts: Floats | None = None  # (n, 3): starts of the rays, metres; None for the centre
     cycle: ClassVar[str] = "frame"
 
     @property
@@ -177,6 +178,15 @@ class ListedSensor(Sensor):
     def directions(self, firings: Ints) -> Floats:
         """Return the unit directions of firings (k,), in the sensor frame: (k, 1, 3)."""
         return self.rays[firings % len(self.rays)][:, None, :]
+
+    def origins(self, firings: Ints) -> Floats | None:
+        """Return the starts of the rays of firings (k,), sensor frame: (k, 1, 3), metres.
+
+        None if all rays start at the sensor's centre.
+        """
+        if self.starts is None:
+            return None
+        return self.starts[firings % len(self.rays)][:, None, :]
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the starts of firings (k,), nanoseconds since the start of the station: (k,)."""

@@ -1,0 +1,205 @@
+"""Sensors as files for other programs: rays in the order of firing, with their times."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from ..base.arrays import Ints
+from ..base.errors import LidarError
+from ..base.validation import checked
+from ..sensor_files.fired_rays import FRAME_HZ, FiredRays
+from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
+from .ray_sensors import PrismSensor
+from .sensor import Sensor
+
+MAX_RAYS = 20_000_000  # of a file; the arrays of as many rays take 4 GB
+_SLACK_NS = 1e-3  # roundings of times of firings
+
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Revolutions = Annotated[int, Field(gt=0, le=10_000_000)]
+
+
+class SensorFile(NamedTuple):
+    """A file that `export_sensor` wrote.
+
+    Attributes
+    ----------
+    path
+        The file.
+    format
+        Name of its format.
+    rays
+        Rays that it holds.
+    left_out
+        What it does not hold of the sensor, a clause each.
+    """
+
+    path: Path
+    format: str
+    rays: FiredRays
+    left_out: tuple[str, ...]
+
+
+@checked
+def export_sensor(
+    sensor: Any,
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002 - the name of the option
+    seconds: Seconds | None = None,
+    revolutions: Revolutions | None = None,
+) -> SensorFile:
+    """Write the rays of a sensor to a file of another program.
+
+    Parameters
+    ----------
+    sensor
+        A `Sensor`, as `load_sensor` and `Sensor.grid` return.
+    path
+        The file; its ending chooses the format, unless `format` does. An existing file is
+        replaced.
+    format
+        Name of the format, such as "livox"; see docs/how-to/other-simulators.md.
+    seconds
+        Duration of the pattern in the file.
+    revolutions
+        Revolutions or frames in the file instead; by default one.
+
+    Returns
+    -------
+    SensorFile
+        The format, the rays, and what the format does not hold of the sensor.
+
+    Raises
+    ------
+    LidarError
+        If there is no such format, the format cannot hold the sensor, the rays are too many, a
+        package is missing, or the file cannot be written.
+
+    Examples
+    --------
+    >>> from lidarsim import export_sensor, load_sensor
+    >>> file = export_sensor(load_sensor("velodyne/vlp16"), "vlp16.npz")  # doctest: +SKIP
+    """
+    path = Path(path)
+    row = format_of(path, format)
+    if not isinstance(sensor, Sensor):
+        raise LidarError(f"{type(sensor).__name__} is no Sensor: load_sensor(MODEL) returns one.")
+    rays = fired_rays(sensor, seconds=seconds, revolutions=revolutions)
+    if not path.parent.is_dir():
+        raise LidarError(f"The folder {path.parent} does not exist: make it first.")
+    write = row.function("write")
+    left_out = write(path, rays, _left_out(sensor, rays, row))
+    return SensorFile(path, row.name, rays, tuple(left_out))
+
+
+def fired_rays(
+    sensor: Sensor, *, seconds: float | None = None, revolutions: int | None = None
+) -> FiredRays:
+    """Return the rays of a sensor's first firings, in the order of their times.
+
+    Firings are whole: the last firing starts before the end of the duration. The duration is
+    `seconds`, or some revolutions or frames, by default one.
+
+    Raises
+    ------
+    LidarError
+        If both are given, or the rays are more than `MAX_RAYS`.
+    """
+    if seconds is not None and revolutions is not None:
+        raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
+    duration_ns = 1e9 * seconds if seconds is not None else 0.0
+    if seconds is None:
+        duration_ns = sensor.revolution_start_ns(revolutions or 1)
+    count = _firings_before(sensor, duration_ns)
+    firings = np.arange(count)
+    times_ns = sensor.times_ns(firings).reshape(-1) - round(sensor.start_ns)
+    order = np.argsort(times_ns, kind="stable")
+    times_ns = times_ns[order] - min(0, times_ns.min())
+    origins = sensor.origins(firings)
+    channels = np.tile(np.arange(sensor.channels), count)
+    return FiredRays(
+        directions=sensor.directions(firings).reshape(-1, 3)[order],
+        times_ns=times_ns,
+        channels=channels[order],
+        origins=None if origins is None else origins.reshape(-1, 3)[order],
+        cycle_ns=_cycle_ns(sensor, duration_ns, count, times_ns),
+        rate_hz=float(getattr(sensor.head, "rate_hz", FRAME_HZ)),
+        range_m=(sensor.min_range_m, sensor.max_range_m),
+        name=sensor.model,
+        repeats=_repeats(sensor, count),
+    )
+
+
+def _firings_before(sensor: Sensor, duration_ns: float) -> int:
+    """Return the number of firings that start before a time since the start of the head.
+
+    Raises
+    ------
+    LidarError
+        If the rays are more than `MAX_RAYS`.
+    """
+    limit = MAX_RAYS // sensor.channels + 1
+
+    def starts_before(firing: int) -> bool:
+        """Return True if a firing starts before the end of the duration."""
+        start_ns = float(sensor.begins_ns(np.array([firing]))[0]) - sensor.start_ns
+        return start_ns < duration_ns - _SLACK_NS
+
+    if starts_before(limit):
+        raise LidarError(
+            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {duration_ns / 1e9:.4g} s: give "
+            "fewer seconds or revolutions."
+        )
+    lower = 0
+    while limit - lower > 1:
+        middle = (lower + limit) // 2
+        if starts_before(middle):
+            lower = middle
+        else:
+            limit = middle
+    return lower + 1
+
+
+def _cycle_ns(sensor: Sensor, duration_ns: float, count: int, times_ns: Ints) -> float:
+    """Return the duration after which the list of rays may be repeated.
+
+    The duration is longer than asked for if beams of the last firing leave after its end.
+    """
+    if times_ns[-1] < duration_ns:
+        return duration_ns
+    next_ns = float(sensor.begins_ns(np.array([count]))[0]) - sensor.start_ns
+    return max(next_ns, float(times_ns[-1] + 1))
+
+
+def _repeats(sensor: Sensor, count: int) -> bool:
+    """Return True if a sensor repeats its first `count` firings, except for parts of a firing."""
+    if sensor.period is not None:
+        return count % sensor.period == 0
+    per_turn = getattr(sensor.head, "firings_per_turn", 0)
+    if isinstance(sensor, PrismSensor) or not per_turn:
+        return False
+    return bool(abs(count - max(round(count / per_turn), 1) * per_turn) < 1)
+
+
+def _left_out(sensor: Sensor, rays: FiredRays, row: SensorFormat) -> list[str]:
+    """Return what a format does not hold of a sensor, a clause each."""
+    has = {
+        "times": True,
+        "channels": sensor.channels > 1,
+        "origins": rays.origins is not None,
+        "ranges": sensor.min_range_m > 0 or sensor.max_range_m < float("inf"),
+        "rate": True,
+        "divergence": sensor.optics.divergence_mrad is not None,
+        "returns": sensor.returns is not None,
+        "noise": sensor.noise is not None,
+    }
+    clauses = [words for name, words in PROPERTIES.items() if has[name] and name not in row.holds]
+    if not rays.repeats:
+        assert rays.cycle_ns is not None  # of a sensor
+        clauses.append(f"rays after {rays.cycle_ns / 1e9:.4g} s, which do not repeat these")
+    return clauses

@@ -1,0 +1,1 @@
+"""Files with the rays of sensors, for other programs and from other programs."""

@@ -1,0 +1,93 @@
+"""Rays of a sensor in the order of firing, as files of sensors hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..base.arrays import Floats, Ints
+from ..base.elementary import arctan2, sin_cos
+
+# Conventions of rays, which files state in their headers.
+AXES = "x forward, y left, z up"
+AZIMUTH = "degrees from x, counter-clockwise seen from above, -180 to 180"
+ELEVATION = "degrees above the xy plane"
+TIME = "nanoseconds since the first firing may leave"
+FRAME_HZ = 10.0  # of lists that state neither times nor a rate
+
+
+@dataclass(frozen=True, eq=False)
+class FiredRays:
+    """Rays of a sensor, in the sensor frame: x forward, y left, z up.
+
+    Attributes
+    ----------
+    directions
+        float64 (n, 3): unit directions in the order of firing.
+    times_ns
+        int64 (n,): times of firing since the start of the list, nanoseconds; None if unknown.
+    channels
+        int64 (n,): channel of each ray; 0 is the lowest.
+    origins
+        float64 (n, 3): starts of the rays, metres; None if all start at the sensor's centre.
+    cycle_ns
+        Duration of the list, after which it may be repeated, nanoseconds; None if unknown.
+    rate_hz
+        Revolutions, lines or frames a second.
+    range_m
+        Shortest and longest range, metres; the longest may be infinite.
+    name
+        Name of the sensor.
+    repeats
+        Whether the sensor itself repeats these rays, except for parts of a firing.
+    """
+
+    directions: Floats
+    times_ns: Ints | None = None
+    channels: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    origins: Floats | None = None
+    cycle_ns: float | None = None
+    rate_hz: float = FRAME_HZ
+    range_m: tuple[float, float] = (0.0, float("inf"))
+    name: str = ""
+    repeats: bool = True
+
+    def __post_init__(self) -> None:
+        if not len(self.channels):
+            object.__setattr__(self, "channels", np.zeros(len(self.directions), np.int64))
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    @property
+    def azimuths_deg(self) -> Floats:
+        """Azimuths (n,), degrees, counter-clockwise from x, within ±180."""
+        x, y, _ = self.directions.T
+        return np.degrees(arctan2(y, x))
+
+    @property
+    def elevations_deg(self) -> Floats:
+        """Elevations (n,), degrees above the xy plane."""
+        x, y, z = self.directions.T
+        return np.degrees(arctan2(z, np.sqrt(x * x + y * y)))
+
+    @property
+    def origins_or_centre(self) -> Floats:
+        """Starts of the rays (n, 3), metres; zeros if all start at the sensor's centre."""
+        return np.zeros((len(self), 3)) if self.origins is None else self.origins
+
+    def timed(self) -> FiredRays:
+        """Return the rays with times: without stated times, evenly spread over a frame."""
+        if self.times_ns is not None:
+            return self
+        cycle_ns = self.cycle_ns or 1e9 / self.rate_hz
+        times_ns = np.rint(cycle_ns * np.arange(len(self)) / len(self)).astype(np.int64)
+        return replace(self, times_ns=times_ns, cycle_ns=cycle_ns)
+
+
+def directions_of(azimuths_deg: Floats, elevations_deg: Floats) -> Floats:
+    """Return the unit directions (n, 3) of azimuths and elevations (n,), degrees."""
+    up, level = sin_cos(np.radians(elevations_deg))
+    sin, cos = sin_cos(np.radians(azimuths_deg))
+    return np.column_stack([level * cos, level * sin, up])

@@ -1,0 +1,187 @@
+"""The table of files of sensors: the module of each format, its endings, and what it holds.
+
+It is quick to import: help of the command reads it. Packages add formats as plug-ins of the group
+`GROUP`, whose names are the names of the formats; each is a `SensorFormat`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..base.errors import LidarError
+from ..base.extras import need
+from ..base.plugins import find_plugin, plugins_of
+from ..base.words import did_you_mean
+
+if TYPE_CHECKING:
+    from .fired_rays import FiredRays
+
+GROUP = "lidarsim.sensor_files"
+
+# What a format may hold of a sensor besides directions. {name: words for what it does not hold}
+PROPERTIES = {
+    "times": "times of the rays",
+    "channels": "channels",
+    "origins": "starts of the rays beside the sensor's centre",
+    "ranges": "shortest and longest range",
+    "rate": "frames a second",
+    "divergence": "width of the beams",
+    "returns": "returns of a pulse",
+    "noise": "noise",
+}
+
+
+@dataclass(frozen=True)
+class SensorFormat:
+    """A format of files of sensors.
+
+    Parameters
+    ----------
+    name
+        Name of the format, as in ``--as``.
+    endings
+        Endings of its files, such as ``.csv``.
+    module
+        Dotted name of the module of the format. `write(path, rays, left_out)` there writes rays,
+        and returns all that the file does not hold of the sensor, a clause each, `left_out` by
+        `PROPERTIES` first; `read(path)` returns `FiredRays`, or None for a file of
+        another format.
+    words
+        Description in a few words.
+    holds
+        Names in `PROPERTIES` of what the format holds.
+    by_ending
+        Whether the ending alone chooses the format; else ``--as`` does.
+    reads
+        Whether there is a function `read`.
+    packages, extra
+        Import packages that the module needs, and the extra that installs them.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    module: str
+    words: str
+    holds: frozenset[str] = frozenset()
+    by_ending: bool = False
+    reads: bool = True
+    packages: tuple[str, ...] = ()
+    extra: str = ""
+
+    def function(self, name: str) -> Any:
+        """Import the module and return its function of a name; LidarError without its package."""
+        for package in self.packages:
+            need(package, self.extra, f"Sensors as {self.name} are written and read")
+        return getattr(import_module(self.module), name)
+
+
+def _row(
+    name: str, endings: str, words: str, holds: Sequence[str] = (), **options: Any
+) -> SensorFormat:
+    """Return a row of the table whose module stands beside this module."""
+    module = options.pop("module", name)
+    return SensorFormat(
+        name,
+        tuple(endings.split()),
+        f"{__package__}.{module}",
+        words,
+        frozenset(holds),
+        **options,
+    )
+
+
+_COLUMNS = ("times", "channels", "origins", "ranges", "rate")
+
+FORMATS: tuple[SensorFormat, ...] = (
+    _row("npz", ".npz", "arrays of NumPy", _COLUMNS, module="ray_npz", by_ending=True),
+    _row("csv", ".csv", "a table of rays", _COLUMNS, module="ray_csv", by_ending=True),
+    _row(
+        "parquet",
+        ".parquet",
+        "a table of rays",
+        _COLUMNS,
+        module="ray_parquet",
+        by_ending=True,
+        packages=("pyarrow",),
+        extra="parquet",
+    ),
+)
+
+
+@cache
+def formats() -> dict[str, SensorFormat]:
+    """Return the formats by name, with the formats of plug-ins.
+
+    Raises
+    ------
+    LidarError
+        If a plug-in cannot be used.
+    """
+    table = {row.name: row for row in FORMATS}
+    for name in plugins_of(GROUP):
+        plugin = find_plugin(GROUP, name)
+        if plugin is not None and name not in table:
+            table[name] = replace(plugin.load(SensorFormat), name=name)
+    return table
+
+
+def format_of(path: Path, name: str | None) -> SensorFormat:
+    """Return the format of a file that is to be written, by its name or by the ending.
+
+    Raises
+    ------
+    LidarError
+        If there is no such format, or the file has another ending than the format.
+    """
+    table = formats()
+    ending = path.suffix.lower()
+    if name is not None and name not in table:
+        names = ", ".join(table)
+        raise LidarError(
+            f"Sensors are not written as {name!r}.{did_you_mean(name, [*table])} Formats: {names}."
+        )
+    if name is None:
+        row = next((row for row in table.values() if row.by_ending and ending in row.endings), None)
+        if row is None:
+            raise LidarError(f"{path} has no ending of a file of a sensor. {_choices(ending)}")
+        return row
+    row = table[name]
+    if ending not in row.endings:
+        expected = " or ".join(row.endings)
+        raise LidarError(f"{path} does not end in {expected}, as files of {name} do.")
+    return row
+
+
+def _choices(ending: str) -> str:
+    """Return a sentence on the formats of an ending, or on all endings."""
+    table = formats()
+    names = [row.name for row in table.values() if ending in row.endings]
+    if names:
+        return f"Say which format it is: {' or '.join(f'--as {name}' for name in names)}."
+    endings = dict.fromkeys(ending for row in table.values() for ending in row.endings)
+    return f"Endings are {', '.join(endings)}; .png draws the beams."
+
+
+def read_rays(path: Path) -> FiredRays | None:
+    """Return the rays of a file by its ending; None for an ending of no format that is read.
+
+    Raises
+    ------
+    ValueError
+        If the file has none of the formats of its ending.
+    LidarError
+        If a package is missing, or the file is larger than the memory.
+    OSError
+        If the file cannot be read.
+    """
+    rows = [row for row in formats().values() if row.reads and path.suffix.lower() in row.endings]
+    for row in rows:
+        rays: FiredRays | None = row.function("read")(path)
+        if rays is not None:
+            return rays
+    return None

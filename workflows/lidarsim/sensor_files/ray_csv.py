@@ -1,0 +1,82 @@
+"""Rays as a comma-separated table (.csv), with the header in remarks before the columns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..base.tables import DEGREES, METRES, NUMBERS, Quantity, read_table
+from ..base.textfile import read_text
+from ..base.time_units import SECONDS
+from .fired_rays import FiredRays
+from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
+from .writing import write_text_of
+
+_DECIMALS = 9  # of angles; directions have all digits
+_TIMES = ("time", "t", "time offset", "offset", "timestamp", "stamp", "fire time")
+QUANTITIES = (
+    Quantity("time_s", _TIMES, SECONDS, None),
+    Quantity("channel", ("channel", "ring", "laser", "beam"), NUMBERS, ""),
+    Quantity("azimuth_deg", ("azimuth",), DEGREES, None),
+    Quantity("elevation_deg", ("elevation",), DEGREES, None),
+    *(Quantity(name, (name, name[-1], f"d{name[-1]}"), NUMBERS, "") for name in DIRECTION),
+    *(Quantity(name, (name.removesuffix("_m"),), METRES, "m") for name in ORIGIN),
+)
+
+
+def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+    """Write rays as a table with a header in remarks."""
+    columns: dict[str, Any] = columns_of(rays)
+    for name in ("azimuth_deg", "elevation_deg"):
+        columns[name] = np.round(columns[name], _DECIMALS) + 0.0  # no -0.0
+    remarks = [
+        f"# {name}: {json.dumps(value)}" for name, value in header_of(rays, left_out).items()
+    ]
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [*remarks, ",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows)]
+    write_text_of(path, "\n".join(lines) + "\n")
+    return left_out
+
+
+def is_ray_table(text: str) -> bool:
+    """Return True if a text is a table of rays: a column has times of single rays by this name."""
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    return TIME_COLUMN in next(lines, "").split(",")
+
+
+def read(path: Path) -> FiredRays | None:
+    """Return the rays of a table; see `rays_of_text`."""
+    return rays_of_text(read_text(path))
+
+
+def rays_of_text(text: str) -> FiredRays:
+    """Return the rays of a table with azimuths and elevations, or directions.
+
+    Names and units of columns may have other spellings, such as «Azimuth [rad]».
+
+    Raises
+    ------
+    ValueError
+        If a column is missing or not known, or a cell holds no finite number.
+    """
+    columns = read_table(text, QUANTITIES)
+    if "time_s" in columns:
+        columns[TIME_COLUMN] = columns.pop("time_s") * 1e9
+    return rays_of(columns, _header(text))
+
+
+def _header(text: str) -> dict[str, Any]:
+    """Return the header in the remarks at the start of a text; other remarks are left out."""
+    header = {}
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        name, _, value = line.lstrip("# ").partition(":")
+        with suppress(ValueError):
+            header[name.strip()] = json.loads(value)
+    return header

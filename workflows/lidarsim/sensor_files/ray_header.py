@@ -1,0 +1,146 @@
+"""The header of files of rays: name, ranges, rate and conventions, as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+
+from ..base.arrays import Floats, Ints
+from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, FiredRays, directions_of
+
+KIND = "rays of a sensor"
+# Names of the columns of a table; directions count, and the angles say the same in degrees.
+TIME_COLUMN = "time_offset_ns"
+DIRECTION = ("direction_x", "direction_y", "direction_z")
+ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")
+COLUMNS = (TIME_COLUMN, "channel", "azimuth_deg", "elevation_deg", *DIRECTION, *ORIGIN)
+
+
+def header_of(rays: FiredRays, left_out: Sequence[str]) -> dict[str, Any]:
+    """Return the header of rays; an infinite range is None.
+
+    `left_out` says what the file does not hold of the sensor.
+    """
+    min_range_m, max_range_m = rays.range_m
+    return {
+        "content": KIND,
+        "sensor": rays.name,
+        "axes": AXES,
+        "azimuth": AZIMUTH,
+        "elevation": ELEVATION,
+        "time": TIME,
+        "min_range_m": min_range_m,
+        "max_range_m": max_range_m if isfinite(max_range_m) else None,
+        "rate_hz": rays.rate_hz,
+        "cycle_ns": rays.cycle_ns,
+        "repeats": rays.repeats,
+        "not_in_this_file": list(left_out),
+    }
+
+
+def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
+    """Return the columns `COLUMNS` of rays."""
+    timed = rays.timed()
+    assert timed.times_ns is not None  # of timed rays
+    angles = (rays.azimuths_deg, rays.elevations_deg)
+    vectors = (*rays.directions.T, *rays.origins_or_centre.T)
+    values = (timed.times_ns, rays.channels, *angles, *vectors)
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
+    """Return the rays of columns and a header.
+
+    Columns are those of `COLUMNS`: directions or both angles are required.
+
+    Raises
+    ------
+    ValueError
+        If columns are missing, have different lengths, or hold numbers that are not finite; or if
+        the header has impossible figures.
+    """
+    lengths = {name: np.shape(values) for name, values in columns.items()}
+    if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
+        raise ValueError("its columns must have a number for each ray, and the same length")
+    for name, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values, np.float64)))
+        if len(bad):
+            raise ValueError(f"{name} of ray {bad[0] + 1} is not finite")
+    directions = _directions(columns)
+    if not len(directions):
+        raise ValueError("it has no rays")
+    origins = None
+    if any(name in columns for name in ORIGIN):
+        zero = np.zeros(len(directions))
+        origins = np.column_stack(
+            [np.asarray(columns.get(name, zero), np.float64) for name in ORIGIN]
+        )
+        origins = origins if origins.any() else None
+    times_ns = None
+    if TIME_COLUMN in columns:
+        times_ns = np.rint(np.asarray(columns[TIME_COLUMN], np.float64)).astype(np.int64)
+    channels = np.asarray(columns.get("channel", np.zeros(len(directions))), np.int64)
+    max_range_m = header.get("max_range_m")
+    cycle_ns = header.get("cycle_ns")
+    rays = FiredRays(
+        directions,
+        times_ns,
+        channels,
+        origins,
+        None if cycle_ns is None else _positive(header, "cycle_ns"),
+        _positive(header, "rate_hz", FRAME_HZ),
+        (
+            float(header.get("min_range_m") or 0.0),
+            inf if max_range_m is None else _positive(header, "max_range_m"),
+        ),
+        str(header.get("sensor", "")),
+        bool(header.get("repeats", True)),
+    )
+    check_times(rays)
+    return rays
+
+
+def check_times(rays: FiredRays) -> None:
+    """Raise ValueError if the times of rays go back, or the list ends before its last ray."""
+    times_ns = rays.times_ns
+    if times_ns is None:
+        return
+    backward_rays = np.flatnonzero(np.diff(times_ns) < 0)
+    if len(backward_rays):
+        raise ValueError(f"times go back at ray {backward_rays[0] + 2}")
+    if times_ns[0] < 0:
+        raise ValueError(f"its first time is {times_ns[0]} ns; times are counted from 0 on")
+    if rays.cycle_ns is not None and rays.cycle_ns < times_ns[-1]:
+        raise ValueError(f"cycle_ns is {rays.cycle_ns:.15g}, before the last ray: {times_ns[-1]}")
+
+
+def _directions(columns: Mapping[str, Any]) -> Floats:
+    """Return the unit directions of columns, from vectors or else from angles; ValueError if none.
+
+    Vectors are scaled to length 1 unless they have it to twelve digits.
+    """
+    if all(name in columns for name in DIRECTION):
+        vectors = np.column_stack([np.asarray(columns[name], np.float64) for name in DIRECTION])
+        lengths = np.sqrt((vectors * vectors).sum(axis=1))
+        if not (lengths > 0).all():
+            raise ValueError(f"the direction of ray {int(lengths.argmin()) + 1} is zero")
+        if np.abs(lengths - 1).max() < 1e-12:
+            return vectors
+        return np.asarray(vectors / lengths[:, None], np.float64)
+    if "azimuth_deg" in columns and "elevation_deg" in columns:
+        elevations = np.asarray(columns["elevation_deg"], np.float64)
+        if len(elevations) and np.abs(elevations).max() > 90 + 1e-9:
+            raise ValueError("elevation_deg goes beyond 90 degrees")
+        return directions_of(np.asarray(columns["azimuth_deg"], np.float64), elevations)
+    raise ValueError("it needs azimuth_deg and elevation_deg, or direction_x, _y and _z")
+
+
+def _positive(header: Mapping[str, Any], name: str, default: float | None = None) -> float:
+    """Return a figure of a header above 0; ValueError for another value."""
+    value = header.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < inf:
+        raise ValueError(f"{name} of its header is {value!r}; a number above 0 is expected")
+    return float(value)
