@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from lidarsim import LidarError, Sensor, export_sensor, load_sensor
+from lidarsim import LidarError, MujocoScanner, Sensor, export_sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
 
 TABLES = ("npz", "csv", "parquet")
@@ -64,7 +64,7 @@ def test_a_table_states_its_conventions_and_what_it_lacks(tmp_path):
     remarks = [line[2:].partition(": ") for line in lines if line.startswith("#")]
     header = {name: json.loads(value) for name, _, value in remarks}
     assert header["axes"] == "x forward, y left, z up"
-    assert "counter-clockwise" in header["azimuth"] and not header["repeats"]
+    assert "counter-clockwise" in header["azimuth_deg"] and not header["repeats"]
     assert "rays after 0.1 s, which do not repeat these" in header["not_in_this_file"]
     rows = [*csv.DictReader(line for line in lines if not line.startswith("#"))]
     assert len(rows) == 10_000 and rows[1]["time_offset_ns"] == "10000"
@@ -72,6 +72,102 @@ def test_a_table_states_its_conventions_and_what_it_lacks(tmp_path):
     direction = [float(rows[77][f"direction_{axis}"]) for axis in "xyz"]
     expected = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)]
     assert np.allclose(direction, [*expected, np.sin(elevation)], atol=1e-10)
+
+
+def read_as_the_plug_in_does(path):
+    """Times and directions as livox_laser_simulation has them: yaw, and pitch from the zenith."""
+    first, *lines = path.read_text().splitlines()
+    assert first == "Time/s,Azimuth/deg,Zenith/deg"  # skipped there
+    time, azimuth, zenith = np.array(
+        [[float(word) for word in line.split(",")] for line in lines]
+    ).T
+    yaw, pitch = np.radians(azimuth), np.radians(zenith) - np.pi / 2
+    up = -np.sin(pitch)  # positive pitch is nose down
+    return time, np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), up], axis=1)
+
+
+def test_livox_lists_have_the_rays_that_the_plug_in_casts(tmp_path):
+    file = export_sensor(load_sensor("livox/mid360"), tmp_path / "r.csv", format="livox")
+    assert "channels" in file.left_out and "starts of the rays" not in "".join(file.left_out)
+    time, directions = read_as_the_plug_in_does(tmp_path / "r.csv")
+    assert angle_deg(directions, file.rays.directions) < 1e-5
+    assert np.array_equal(np.rint(time * 1e9), file.rays.times_ns)
+    back = load_sensor(calibration=tmp_path / "r.csv")
+    firings = np.arange(len(file.rays))
+    assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
+    assert np.array_equal(back.times_ns(firings)[:, 0], file.rays.times_ns)
+
+
+WORLD = """
+<mujoco>
+  {}
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 .1" pos="0 0 -1"/>
+    <geom name="wall" type="box" size=".1 5 3" pos="6 0 1" euler="0 5 20"/>
+    <geom name="roof" type="box" size="4 4 .1" pos="-2 1 3"/>
+    <site name="lidar" pos="0 0 0"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+def mujoco_world(head=""):
+    """MuJoCo, and a model of a world with its data."""
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    model = mujoco.MjModel.from_xml_string(WORLD.format(head))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return mujoco, model, data
+
+
+def test_mujoco_casts_the_rays_of_angles_as_we_do(tmp_path):
+    mujoco, model, data = mujoco_world()
+    sensor = load_sensor("livox/mid360", min_range_m=0, max_range_m=80)
+    file = export_sensor(sensor, tmp_path / "rays.npz", format="mujoco")
+    with np.load(tmp_path / "rays.npz") as arrays:
+        theta, phi, times = (arrays[name] for name in ("theta", "phi", "time_offset_ns"))
+        assert json.loads(str(arrays["header"]))["theta"].startswith("radians from x, counter-")
+    assert len(theta) == 20_000 and np.array_equal(times, file.rays.times_ns)
+    # As MuJoCo-LiDAR's processor backend makes directions of theta and phi.
+    vectors = np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], 1)
+    geoms = np.zeros(len(theta), np.int32)
+    distances = np.zeros(len(theta))
+    mujoco.mj_multiRay(
+        m=model, d=data, pnt=np.zeros(3), vec=vectors.ravel(), geomgroup=None, flg_static=1,
+        bodyexclude=-1, geomid=geoms, dist=distances, normal=None, nray=len(theta), cutoff=80,
+    )  # fmt: skip
+    back = load_sensor(calibration=tmp_path / "rays.npz")
+    ranges = MujocoScanner(model, back, site="lidar").ranges(data).ravel()
+    hit = (geoms >= 0) & (distances < 79.9)
+    assert hit.sum() > 5000 and np.abs(ranges[hit] - distances[hit]).max() < 1e-3
+    assert (np.isnan(ranges) | ~np.isfinite(ranges))[geoms < 0].all()
+    firings = np.arange(len(theta))
+    assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
+    assert np.array_equal(back.times_ns(firings)[:, 0], file.rays.times_ns)
+    assert back.max_range_m == 80
+
+
+def test_rangefinders_measure_what_a_scanner_does(tmp_path):
+    sensor = Sensor.grid(36, 8, 40, max_range_m=50)
+    file = export_sensor(sensor, tmp_path / "lidar.xml", format="mjcf")
+    assert file.left_out == ("times of the rays", "channels", "frames a second")
+    _, model, data = mujoco_world(f'<include file="{tmp_path / "lidar.xml"}"/>')
+    ranges = MujocoScanner(model, sensor, site="lidar").ranges(data).ravel()
+    hit = np.isfinite(ranges)
+    assert hit.sum() > 100 and np.abs(data.sensordata[hit] - ranges[hit]).max() < 1e-3
+    assert "<!-- Not in this file: channels. -->" in (tmp_path / "lidar.xml").read_text()
+    with pytest.raises(LidarError, match="would have 28,944 sites with rangefinders"):
+        export_sensor(load_sensor("velodyne/vlp16"), tmp_path / "vlp16.xml", format="mjcf")
+
+
+def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
+    theta, phi = np.meshgrid(np.linspace(-1, 1, 10), np.linspace(0, 0.5, 4))
+    np.savez(tmp_path / "rays.npz", theta=theta.ravel(), phi=phi.ravel())
+    sensor = load_sensor(calibration=tmp_path / "rays.npz")
+    assert np.array_equal(sensor.times_ns(np.arange(41))[:, 0], np.arange(41) * 2_500_000)
+    np.savez(tmp_path / "half.npz", theta=theta.ravel())
+    with pytest.raises(LidarError, match="no array phi"):
+        load_sensor(calibration=tmp_path / "half.npz")
 
 
 @pytest.mark.parametrize(

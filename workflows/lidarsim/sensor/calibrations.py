@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -20,7 +19,10 @@ from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
 from ..sensor_files.fired_rays import FiredRays
 from ..sensor_files.format_table import read_rays
+from ..sensor_files.livox import is_livox
+from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
+from ..sensor_files.text_rows import rows_of
 from .beams import Beams
 
 # Errors of files that users write.
@@ -210,11 +212,11 @@ def _table(name: str, text: str) -> Calibration:
     """Read a comma-separated calibration in the format of its header."""
     if is_ray_table(text):
         return _calibration_of(name, rays_of_text(text))
+    if is_livox(text):
+        return _livox(name, text)
     header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
-    if header == ["time/s", "azimuth/deg", "zenith/deg"]:
-        return _livox(name, _rows(text, 1, 3))
     if header[1:] == ["elevation", "azimuth"]:
-        rows = _rows(text, 1, 3)
+        rows = rows_of(text, 1, 3)
         if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
             raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
         elevation, azimuth = np.radians(rows[:, 1:]).T
@@ -230,7 +232,7 @@ def _table(name: str, text: str) -> Calibration:
             )
         if duplicate := next((word for word in header if header.count(word) > 1), None):
             raise ValueError(f"it has the column {duplicate!r} twice")
-        columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
+        columns = dict(zip(header, rows_of(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
             np.radians(columns["elevation_deg"]),
@@ -245,43 +247,16 @@ def _table(name: str, text: str) -> Calibration:
         raise ValueError(
             f"its first line, {','.join(header)[:60]!r}, has no known format"
         ) from None
-    elevation, azimuth = np.radians(_rows(text, 0, 2)).T
+    elevation, azimuth = np.radians(rows_of(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
 
 
-def _livox(name: str, rows: Floats) -> Calibration:
-    """Return the rays of Livox's list, rows of time, azimuth and zenith angle: (n, 3).
-
-    Zenith is counted from the z axis; the times may only number the rows.
-    """
-    times = rows[:, 0]
-    azimuth, zenith = np.radians(rows[:, 1:]).T
-    backward_rows = np.flatnonzero(np.diff(times) < 0)
-    if len(backward_rows):
-        raise ValueError(f"times go back in line {backward_rows[0] + 3}")
-    level, up = sin_cos(zenith)
-    sin, cos = sin_cos(azimuth)
-    rays = np.column_stack([level * cos, level * sin, up])
-    if times[-1] == times[0] or (np.diff(times) == 1).all():  # equal, or row numbers: not times
-        return Calibration(name, "livox", rays=rays)
-    shot_ns = (times - times[0]) * 1e9
-    interval_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
+def _livox(name: str, text: str) -> Calibration:
+    """Return the rays of Livox's list."""
+    rays = rays_of_livox(text)
+    if rays.times_ns is None:
+        return Calibration(name, "livox", rays=rays.directions)
+    shot_ns = rays.times_ns.astype(np.float64)
+    interval_us = Fraction(float(shot_ns[-1]) / (len(rays) - 1) / 1000).limit_denominator(1000)
     head = {"listed": True, "firing_us": interval_us}
-    return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
-
-
-def _rows(text: str, skip: int, columns: int) -> Floats:
-    """Return the numbers of the lines after the header, (n, columns).
-
-    Raises
-    ------
-    ValueError
-        If there are no such lines, or a number is not finite; the message names the line.
-    """
-    rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
-    if not len(rows) or rows.shape[1] != columns:
-        raise ValueError(f"it needs lines of {columns} numbers")
-    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    if len(bad):
-        raise ValueError(f"line {bad[0] + skip + 1} has numbers that are not finite")
-    return rows
+    return Calibration(name, "livox", rays=rays.directions, shot_ns=shot_ns, head=head)

@@ -11,9 +11,9 @@ from ..base.elementary import arctan2, sin_cos
 
 # Conventions of rays, which files state in their headers.
 AXES = "x forward, y left, z up"
-AZIMUTH = "degrees from x, counter-clockwise seen from above, -180 to 180"
-ELEVATION = "degrees above the xy plane"
-TIME = "nanoseconds since the first firing may leave"
+AZIMUTH = "from x, counter-clockwise seen from above, within half a turn"
+ELEVATION = "above the xy plane"
+TIME = "nanoseconds since the start of the list"
 FRAME_HZ = 10.0  # of lists that state neither times nor a rate
 
 

@@ -28,7 +28,8 @@ PROPERTIES = {
     "times": "times of the rays",
     "channels": "channels",
     "origins": "starts of the rays beside the sensor's centre",
-    "ranges": "shortest and longest range",
+    "min_range": "shortest range",
+    "max_range": "longest range",
     "rate": "frames a second",
     "divergence": "width of the beams",
     "returns": "returns of a pulse",
@@ -95,10 +96,19 @@ def _row(
     )
 
 
-_COLUMNS = ("times", "channels", "origins", "ranges", "rate")
+_COLUMNS = ("times", "channels", "origins", "min_range", "max_range", "rate")
 
 FORMATS: tuple[SensorFormat, ...] = (
+    _row(
+        "mujoco",
+        ".npz",
+        "angles for MuJoCo-LiDAR",
+        ("times", "min_range", "max_range", "rate"),
+        module="mujoco_rays",
+    ),
+    _row("mjcf", ".xml", "rangefinders of MuJoCo", ("origins", "max_range"), reads=False),
     _row("npz", ".npz", "arrays of NumPy", _COLUMNS, module="ray_npz", by_ending=True),
+    _row("livox", ".csv", "scan_mode of Livox's plug-in for Gazebo", ("times",)),
     _row("csv", ".csv", "a table of rays", _COLUMNS, module="ray_csv", by_ending=True),
     _row(
         "parquet",

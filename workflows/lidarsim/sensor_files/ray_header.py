@@ -19,19 +19,26 @@ ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")
 COLUMNS = (TIME_COLUMN, "channel", "azimuth_deg", "elevation_deg", *DIRECTION, *ORIGIN)
 
 
-def header_of(rays: FiredRays, left_out: Sequence[str]) -> dict[str, Any]:
+def header_of(
+    rays: FiredRays,
+    left_out: Sequence[str],
+    *,
+    azimuth: str = "azimuth_deg",
+    elevation: str = "elevation_deg",
+) -> dict[str, Any]:
     """Return the header of rays; an infinite range is None.
 
-    `left_out` says what the file does not hold of the sensor.
+    `left_out` says what the file does not hold of the sensor; `azimuth` and `elevation` are the
+    names of the columns, which have radians unless the names end in _deg.
     """
     min_range_m, max_range_m = rays.range_m
     return {
         "content": KIND,
         "sensor": rays.name,
         "axes": AXES,
-        "azimuth": AZIMUTH,
-        "elevation": ELEVATION,
-        "time": TIME,
+        azimuth: f"{_unit(azimuth)} {AZIMUTH}",
+        elevation: f"{_unit(elevation)} {ELEVATION}",
+        TIME_COLUMN: TIME,
         "min_range_m": min_range_m,
         "max_range_m": max_range_m if isfinite(max_range_m) else None,
         "rate_hz": rays.rate_hz,
@@ -39,6 +46,11 @@ def header_of(rays: FiredRays, left_out: Sequence[str]) -> dict[str, Any]:
         "repeats": rays.repeats,
         "not_in_this_file": list(left_out),
     }
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a column of angles."""
+    return "degrees" if name.endswith("_deg") else "radians"
 
 
 def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:

@@ -41,13 +41,19 @@ def read(path: Path) -> FiredRays | None:
     arrays = read_arrays(path)
     if HEADER not in arrays and "direction_x" not in arrays and "azimuth_deg" not in arrays:
         return None
-    header: Any = json.loads(str(arrays.pop(HEADER, np.array("{}"))))
-    if not isinstance(header, dict):
-        raise ValueError("its header is not of a file of rays")
+    header = header_in(arrays)
     if unknown := [name for name in arrays if name not in COLUMNS]:
         names = ", ".join(map(printable, unknown[:5]))
         raise ValueError(f"it has arrays that are not known: {names}. Known: {', '.join(COLUMNS)}")
     return rays_of(arrays, header)
+
+
+def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
+    """Remove the header from arrays and return it; ValueError if it is not of a file of rays."""
+    header = json.loads(str(arrays.pop(HEADER, np.array("{}"))))
+    if not isinstance(header, dict):
+        raise ValueError("its header is not of a file of rays")
+    return header
 
 
 def read_arrays(path: Path) -> dict[str, Any]:

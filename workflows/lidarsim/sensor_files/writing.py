@@ -25,3 +25,8 @@ def write_text_of(path: Path, text: str) -> None:
     """Write a text in UTF-8; LidarError if the file cannot be written."""
     with write_bytes_of(path) as file:
         file.write(text.encode())
+
+
+def remark(text: str) -> str:
+    """Return a text for a comment of XML, which must not have two hyphens in a row."""
+    return text.replace("--", "- -").rstrip("-")

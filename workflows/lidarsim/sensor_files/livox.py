@@ -1,0 +1,63 @@
+"""Livox's lists of rays (.csv): Time/s, Azimuth/deg, Zenith/deg.
+
+The plug-in livox_laser_simulation for Gazebo and its descendants read them. The zenith angle is
+counted from the z axis, the azimuth counter-clockwise from x; times may only number the rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..base.textfile import read_text
+from .fired_rays import FiredRays, directions_of
+from .text_rows import rows_of
+from .writing import write_text_of
+
+HEADER = "Time/s,Azimuth/deg,Zenith/deg"
+_DECIMALS = 9
+
+
+def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+    """Write rays in the order of firing; the format has no remarks."""
+    times_ns = rays.timed().times_ns
+    assert times_ns is not None  # of timed rays
+    azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # no -0.0
+    zeniths = np.round(90 - rays.elevations_deg, _DECIMALS)
+    rows = zip(times_ns.tolist(), azimuths.tolist(), zeniths.tolist(), strict=True)
+    lines = [f"{time // 10**9}.{time % 10**9:09d},{azimuth!r},{zenith!r}"
+             for time, azimuth, zenith in rows]  # fmt: skip
+    write_text_of(path, "\n".join([HEADER, *lines]) + "\n")
+    return left_out
+
+
+def is_livox(text: str) -> bool:
+    """Return True if a text has the header of Livox's lists."""
+    words = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
+    return words == HEADER.lower().split(",")
+
+
+def read(path: Path) -> FiredRays | None:
+    """Return the rays of a list; None for a file of another format."""
+    text = read_text(path)
+    return rays_of_text(text) if is_livox(text) else None
+
+
+def rays_of_text(text: str) -> FiredRays:
+    """Return the rays of a list, with times unless these only number the rows.
+
+    Raises
+    ------
+    ValueError
+        If numbers are missing or not finite, or times go back.
+    """
+    times_s, azimuths_deg, zeniths_deg = rows_of(text, 1, 3).T
+    backward_rows = np.flatnonzero(np.diff(times_s) < 0)
+    if len(backward_rows):
+        raise ValueError(f"times go back in line {backward_rows[0] + 3}")
+    directions = directions_of(azimuths_deg, 90 - zeniths_deg)
+    if times_s[-1] == times_s[0] or (np.diff(times_s) == 1).all():
+        return FiredRays(directions)
+    return FiredRays(directions, np.rint((times_s - times_s[0]) * 1e9).astype(np.int64))

@@ -1,0 +1,26 @@
+"""Rows of numbers that commas separate."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from ..base.arrays import Floats
+
+
+def rows_of(text: str, skip: int, columns: int) -> Floats:
+    """Return the numbers of the lines after a header of `skip` lines, (n, columns).
+
+    Raises
+    ------
+    ValueError
+        If there are no such lines, or a number is not finite; the message names the line.
+    """
+    rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
+    if not len(rows) or rows.shape[1] != columns:
+        raise ValueError(f"it needs lines of {columns} numbers")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise ValueError(f"line {bad[0] + skip + 1} has numbers that are not finite")
+    return rows
