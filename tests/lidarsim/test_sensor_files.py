@@ -7,8 +7,10 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
-from lidarsim import LidarError, MujocoScanner, Sensor, export_sensor, load_sensor
+from lidarscenes.gazebo.import_world import import_world
+from lidarsim import Beams, LidarError, MujocoScanner, Sensor, Spin, export_sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
 
 TABLES = ("npz", "csv", "parquet")
@@ -158,6 +160,55 @@ def test_rangefinders_measure_what_a_scanner_does(tmp_path):
     assert "<!-- Not in this file: channels. -->" in (tmp_path / "lidar.xml").read_text()
     with pytest.raises(LidarError, match="would have 28,944 sites with rangefinders"):
         export_sensor(load_sensor("velodyne/vlp16"), tmp_path / "vlp16.xml", format="mjcf")
+
+
+GRIDS = {
+    "round": Sensor.grid(360, 8, 40, max_range_m=50, min_range_m=0.5, rate_hz=20),
+    "sector": Sensor.grid(270, 4, 10, horizontal_fov_deg=270),
+    "behind": Sensor(Beams.even(3, 4.0), Spin(40, clockwise=True, zero_deg=180)),
+    "line": Sensor.grid(720, 1, 0),
+}
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_grids_come_back_from_gazebo(name, tmp_path):
+    sensor = GRIDS[name]
+    export_sensor(sensor, tmp_path / "lidar.sdf")
+    text = (tmp_path / "lidar.sdf").read_text()
+    assert "<!-- Not in this file: times of the rays. -->" in text
+    box = "<geometry><box><size>1 1 1</size></box></geometry>"
+    floor = f'<model name="m"><link name="l"><visual name="v">{box}</visual></link></model>'
+    lidar = text[text.index("<model") : text.index("</sdf>")]
+    world = f'<sdf version="1.9"><world name="w">{floor}{lidar}</world></sdf>'
+    (tmp_path / "world.sdf").write_text(world)
+    (tmp_path / "scenario").mkdir()
+    import_world(tmp_path / "world.sdf", tmp_path / "scenario", ())
+    [file] = [file for file in (tmp_path / "scenario").iterdir() if file.name != "scenario.yaml"]
+    data = yaml.safe_load((tmp_path / "scenario/scenario.yaml").read_text())["sensors"]
+    [entry] = data.values()
+    assert entry.get("max_range_m", np.inf) == sensor.max_range_m
+    assert entry.get("min_range_m", 0) == sensor.min_range_m
+    rays, back = fired_rays(sensor), fired_rays(load_sensor(file, step_deg=360))
+    assert back.rate_hz == rays.rate_hz and len(back) == len(rays)
+    keys = [np.round(r.directions, 9) + 0.0 for r in (rays, back)]
+    ordered = [r.directions[np.lexsort(k.T)] for r, k in zip((rays, back), keys, strict=True)]
+    assert angle_deg(*ordered) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("sensor", "reason"),
+    [
+        ("velodyne/vlp16", "28,944 rays have .* azimuths and 16 elevations"),
+        ("ouster/os1-64", "64 elevations, because channels fire at different azimuths"),
+        ("livox/mid360", "the pattern has no rows"),
+        (Sensor(Beams(np.radians([-5.0, 0, 1]))), "elevations are 1 to 5 degrees apart"),
+    ],
+)
+def test_what_is_no_grid_is_refused_for_gazebo(sensor, reason, tmp_path):
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    with pytest.raises(LidarError, match=f"is no regular grid, as <gpu_lidar> is: .*{reason}"):
+        export_sensor(sensor, tmp_path / "lidar.sdf")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
