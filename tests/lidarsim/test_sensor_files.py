@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from lidarscenes.gazebo.import_world import import_world
+from lidarscenes.sensors.omnilidar import read_omnilidar
 from lidarsim import Beams, LidarError, MujocoScanner, Sensor, Spin, export_sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
 
@@ -209,6 +210,104 @@ def test_what_is_no_grid_is_refused_for_gazebo(sensor, reason, tmp_path):
     with pytest.raises(LidarError, match=f"is no regular grid, as <gpu_lidar> is: .*{reason}"):
         export_sensor(sensor, tmp_path / "lidar.sdf")
     assert list(tmp_path.iterdir()) == []
+
+
+# Types by omni.sensors.nv.lidar, "Setting Lidar Attributes", and the schemas of omni_sensors.
+CORE = "omni:sensor:Core:"
+OMNILIDAR_TYPES = {
+    "omni:sensor:modelName": "string",
+    "omni:sensor:tickRate": "float",
+    **{f"{CORE}{name}": "float" for name in ("nearRangeM", "farRangeM", "waveLengthNm")},
+    f"{CORE}scanType": "token",
+    **{
+        f"{CORE}{name}": "uint"
+        for name in (
+            "scanRateBaseHz", "reportRateBaseHz", "patternFiringRateHz", "numberOfEmitters",
+            "numberOfChannels", "emitterStateCount", "stateResolutionStep", "numLines",
+        )
+    },
+    f"{CORE}numRaysPerLine": "uint[]",
+}  # fmt: skip
+STATE_TYPES = {"azimuthDeg": "float[]", "elevationDeg": "float[]"}
+STATE_TYPES |= dict.fromkeys(("fireTimeNs", "channelId", "bank"), "uint[]")
+
+
+@pytest.mark.extended(keep=("mid360",))
+@pytest.mark.parametrize(
+    ("model", "frames"), [("livox/mid360", 2), ("ouster/os1-64", 1), ("velodyne/vlp16", 1)]
+)
+def test_omnilidar_has_attributes_of_the_schema_and_reads_back(model, frames, tmp_path):
+    usd = pytest.importorskip("pxr.Usd", reason='needs usd-core: pip install "lidarpool[usd]"')
+    path = tmp_path / "lidar.usda"
+    file = export_sensor(load_sensor(model), path, revolutions=frames)
+    stage = usd.Stage.Open(str(path))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "OmniLidar"
+    names = [f"s{number:03d}" for number in range(1, frames + 1)]
+    states = [f"OmniSensorGenericLidarCoreEmitterStateAPI:{name}" for name in names]
+    schemas = prim.GetMetadata("apiSchemas").GetAddedOrExplicitItems()
+    assert list(schemas) == ["OmniSensorGenericLidarCoreAPI", *states]
+    types = {a.GetName(): str(a.GetTypeName()) for a in prim.GetAttributes()}
+    of_states = {
+        f"{CORE}emitterState:{name}:{field}": kind
+        for name in names
+        for field, kind in STATE_TYPES.items()
+    }
+    assert types == {**OMNILIDAR_TYPES, **of_states}
+    values = {a.GetName(): a.Get() for a in prim.GetAttributes()}
+    emitters = values[f"{CORE}numberOfEmitters"]
+    assert sum(values[f"{CORE}numRaysPerLine"]) == emitters == len(file.rays) // frames
+    assert all(len(values[name]) == emitters for name in of_states)
+    azimuth, elevation, times = (
+        np.concatenate([np.array(values[f"{CORE}emitterState:{n}:{field}"], float) for n in names])
+        for field in ("azimuthDeg", "elevationDeg", "fireTimeNs")
+    )
+    assert np.abs((azimuth - file.rays.azimuths_deg + 180) % 360 - 180).max() < 1e-5
+    assert np.abs(elevation - file.rays.elevations_deg).max() < 1e-5
+    starts = np.repeat(np.arange(frames) * 10**8, emitters)
+    assert np.array_equal(times + starts, file.rays.times_ns)
+    back = read_omnilidar(path)
+    assert angle_deg(back.rays.directions, file.rays.directions) < 1e-5
+    assert np.array_equal(back.rays.times_ns, file.rays.times_ns)
+    assert back.rays.range_m == pytest.approx(file.rays.range_m)
+    assert back.left_out == ["its channels: a list of rays has one"]
+
+
+ROTARY = """#usda 1.0
+def Xform "World"
+{{
+def OmniLidar "Lidar" (
+    prepend apiSchemas = ["OmniSensorGenericLidarCoreAPI"]
+){{
+    token omni:sensor:Core:scanType = "ROTARY"
+    uint omni:sensor:Core:scanRateBaseHz = 10
+    uint omni:sensor:Core:reportRateBaseHz = 3600
+    float omni:sensor:Core:farRangeM = 60
+    float[] omni:sensor:Core:emitterState:s001:azimuthDeg = [0, 1]
+    float[] omni:sensor:Core:emitterState:s001:elevationDeg = [-5, 5]
+    uint[] omni:sensor:Core:emitterState:s001:fireTimeNs = [0, 500]
+    {}
+}}
+}}
+"""
+
+
+def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
+    pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
+    path = tmp_path / "lidar.usda"
+    path.write_text(ROTARY.format(f"float[] {CORE}emitterState:s001:vertOffsetM = [0.1, 0.1]"))
+    sensor = read_omnilidar(path)
+    rays = sensor.rays
+    assert len(rays) == 720 and rays.cycle_ns == 1e8 and rays.range_m == (0, 60)
+    assert rays.times_ns[:4].tolist() == [0, 500, 277_778, 278_278]
+    assert np.allclose(rays.azimuths_deg[:4], [0, 1, -1, 0], atol=1e-5), "clockwise"
+    assert sensor.left_out[0] == "vertOffsetM of its emitters"
+    path.write_text(ROTARY.format(f"float[] {CORE}emitterState:s002:azimuthDeg = [0, 1]"))
+    with pytest.raises(LidarError, match="emitterState:s002 has no elevationDeg, fireTimeNs"):
+        read_omnilidar(path)
+    path.write_text('#usda 1.0\ndef Xform "World" {}\n')
+    with pytest.raises(LidarError, match="it has no OmniLidar prim"):
+        read_omnilidar(path)
 
 
 def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):

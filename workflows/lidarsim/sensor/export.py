@@ -11,8 +11,9 @@ from pydantic import Field
 from ..base.arrays import Ints
 from ..base.errors import LidarError
 from ..base.validation import checked
-from ..sensor_files.fired_rays import FRAME_HZ, FiredRays
+from ..sensor_files.fired_rays import FRAME_HZ, FiredRays, Light
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
+from .optics import Optics
 from .ray_sensors import PrismSensor
 from .sensor import Sensor
 
@@ -132,7 +133,17 @@ def fired_rays(
         range_m=(sensor.min_range_m, sensor.max_range_m),
         name=sensor.model,
         repeats=_repeats(sensor, count),
+        light=_light(sensor.optics),
     )
+
+
+def _light(optics: Optics) -> Light:
+    """Return the light of a sensor for files."""
+    divergence_mrad = optics.divergence_mrad
+    if divergence_mrad is not None:
+        across, up = np.broadcast_to(divergence_mrad, 2).tolist()
+        return Light(optics.wavelength_nm, optics.pulse_ns, (across, up))
+    return Light(optics.wavelength_nm, optics.pulse_ns, None)
 
 
 def _firings_before(sensor: Sensor, duration_ns: float) -> int:

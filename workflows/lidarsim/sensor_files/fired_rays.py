@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,15 @@ AZIMUTH = "from x, counter-clockwise seen from above, within half a turn"
 ELEVATION = "above the xy plane"
 TIME = "nanoseconds since the start of the list"
 FRAME_HZ = 10.0  # of lists that state neither times nor a rate
+
+
+class Light(NamedTuple):
+    """Light of a sensor."""
+
+    wavelength_nm: float
+    pulse_ns: float
+    # Full angles across and up, at 1/e² of the maximum; None if unknown.
+    divergence_mrad: tuple[float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +51,8 @@ class FiredRays:
         Name of the sensor.
     repeats
         Whether the sensor itself repeats these rays, except for parts of a firing.
+    light
+        Light of the sensor; None if unknown.
     """
 
     directions: Floats
@@ -52,6 +64,7 @@ class FiredRays:
     range_m: tuple[float, float] = (0.0, float("inf"))
     name: str = ""
     repeats: bool = True
+    light: Light | None = None
 
     def __post_init__(self) -> None:
         if not len(self.channels):

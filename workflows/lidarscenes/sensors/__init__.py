@@ -1,0 +1,1 @@
+"""Sensors of other programs as lists of rays, and as scenarios."""

@@ -1,0 +1,224 @@
+"""OmniLidar prims of Isaac Sim and Omniverse as rays: `omnilidar_child.py` reads the files.
+
+Attributes by the extension omni.sensors.nv.lidar, "Setting Lidar Attributes". Azimuths are taken
+counter-clockwise from x, where x is forward, y left and z up.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.allowance import Allowance, memory_share
+from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
+from lidarsim.base.input_files import check_input
+from lidarsim.base.words import listed
+from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
+
+from ..files.child_process import Child
+from ..files.usd import USD_CORE_BYTES
+
+CORE = "omni:sensor:Core:"
+_STATE = f"{CORE}emitterState:"
+_MAX_RAYS = 20_000_000
+# Attributes of a state that are understood, and those that do not change rays.
+_READ = ("azimuthDeg", "elevationDeg", "fireTimeNs")
+_OF_NO_RAY = ("channelId", "bank", "rangeId", "roi", "isROIState", "reportRateDiv")
+
+
+class ReadSensor(NamedTuple):
+    """A sensor of another program.
+
+    Attributes
+    ----------
+    rays
+        Its rays.
+    left_out
+        What is not as in the other program, a clause each.
+    """
+
+    rays: FiredRays
+    left_out: list[str]
+
+
+def read_omnilidar(path: Path) -> ReadSensor:
+    """Return the rays of the first OmniLidar prim of a file of OpenUSD.
+
+    Raises
+    ------
+    LidarError
+        If usd-core is missing, the file cannot be read, or the prim has no usable emitter states.
+    """
+    if find_spec("pxr") is None:
+        command = install_command("lidarpool[usd]")
+        raise LidarError(f"{path} is OpenUSD, which usd-core reads: {command}.")
+    if sys.platform == "win32":  # where a process has no limits of memory
+        raise LidarError(f"{path} is OpenUSD, which is not read on Windows.")
+    try:
+        prim = _read_prim(path)
+        return _sensor(prim)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(getattr(error, "strerror", None) or error).split())
+        raise LidarError(f"{path} is no usable OmniLidar: {reason}.") from error
+
+
+class _Prim(NamedTuple):
+    """Attributes of a prim."""
+
+    paths: list[str]  # of all OmniLidar prims of the file
+    values: dict[str, Any]  # {name: plain value}
+    arrays: dict[str, AnyArray]
+
+    def number(self, name: str, default: float) -> float:
+        """Return an attribute of the model as a number."""
+        return float(self.values.get(CORE + name, default))
+
+
+def _read_prim(path: Path) -> _Prim:
+    """Read the first OmniLidar prim of a file; ValueError if there is none."""
+    allowance = Allowance(check_input(path), "write it again with fewer rays")
+    child = Child(
+        Path(__file__).with_name("omnilidar_child.py"),
+        "usd-core",
+        memory_share() + USD_CORE_BYTES,
+        path.absolute().parent,
+        hidden=("PXR_",),
+        environment={"PXR_WORK_THREAD_LIMIT": "1"},
+    )
+    with closing(child.frames(path, {}, lambda frame, size: allowance.take(size))) as frames:
+        frame, arrays = next(frames)
+    if not frame["prims"]:
+        raise ValueError("it has no OmniLidar prim")
+    return _Prim(frame["prims"], frame["values"], dict(zip(frame["names"], arrays, strict=True)))
+
+
+def _sensor(prim: _Prim) -> ReadSensor:
+    """Return the rays of a prim; ValueError if its attributes make no pattern."""
+    states = _states(prim)
+    rate_hz = prim.number("scanRateBaseHz", 10)
+    if not rate_hz > 0:
+        raise ValueError(f"scanRateBaseHz is {rate_hz:g}")
+    kind = str(prim.values.get(f"{CORE}scanType", "ROTARY"))
+    fires = {"SOLID_STATE": _solid_state, "ROTARY": _rotary}
+    if kind not in fires:
+        raise ValueError(f"scanType is {kind!r}; SOLID_STATE and ROTARY are read")
+    pattern = fires[kind](prim, states, rate_hz)
+    order = np.argsort(pattern.times_ns, kind="stable")
+    rays = FiredRays(
+        directions_of(pattern.azimuths_deg[order], pattern.elevations_deg[order]),
+        pattern.times_ns[order],
+        cycle_ns=max(pattern.cycle_ns, float(pattern.times_ns.max()) + 1),
+        rate_hz=rate_hz,
+        range_m=(prim.number("nearRangeM", 0.0), prim.number("farRangeM", np.inf)),
+        name=str(prim.values.get("omni:sensor:modelName", "")) or "OmniLidar",
+    )
+    return ReadSensor(rays, [*_left_out(prim, states)])
+
+
+class _State(NamedTuple):
+    """Emitters that fire in a tick."""
+
+    azimuths_deg: Floats  # (n,)
+    elevations_deg: Floats  # (n,)
+    times_ns: Ints  # (n,), since the tick
+
+
+class _Pattern(NamedTuple):
+    """Rays of some scans."""
+
+    azimuths_deg: Floats  # (n,)
+    elevations_deg: Floats  # (n,)
+    times_ns: Ints  # (n,)
+    cycle_ns: float
+
+
+def _states(prim: _Prim) -> list[_State]:
+    """Return the emitter states in their order; ValueError if one cannot be used."""
+    names = sorted(
+        {name[len(_STATE) :].partition(":")[0] for name in prim.arrays if name.startswith(_STATE)}
+    )
+    if not names:
+        raise ValueError(
+            "it has no emitter states of its own, such as emitterState:s001:azimuthDeg"
+        )
+    states = []
+    for name in names:
+        fields = {field: prim.arrays.get(f"{_STATE}{name}:{field}") for field in _READ}
+        if missing := [field for field, values in fields.items() if values is None]:
+            raise ValueError(f"emitterState:{name} has no {listed(missing)}")
+        columns = [np.asarray(values, np.float64) for values in fields.values()]
+        if len({column.shape for column in columns}) > 1 or not len(columns[0]):
+            raise ValueError(f"the arrays of emitterState:{name} have different lengths, or none")
+        if not all(np.isfinite(column).all() for column in columns):
+            raise ValueError(f"emitterState:{name} has numbers that are not finite")
+        states.append(_State(columns[0], columns[1], np.rint(columns[2]).astype(np.int64)))
+    return states
+
+
+def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
+    """Return the rays of a scan for each state."""
+    del prim
+    starts_ns = np.rint(np.arange(len(states)) * (1e9 / rate_hz)).astype(np.int64)
+    return _Pattern(
+        np.concatenate([state.azimuths_deg for state in states]),
+        np.concatenate([state.elevations_deg for state in states]),
+        np.concatenate(
+            [start + state.times_ns for start, state in zip(starts_ns, states, strict=True)]
+        ),
+        len(states) * 1e9 / rate_hz,
+    )
+
+
+def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
+    """Return the rays of the ticks of a scan; ValueError without a rate of ticks."""
+    tick_hz = prim.number("patternFiringRateHz", 0) or prim.number("reportRateBaseHz", 0)
+    if not tick_hz > 0:
+        raise ValueError("it has neither patternFiringRateHz nor reportRateBaseHz")
+    ticks = max(round(tick_hz / rate_hz), 1)
+    if ticks * max(len(state.azimuths_deg) for state in states) > _MAX_RAYS:
+        raise ValueError(f"a scan has more than {_MAX_RAYS:,} rays")
+    clockwise = prim.values.get(f"{CORE}rotationDirection", "CW") == "CW"
+    step_deg = 360 * rate_hz / tick_hz * (-1 if clockwise else 1)
+    hold = max(int(prim.number("stateResolutionStep", 1)), 1)
+    start_deg = prim.number("startAzimuthOffsetDeg", 0.0)
+    chosen = [states[tick // hold % len(states)] for tick in range(ticks)]
+    return _Pattern(
+        np.concatenate(
+            [start_deg + tick * step_deg + state.azimuths_deg for tick, state in enumerate(chosen)]
+        ),
+        np.concatenate([state.elevations_deg for state in chosen]),
+        np.concatenate(
+            [round(tick * 1e9 / tick_hz) + state.times_ns for tick, state in enumerate(chosen)]
+        ),
+        1e9 / rate_hz,
+    )
+
+
+def _left_out(prim: _Prim, states: list[_State]) -> list[str]:
+    """Return what is not as in the other program, a clause each."""
+    clauses = []
+    if prim.paths[1:]:
+        clauses.append(f"{len(prim.paths) - 1} further OmniLidar prims: {prim.paths[0]} is read")
+    fields = {name.rpartition(":")[2] for name in _used_arrays(prim.arrays)}
+    if others := sorted(fields - {*_READ, *_OF_NO_RAY}):
+        clauses.append(f"{listed(others)} of its emitters")
+    if len(states[0].azimuths_deg) > 1:
+        clauses.append("its channels: a list of rays has one")
+    noise = [name for name in ("azimuthErrorStd", "elevationErrorStd", "rangeAccuracyM")
+             if prim.number(name, 0.0)]  # fmt: skip
+    if noise:
+        clauses.append(f"noise: {listed(noise)}")
+    return clauses
+
+
+def _used_arrays(arrays: Mapping[str, AnyArray]) -> list[str]:
+    """Return the arrays of emitter states that hold a number other than zero."""
+    return [name for name, values in arrays.items() if name.startswith(_STATE) and values.any()]

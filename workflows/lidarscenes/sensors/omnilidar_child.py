@@ -1,0 +1,103 @@
+"""Reads an OmniLidar prim with usd-core, in a process that `omnilidar.py` starts: a script.
+
+usd-core ends its process on some broken files; here only this process. The script imports nothing
+of lidarpool. Standard output gets one frame: a line of JSON with the attributes of the prim, and
+the bytes of the arrays that `names` of the line names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Tf, Usd
+
+MAX_WAIT_S = 120  # broken files may take for ever
+_API = "OmniSensorGenericLidarCoreAPI"
+_PREFIX = "omni:sensor:"
+
+
+def main(path: str) -> None:
+    """Read a file, and write a frame to standard output."""
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    frame: dict[str, Any]
+    arrays: list[np.ndarray] = []
+    try:
+        stage = Usd.Stage.Open(path)
+        _check_layers(stage, path)
+        prims = [prim for prim in stage.TraverseAll() if _is_lidar(prim)]
+        values = _attributes(prims[0]) if prims else {}
+        fields = {name: np.asarray(value) for name, value in values.items() if _is_array(value)}
+        arrays = [np.ascontiguousarray(array) for array in fields.values()]
+        plain = {name: value for name, value in values.items() if name not in fields}
+        frame = {
+            "what": "lidar",
+            "prims": [str(prim.GetPath()) for prim in prims],
+            "values": plain,
+            "names": [*fields],
+        }
+    except Exception as error:  # usd-core raises errors of several classes
+        frame = {"what": "error", "reason": _reason(error, path)}
+        arrays = []
+    frame["arrays"] = [[array.dtype.str, array.shape] for array in arrays]
+    output.write(json.dumps(frame, default=str).encode() + b"\n")
+    for array in arrays:
+        output.write(array.tobytes())
+    output.flush()
+
+
+def _reason(error: Exception, path: str) -> str:
+    """Return the reason of an error, without names of C++ and folders."""
+    try:
+        text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
+    except UnicodeDecodeError:
+        return "its text is garbled"
+    return " ".join(text.replace(path, Path(path).name).split())[:300]
+
+
+def _check_layers(stage: Usd.Stage, path: str) -> None:
+    """Raise ValueError if content is from outside the folder of the file."""
+    folder = Path(path).resolve().parent
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
+            raise ValueError(f"it refers to {layer.realPath}, outside its folder")
+
+
+def _is_lidar(prim: Usd.Prim) -> bool:
+    """Return True for an OmniLidar with the attributes of the generic model."""
+    applied = prim.GetMetadata("apiSchemas")
+    names = applied.GetAddedOrExplicitItems() if applied else []
+    return str(prim.GetTypeName()) == "OmniLidar" or _API in names
+
+
+def _attributes(prim: Usd.Prim) -> dict[str, Any]:
+    """Return the attributes of a sensor that have a value."""
+    attributes = {
+        attribute.GetName(): attribute.Get()
+        for attribute in prim.GetAttributes()
+        if attribute.GetName().startswith(_PREFIX)
+    }
+    return {name: value for name, value in attributes.items() if value is not None}
+
+
+def _is_array(value: Any) -> bool:
+    """Return True for an array of numbers."""
+    return not isinstance(value, str) and hasattr(value, "__len__")
+
+
+if __name__ == "__main__":
+    message = json.loads(sys.argv[2])
+    signal.alarm(MAX_WAIT_S)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
+    max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
+    resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
+    main(sys.argv[1])
+    os._exit(0)
