@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import runpy
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -308,6 +312,69 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
     path.write_text('#usda 1.0\ndef Xform "World" {}\n')
     with pytest.raises(LidarError, match="it has no OmniLidar prim"):
         read_omnilidar(path)
+
+
+def test_a_python_file_returns_the_rays_of_each_frame(tmp_path):
+    """In a process that has NumPy and nothing of ours; vertices of the file are its sensor's."""
+    sensor = load_sensor("livox/mid360")
+    file = export_sensor(sensor, tmp_path / "mid360.py", revolutions=3)
+    assert (tmp_path / "mid360.py").stat().st_size < 1_500_000
+    code = """
+import sys
+import mid360
+import numpy as np
+assert not {"lidarsim", "lidarpool"} & sys.modules.keys()
+origins, directions, times_ns = mid360.rays(frame=4)
+np.savez("out.npz", origins=origins, directions=directions, times_ns=times_ns)
+print(mid360.NAME, mid360.RATE_HZ, mid360.FRAMES, mid360.MAX_RANGE_M)
+"""
+    environment = {name: text for name, text in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=environment
+    )
+    assert done.stdout == "Livox Mid-360, typical pattern 10.0 3 70.0\n", done.stderr
+    with np.load(tmp_path / "out.npz") as arrays:
+        frame = slice(20_000, 40_000)  # frame 4 of 3 is frame 1
+        assert arrays["directions"].dtype == np.float32 and not arrays["origins"].any()
+        assert angle_deg(arrays["directions"], file.rays.directions[frame]) < 1e-5
+        assert np.array_equal(arrays["times_ns"], file.rays.times_ns[frame])
+
+
+def test_a_python_file_has_the_starts_of_the_rays(tmp_path):
+    file = export_sensor(load_sensor("velodyne/hdl64e-s2"), tmp_path / "hdl64.py", seconds=0.002)
+    module = runpy.run_path(str(tmp_path / "hdl64.py"))
+    origins, directions, _ = module["rays"]()
+    assert np.allclose(origins, file.rays.origins, atol=1e-7) and len(directions) == len(file.rays)
+    assert "Not in this file: channels" in module["__doc__"]
+
+
+def test_rgl_rays_are_matrices_that_take_z_to_the_ray(tmp_path):
+    sensor = load_sensor("velodyne/hdl64e-s2")
+    file = export_sensor(sensor, tmp_path / "rays.npz", format="rgl")
+    with np.load(tmp_path / "rays.npz") as arrays:
+        kinds = {
+            name: (arrays[name].dtype, arrays[name].shape) for name in arrays if name != "header"
+        }
+        matrices = arrays["rays"].astype(np.float64)
+        count = len(file.rays)
+        assert kinds == {
+            "rays": (np.float32, (count, 3, 4)),
+            "ring_ids": (np.int32, (count,)),
+            "time_offsets": (np.float32, (count,)),
+            "ranges": (np.float32, (1, 2)),
+        }
+        assert np.array_equal(arrays["ring_ids"], file.rays.channels)
+        assert np.abs(arrays["time_offsets"] - file.rays.times_ns / 1e6).max() < 1e-5
+    ends = matrices @ [0, 0, 5, 1]  # five metres along the z axis
+    expected = file.rays.origins + 5 * file.rays.directions
+    assert np.abs(ends - expected).max() < 1e-5
+    rotations = matrices[:, :, :3]
+    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+    assert np.allclose(np.linalg.det(rotations), 1, atol=1e-6)
+    back = load_sensor(calibration=tmp_path / "rays.npz")
+    firings = np.arange(count)
+    assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
+    assert np.abs(back.times_ns(firings)[:, 0] - file.rays.times_ns).max() <= 8, "float32 ms"
 
 
 def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):

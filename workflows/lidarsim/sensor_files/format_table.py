@@ -116,6 +116,21 @@ FORMATS: tuple[SensorFormat, ...] = (
         reads=False,
     ),
     _row(
+        "warp",
+        ".py",
+        "a Python file of arrays, for Isaac Lab, mjlab and Genesis",
+        ("times", "origins", "min_range", "max_range", "rate"),
+        module="warp_module",
+        by_ending=True,
+        reads=False,
+    ),
+    _row(
+        "rgl",
+        ".npz",
+        "RobotecGPULidar",
+        ("times", "channels", "origins", "min_range", "max_range", "rate"),
+    ),
+    _row(
         "omnilidar",
         ".usda",
         "OmniLidar of Isaac Sim",

@@ -1,0 +1,103 @@
+"""Rays as the inputs of nodes of RobotecGPULidar (.npz).
+
+By its header api/core.h: a ray is a matrix (3, 4) that takes the z axis to the direction of the ray
+and zero to its start; ring ids are int32, time offsets float32 milliseconds, ranges two float32.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..base.arrays import Floats
+from .fired_rays import AXES, FiredRays
+from .ray_npz import HEADER, header_in, read_arrays
+from .writing import write_bytes_of
+
+_STEEP = 0.9  # z component above which a ray is taken as vertical
+
+
+def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+    """Write arrays, each the input of the node that is named after it."""
+    times_ns = rays.timed().times_ns
+    assert times_ns is not None  # of timed rays
+    header = {
+        "sensor": rays.name,
+        "axes": AXES,
+        "rays": "rgl_node_rays_from_mat3x4f: rows of matrices; column 3 is the direction",
+        "ring_ids": "rgl_node_rays_set_ring_ids",
+        "time_offsets": "rgl_node_rays_set_time_offsets: milliseconds since the start of the list",
+        "ranges": "rgl_node_rays_set_range: shortest and longest, metres",
+        "rate_hz": rays.rate_hz,
+        "cycle_ns": rays.cycle_ns,
+        "not_in_this_file": list(left_out),
+    }
+    with write_bytes_of(path) as file:
+        np.savez_compressed(
+            file,
+            allow_pickle=False,
+            rays=_matrices(rays).astype(np.float32),
+            ring_ids=rays.channels.astype(np.int32),
+            time_offsets=(times_ns / 1e6).astype(np.float32),
+            ranges=np.array([rays.range_m], np.float32),
+            **{HEADER: np.array(json.dumps(header))},
+        )
+    return left_out
+
+
+def _matrices(rays: FiredRays) -> Floats:
+    """Return matrices (n, 3, 4) that take the z axis to the rays.
+
+    Their x axes are level and to the right of the rays, or -y for vertical rays.
+    """
+    ahead = rays.directions
+    up = np.where(np.abs(ahead[:, 2:]) > _STEEP, [[1.0, 0, 0]], [[0.0, 0, 1]])
+    right = np.cross(ahead, up)
+    right /= np.sqrt((right * right).sum(axis=1))[:, None]
+    return np.stack([right, np.cross(ahead, right), ahead, rays.origins_or_centre], axis=2)
+
+
+def read(path: Path) -> FiredRays | None:
+    """Return the rays of arrays of this format; None for other arrays.
+
+    Raises
+    ------
+    ValueError
+        If the arrays have other shapes, or numbers are not finite.
+    LidarError
+        If the content is larger than the memory.
+    """
+    arrays = read_arrays(path)
+    if "rays" not in arrays:
+        return None
+    header = header_in(arrays)
+    matrices = np.asarray(arrays["rays"], np.float64)
+    count = len(matrices)
+    if matrices.shape != (count, 3, 4) or not count:
+        raise ValueError(f"rays has the shape {matrices.shape}; (n, 3, 4) is expected")
+    if not np.isfinite(matrices).all():
+        raise ValueError("rays has numbers that are not finite")
+    directions = matrices[:, :, 2]
+    lengths = np.sqrt((directions * directions).sum(axis=1))
+    if not (lengths > 0).all():
+        raise ValueError(f"the direction of ray {int(lengths.argmin()) + 1} is zero")
+    times_ns = None
+    if (times_ms := arrays.get("time_offsets")) is not None:
+        if times_ms.shape != (count,) or not np.isfinite(times_ms).all():
+            raise ValueError("time_offsets must have a finite number for each ray")
+        times_ns = np.rint(np.asarray(times_ms, np.float64) * 1e6).astype(np.int64)
+        if (np.diff(times_ns) < 0).any() or times_ns[0] < 0:
+            raise ValueError("time_offsets go back, or are below zero")
+    origins = matrices[:, :, 3]
+    ranges = np.asarray(arrays.get("ranges", [[0.0, np.inf]]), np.float64).reshape(-1, 2)
+    return FiredRays(
+        directions / lengths[:, None],
+        times_ns,
+        origins=origins.copy() if origins.any() else None,
+        rate_hz=float(header.get("rate_hz", 10.0)),
+        range_m=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
+        name=str(header.get("sensor", "")),
+    )
