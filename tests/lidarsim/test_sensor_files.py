@@ -5,9 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -338,6 +342,78 @@ print(mid360.NAME, mid360.RATE_HZ, mid360.FRAMES, mid360.MAX_RANGE_M)
         assert arrays["directions"].dtype == np.float32 and not arrays["origins"].any()
         assert angle_deg(arrays["directions"], file.rays.directions[frame]) < 1e-5
         assert np.array_equal(arrays["times_ns"], file.rays.times_ns[frame])
+
+
+class Tensor(np.ndarray):
+    """An array that has a device, as a tensor has."""
+
+    device = "cuda:0"
+
+
+def stand_ins(monkeypatch):
+    """Modules with the documented base classes of Isaac Lab, mjlab and Genesis, and of torch."""
+
+    class Options(SimpleNamespace):
+        """Keeps its arguments, as configurations do."""
+
+    class RaycastPattern:
+        """As in Genesis: its constructor asks for the shape, and has directions computed."""
+
+        def __init__(self):
+            self._ray_dirs = np.empty((*self._get_return_shape(), 3), np.float32).view(Tensor)
+            self.compute_ray_dirs()
+
+    def tensor(values, device):
+        assert device == "cuda:0"
+        return np.array(values).view(Tensor)
+
+    names = {
+        "torch": {"tensor": tensor},
+        "isaaclab.sensors": {"RayCasterCfg": Options},
+        "isaaclab.sensors.ray_caster.patterns": {"PatternBaseCfg": object},
+        "isaaclab.utils": {"configclass": dataclass},
+        "mjlab.sensor": {"ObjRef": Options, "RayCastSensorCfg": Options},
+        "genesis": {"sensors": SimpleNamespace(Lidar=Options)},
+        "genesis.options.sensors.raycaster": {"RaycastPattern": RaycastPattern},
+    }
+    for name, values in names.items():
+        parts = name.split(".")
+        for count in range(1, len(parts) + 1):
+            module = sys.modules.get(".".join(parts[:count]))
+            if module is None or not hasattr(module, "stands_in"):
+                module = ModuleType(".".join(parts[:count]))
+                module.stands_in = True
+                monkeypatch.setitem(sys.modules, module.__name__, module)
+        vars(module).update(values)
+
+
+def test_recipes_give_the_rays_to_other_simulators(tmp_path, monkeypatch):
+    """Code of the documentation beside stand-ins of the classes that it derives from."""
+    file = export_sensor(load_sensor("livox/mid360"), tmp_path / "mid360.py")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "mid360", raising=False)
+    stand_ins(monkeypatch)
+    page = Path(__file__).parents[2] / "docs/how-to/other-simulators.md"
+    blocks = re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    recipes = {
+        name: next(b for b in blocks if f"from {name}" in b)
+        for name in ("isaaclab", "mjlab", "genesis")
+    }
+    spaces = {name: {"__name__": name} for name in recipes}
+    for name, code in recipes.items():
+        exec(compile(code, name, "exec"), spaces[name])
+    lab = spaces["isaaclab"]["lidar"].pattern_cfg
+    directions = {
+        "isaaclab": type(lab).__dataclass_fields__["func"].default(lab, "cuda:0")[1],
+        "mjlab": spaces["mjlab"]["lidar"].pattern.generate_rays(None, "cuda:0")[1],
+    }
+    scene = SimpleNamespace(add_sensor=lambda options: options)
+    lidar = spaces["genesis"]["add_lidar"](scene, SimpleNamespace(idx=3))
+    directions["genesis"] = lidar.pattern._ray_dirs
+    assert lidar.max_range == 70 and spaces["isaaclab"]["lidar"].max_distance == 70
+    for name, vectors in directions.items():
+        assert angle_deg(np.asarray(vectors), file.rays.directions) < 1e-5, name
+    monkeypatch.delitem(sys.modules, "mid360")
 
 
 def test_a_python_file_has_the_starts_of_the_rays(tmp_path):
