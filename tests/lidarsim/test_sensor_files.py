@@ -17,7 +17,11 @@ import numpy as np
 import pytest
 import yaml
 
+from lidarpool.cli.import_plugins import import_whole
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
 from lidarscenes.gazebo.import_world import import_world
+from lidarscenes.sensors.import_sensor import import_sensor
 from lidarscenes.sensors.omnilidar import read_omnilidar
 from lidarsim import Beams, LidarError, MujocoScanner, Sensor, Spin, export_sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
@@ -505,3 +509,46 @@ def test_arrays_that_are_no_rays_are_refused(changes, message, tmp_path):
     (tmp_path / "cut.npz").write_bytes((tmp_path / "rays.npz").read_bytes()[:200])
     with pytest.raises(LidarError, match=r"cut\.npz is not a usable calibration: it is no \.npz"):
         load_sensor(calibration=tmp_path / "cut.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "file_format"),
+    [
+        ("rays.csv", "livox"),
+        ("rays.npz", "mujoco"),
+        ("rays.csv", None),
+        ("rays.usda", None),
+    ],
+)
+def test_import_makes_a_scenario_of_a_file(name, file_format, tmp_path):
+    if name.endswith(".usda"):
+        pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
+    file = export_sensor(load_sensor("livox/mid360"), tmp_path / name, format=file_format)
+    left_out = import_whole(import_sensor, tmp_path / name, tmp_path / "new", (), Scenario.load)
+    assert len(left_out) == (file_format is None), left_out
+    built = build(Scenario.load(tmp_path / "new/scenario.yaml"), plans=False)
+    [carried] = built.survey.carried
+    firings = np.arange(len(file.rays))
+    assert angle_deg(carried.sensor.directions(firings)[:, 0], file.rays.directions) < 1e-5
+    assert np.array_equal(carried.sensor.times_ns(firings)[:, 0], file.rays.times_ns)
+    if file_format != "livox":  # its lists have no ranges
+        assert carried.sensor.max_range_m == 70 and carried.sensor.min_range_m > 0
+
+
+def test_import_reads_tables_of_other_programs(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("Time [us],Azimuth [rad],Elevation [deg]\n5,0.5,10\n6,-0.5,-10\n8,0,90\n")
+    left_out = import_whole(import_sensor, path, tmp_path / "new", (), Scenario.load)
+    assert left_out == []
+    sensor = load_sensor(calibration=tmp_path / "new/rays.npz")
+    assert sensor.times_ns(np.arange(3))[:, 0].tolist() == [0, 1000, 3000]
+    x, y, z = sensor.directions(np.arange(3))[:, 0].T
+    assert np.allclose(np.arctan2(y, x)[:2], [0.5, -0.5])
+    assert np.allclose(np.degrees(np.arcsin(z)), [10, -10, 90])
+    path.write_text("azimuth_deg,elevation_deg\n0,0\n1,0\n")
+    [line] = import_whole(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
+    assert line == "times: it states none, so 2 rays take 0.1 s"
+    path.write_text("azimuth_deg,speed\n0,0\n")
+    with pytest.raises(LidarError, match=r"mine\.csv makes no scenario: it has no rays .*speed"):
+        import_whole(import_sensor, path, tmp_path / "no", (), Scenario.load)
+    assert not (tmp_path / "no").exists()

@@ -134,8 +134,9 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a survey of another program as a scenario.
 
     Surveys of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, models of
-    MuJoCo (.xml) with their rangefinders, and surveys for which a plug-in is installed. Unsupported
-    features are listed, one line each. Mesh files stay where they are.
+    MuJoCo (.xml) with their rangefinders, rays of a sensor (.csv, .npz, .parquet), OmniLidar prims
+    (.usd, .usda), and surveys for which a plug-in is installed. Unsupported features are listed,
+    one line each. Mesh files stay where they are.
 
     \b
     Examples:
@@ -143,11 +144,13 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
       lidarpool import worlds/house.sdf --assets models
       lidarpool import robot.xml
+      lidarpool import mid360.csv
     """  # noqa: D301 - click wants the character, not its name
     from lidarscenes.files.formats import WORLDS
     from lidarscenes.gazebo.import_world import import_world
     from lidarscenes.helios import import_survey
     from lidarscenes.mujoco.import_model import import_model
+    from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
     from ..scenario.build import build
     from ..scenario.point_scene import surfels
@@ -164,6 +167,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         left_out = import_whole(import_model, survey, folder, assets, check)
     elif (plugin := importer_of(survey)) is not None:
         left_out = import_by(plugin, survey, folder, assets, check=check)
+    elif survey.suffix.lower() in ENDINGS:
+        left_out = import_whole(import_sensor, survey, folder, assets, check)
     else:
         left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).left_out
     file = folder / SCENARIO_FILE

@@ -57,7 +57,8 @@ def read(path: Path) -> FiredRays | None:
 def rays_of_text(text: str) -> FiredRays:
     """Return the rays of a table with azimuths and elevations, or directions.
 
-    Names and units of columns may have other spellings, such as «Azimuth [rad]».
+    Names and units of columns may have other spellings, such as «Azimuth [rad]». Times of tables of
+    other programs are counted from the first ray.
 
     Raises
     ------
@@ -65,9 +66,11 @@ def rays_of_text(text: str) -> FiredRays:
         If a column is missing or not known, or a cell holds no finite number.
     """
     columns = read_table(text, QUANTITIES)
+    header = _header(text)
     if "time_s" in columns:
-        columns[TIME_COLUMN] = columns.pop("time_s") * 1e9
-    return rays_of(columns, _header(text))
+        times_s = columns.pop("time_s")
+        columns[TIME_COLUMN] = 1e9 * (times_s if header else times_s - times_s[:1])
+    return rays_of(columns, header)
 
 
 def _header(text: str) -> dict[str, Any]:

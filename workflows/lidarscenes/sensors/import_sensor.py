@@ -1,0 +1,86 @@
+"""Files with the rays of a sensor as scenarios: lists of rays, and OmniLidar prims."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+
+import yaml
+
+from lidarsim.base.errors import LidarError, message_of
+from lidarsim.sensor_files import ray_npz
+from lidarsim.sensor_files.fired_rays import FiredRays
+from lidarsim.sensor_files.format_table import read_rays
+
+from ..writers.lidar_scenario import SCENARIO_FILE, clean
+from .omnilidar import ReadSensor, read_omnilidar
+
+USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+ENDINGS = (".csv", ".npz", ".parquet", *USD_ENDINGS)
+_RAYS_FILE = "rays.npz"
+
+
+def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
+    """Write a sensor's file as a scenario into a folder: `scenario.yaml`, and its rays.
+
+    The scenario has the scene of `lidarpool demo`, with the sensor in place of its own.
+
+    Parameters
+    ----------
+    path
+        Livox's list of rays (.csv), a table of rays (.csv, .parquet), arrays of rays, of
+        MuJoCo-LiDAR or of RobotecGPULidar (.npz), or an OmniLidar prim (.usd, .usda, .usdc, .usdz).
+    folder
+        The folder, which exists.
+    assets
+        None: the files name no others.
+
+    Returns
+    -------
+    What is not as in the file, a line each.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read, or is not of a sensor.
+    """
+    if assets:
+        raise LidarError("it is of a sensor: leave --assets out.")
+    sensor = _read(path)
+    lines = list(sensor.left_out)
+    rays = sensor.rays
+    if rays.times_ns is None:
+        lines.append(f"times: it states none, so {len(rays):,} rays take {1 / rays.rate_hz:g} s")
+    ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
+    head = [f"From {path.name} by lidarpool import.", *(f"Not as there: {line}." for line in lines)]
+    text = "".join(f"# {line}\n" for line in head)
+    text += yaml.safe_dump({"sensor": _section(rays)}, sort_keys=False)
+    (folder / SCENARIO_FILE).write_text(text, encoding="utf-8", newline="\n")
+    return lines
+
+
+def _section(rays: FiredRays) -> dict[str, float | str]:
+    """Return the section `sensor` of a scenario, whose ranges are for users to change."""
+    min_range_m, max_range_m = rays.range_m
+    section: dict[str, float | str] = {"calibration": _RAYS_FILE}
+    if min_range_m:
+        section["min_range_m"] = clean(min_range_m)
+    if isfinite(max_range_m):
+        section["max_range_m"] = clean(max_range_m)
+    return section
+
+
+def _read(path: Path) -> ReadSensor:
+    """Return the sensor of a file; LidarError if the file cannot be used."""
+    if path.suffix.lower() in USD_ENDINGS:
+        return read_omnilidar(path)
+    try:
+        rays = read_rays(path)
+    except (OSError, ValueError) as error:
+        raise LidarError(f"it has no rays of a sensor: {message_of(error)}") from error
+    if rays is None:
+        raise LidarError("it has no rays of a sensor, with azimuths and elevations or directions.")
+    channels = int(rays.channels.max()) + 1
+    lost = [f"its {channels} channels: a list of rays has one"] if channels > 1 else []
+    return ReadSensor(rays, lost)
