@@ -501,8 +501,10 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     """Return the model whose beams are nearest to a unit's, else a model of the file alone."""
     deviations_deg = {}  # {model: greatest difference between its elevations and the unit's}
     for name in model_names():
+        if unit.beams is None or not name.startswith(f"{unit.maker}/"):
+            continue
         model_deg = read_model(name).beams.elevation_deg
-        if name.startswith(f"{unit.maker}/") and unit.beams and len(model_deg) == len(unit.beams):
+        if len(model_deg) == len(unit.beams):
             unit_deg = np.degrees(unit.beams.elevation)
             deviations_deg[name] = float(np.abs(np.sort(unit_deg) - np.sort(model_deg)).max())
     if deviations_deg and min(deviations_deg.values()) < 5:  # units of one model differ by far less

@@ -1,27 +1,22 @@
 """The table of files of sensors: the module of each format, its endings, and what it holds.
 
-It is quick to import: help of the command reads it. Packages add formats as plug-ins of the group
-`GROUP`, whose names are the names of the formats; each is a `SensorFormat`.
+It is quick to import: help of the command reads it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..base.errors import LidarError
 from ..base.extras import need
-from ..base.plugins import find_plugin, plugins_of
 from ..base.words import did_you_mean
 
 if TYPE_CHECKING:
     from .fired_rays import FiredRays
-
-GROUP = "lidarsim.sensor_files"
 
 # What a format may hold of a sensor besides directions. {name: words for what it does not hold}
 PROPERTIES = {
@@ -154,21 +149,7 @@ FORMATS: tuple[SensorFormat, ...] = (
 )
 
 
-@cache
-def formats() -> dict[str, SensorFormat]:
-    """Return the formats by name, with the formats of plug-ins.
-
-    Raises
-    ------
-    LidarError
-        If a plug-in cannot be used.
-    """
-    table = {row.name: row for row in FORMATS}
-    for name in plugins_of(GROUP):
-        plugin = find_plugin(GROUP, name)
-        if plugin is not None and name not in table:
-            table[name] = replace(plugin.load(SensorFormat), name=name)
-    return table
+_BY_NAME = {row.name: row for row in FORMATS}
 
 
 def format_of(path: Path, name: str | None) -> SensorFormat:
@@ -179,19 +160,19 @@ def format_of(path: Path, name: str | None) -> SensorFormat:
     LidarError
         If there is no such format, or the file has another ending than the format.
     """
-    table = formats()
     ending = path.suffix.lower()
-    if name is not None and name not in table:
-        names = ", ".join(table)
+    if name is not None and name not in _BY_NAME:
+        names = ", ".join(_BY_NAME)
         raise LidarError(
-            f"Sensors are not written as {name!r}.{did_you_mean(name, [*table])} Formats: {names}."
+            f"Sensors are not written as {name!r}.{did_you_mean(name, [*_BY_NAME])} "
+            f"Formats: {names}."
         )
     if name is None:
-        row = next((row for row in table.values() if row.by_ending and ending in row.endings), None)
+        row = next((row for row in FORMATS if row.by_ending and ending in row.endings), None)
         if row is None:
             raise LidarError(f"{path} has no ending of a file of a sensor. {_choices(ending)}")
         return row
-    row = table[name]
+    row = _BY_NAME[name]
     if ending not in row.endings:
         expected = " or ".join(row.endings)
         raise LidarError(f"{path} does not end in {expected}, as files of {name} do.")
@@ -200,11 +181,10 @@ def format_of(path: Path, name: str | None) -> SensorFormat:
 
 def _choices(ending: str) -> str:
     """Return a sentence on the formats of an ending, or on all endings."""
-    table = formats()
-    names = [row.name for row in table.values() if ending in row.endings]
+    names = [row.name for row in FORMATS if ending in row.endings]
     if names:
         return f"Say which format it is: {' or '.join(f'--as {name}' for name in names)}."
-    endings = dict.fromkeys(ending for row in table.values() for ending in row.endings)
+    endings = dict.fromkeys(ending for row in FORMATS for ending in row.endings)
     return f"Endings are {', '.join(endings)}; .png draws the beams."
 
 
@@ -220,7 +200,7 @@ def read_rays(path: Path) -> FiredRays | None:
     OSError
         If the file cannot be read.
     """
-    rows = [row for row in formats().values() if row.reads and path.suffix.lower() in row.endings]
+    rows = [row for row in FORMATS if row.reads and path.suffix.lower() in row.endings]
     for row in rows:
         rays: FiredRays | None = row.function("read")(path)
         if rays is not None:

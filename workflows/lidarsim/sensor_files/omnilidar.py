@@ -146,9 +146,10 @@ def _state(rays: FiredRays, number: int, frame: Ints) -> Iterator[str]:
 def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]:
     """Yield the lines of an attribute with an array; angles have the digits of float32."""
     yield f"    {kind} {STATE}{_state_name(number)}:{name} = ["
-    words = map(str, values.tolist())
     if kind == "float[]":
-        words = (f"{value:.9g}" for value in values.astype(np.float32).tolist())
+        words = [f"{value:.9g}" for value in values.astype(np.float32).tolist()]
+    else:
+        words = [str(value) for value in values.tolist()]
     line = ""
     for word in words:
         line += f"{word}, "
