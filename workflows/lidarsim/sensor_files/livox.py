@@ -18,6 +18,7 @@ from .writing import write_text_of
 
 HEADER = "Time/s,Azimuth/deg,Zenith/deg"
 _DECIMALS = 9
+_SECOND_NS = 1_000_000_000
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
@@ -27,8 +28,10 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # no -0.0
     zeniths = np.round(90 - rays.elevations_deg, _DECIMALS)
     rows = zip(times_ns.tolist(), azimuths.tolist(), zeniths.tolist(), strict=True)
-    lines = [f"{time // 10**9}.{time % 10**9:09d},{azimuth!r},{zenith!r}"
-             for time, azimuth, zenith in rows]  # fmt: skip
+    lines = [
+        f"{time_ns // _SECOND_NS}.{time_ns % _SECOND_NS:09d},{azimuth!r},{zenith!r}"
+        for time_ns, azimuth, zenith in rows
+    ]
     write_text_of(path, "\n".join([HEADER, *lines]) + "\n")
     return left_out
 

@@ -27,7 +27,7 @@ _TEXT = '''"""Rays of {name}, as lidarpool wrote them.
 Axes: {axes}. Directions are float32 unit vectors, origins metres, times nanoseconds
 since the start of the pattern. {lacks}
 
->>> origins, directions, times_ns = rays(frame=0)
+    origins, directions, times_ns = rays(frame=0)
 """
 
 import base64
