@@ -25,6 +25,7 @@ from lidarscenes.sensors.import_sensor import import_sensor
 from lidarscenes.sensors.omnilidar import read_omnilidar
 from lidarsim import Beams, LidarError, MujocoScanner, Sensor, Spin, export_sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
+from lidarsim.sensor_files.format_table import read_rays
 
 TABLES = ("npz", "csv", "parquet")
 
@@ -455,6 +456,26 @@ def test_rgl_rays_are_matrices_that_take_z_to_the_ray(tmp_path):
     firings = np.arange(count)
     assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
     assert np.abs(back.times_ns(firings)[:, 0] - file.rays.times_ns).max() <= 8, "float32 ms"
+    assert np.abs(back.origins(firings)[:, 0] - file.rays.origins).max() < 1e-7
+    assert np.array_equal(read_rays(tmp_path / "rays.npz").channels, file.rays.channels)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rays": np.zeros((2, 4, 4))}, r"rays has the shape \(2, 4, 4\)"),
+        ({"rays": np.zeros((2, 3, 4))}, "direction of ray 1 is zero"),
+        ({"time_offsets": np.array([1.0, 0.5])}, "times go back at ray 2"),
+        ({"ring_ids": np.zeros(3)}, "the same length"),
+        ({"intensity": np.zeros(2)}, "arrays that are not known: intensity"),
+        ({"ranges": np.zeros(2)}, "max_range_m of its header is 0.0"),
+        ({"header": np.array('{"rate_hz": 0}')}, "rate_hz of its header is 0"),
+    ],
+)
+def test_arrays_that_are_no_inputs_of_rgl_are_refused(changes, message, tmp_path):
+    np.savez(tmp_path / "rays.npz", **{"rays": np.tile(np.eye(3, 4), (2, 1, 1)), **changes})
+    with pytest.raises(LidarError, match=message):
+        load_sensor(calibration=tmp_path / "rays.npz")
 
 
 def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.words import printable
 from .fired_rays import FiredRays
-from .ray_header import TIME_COLUMN, columns_of, header_of, rays_of
+from .ray_header import TIME_COLUMN, check_names, columns_of, header_of, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 from .writing import write_bytes_of
 
@@ -49,9 +48,7 @@ def read(path: Path) -> FiredRays | None:
     arrays = read_arrays(path)
     if not {"theta", "phi"} & arrays.keys():
         return None
-    if unknown := [name for name in arrays if name not in _NAMES]:
-        names = ", ".join(map(printable, unknown[:5]))
-        raise ValueError(f"it has arrays that are not known: {names}. Known: {', '.join(_NAMES)}")
+    check_names("arrays", arrays, _NAMES)
     if missing := [name for name in ("theta", "phi") if name not in arrays]:
         raise ValueError(f"it has no array {missing[0]}")
     header = header_in(arrays)

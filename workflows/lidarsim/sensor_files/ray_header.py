@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf, isfinite
 from typing import Any
 
 import numpy as np
 
 from ..base.arrays import Floats, Ints
+from ..base.words import printable
 from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, FiredRays, directions_of
 
 KIND = "rays of a sensor"
@@ -113,6 +114,13 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     )
     check_times(rays)
     return rays
+
+
+def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Raise ValueError if a file has arrays or columns that are not known; `kind` says which."""
+    if unknown := [name for name in names if name not in known]:
+        shown = ", ".join(map(printable, unknown[:5]))
+        raise ValueError(f"it has {kind} that are not known: {shown}. Known: {', '.join(known)}")
 
 
 def check_times(rays: FiredRays) -> None:

@@ -12,9 +12,8 @@ import numpy as np
 
 from ..base.allowance import Allowance
 from ..base.input_files import check_input
-from ..base.words import printable
 from .fired_rays import FiredRays
-from .ray_header import COLUMNS, columns_of, header_of, rays_of
+from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
 from .writing import write_bytes_of
 
 HEADER = "header"
@@ -42,9 +41,7 @@ def read(path: Path) -> FiredRays | None:
     if HEADER not in arrays and "direction_x" not in arrays and "azimuth_deg" not in arrays:
         return None
     header = header_in(arrays)
-    if unknown := [name for name in arrays if name not in COLUMNS]:
-        names = ", ".join(map(printable, unknown[:5]))
-        raise ValueError(f"it has arrays that are not known: {names}. Known: {', '.join(COLUMNS)}")
+    check_names("arrays", arrays, COLUMNS)
     return rays_of(arrays, header)
 
 

@@ -11,9 +11,8 @@ import pyarrow.parquet as pq
 
 from ..base.errors import message_of
 from ..base.input_files import open_input
-from ..base.words import printable
 from .fired_rays import FiredRays
-from .ray_header import COLUMNS, columns_of, header_of, rays_of
+from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
 from .writing import write_bytes_of
 
 _HEADER = b"lidarpool"
@@ -43,7 +42,5 @@ def read(path: Path) -> FiredRays | None:
     except pa.ArrowException as error:
         raise ValueError(f"it is not a table of Parquet: {message_of(error)}") from error
     header = json.loads((table.schema.metadata or {}).get(_HEADER, b"{}"))
-    if unknown := [name for name in table.column_names if name not in COLUMNS]:
-        names = ", ".join(map(printable, unknown[:5]))
-        raise ValueError(f"it has columns that are not known: {names}. Known: {', '.join(COLUMNS)}")
+    check_names("columns", table.column_names, COLUMNS)
     return rays_of({name: table[name].to_numpy() for name in table.column_names}, header)

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from itertools import chain
+from math import inf
 from pathlib import Path
 
 import numpy as np
 
 from ..base.arrays import Floats
 from .fired_rays import AXES, FiredRays
+from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 from .writing import write_bytes_of
 
+_NAMES = ("rays", "ring_ids", "time_offsets", "ranges")
 _STEEP = 0.9  # z component above which a ray is taken as vertical
 
 
@@ -74,30 +78,21 @@ def read(path: Path) -> FiredRays | None:
     if "rays" not in arrays:
         return None
     header = header_in(arrays)
-    matrices = np.asarray(arrays["rays"], np.float64)
-    count = len(matrices)
-    if matrices.shape != (count, 3, 4) or not count:
+    check_names("arrays", arrays, _NAMES)
+    matrices = arrays["rays"]
+    if matrices.shape[1:] != (3, 4):
         raise ValueError(f"rays has the shape {matrices.shape}; (n, 3, 4) is expected")
-    if not np.isfinite(matrices).all():
-        raise ValueError("rays has numbers that are not finite")
-    directions = matrices[:, :, 2]
-    lengths = np.sqrt((directions * directions).sum(axis=1))
-    if not (lengths > 0).all():
-        raise ValueError(f"the direction of ray {int(lengths.argmin()) + 1} is zero")
-    times_ns = None
-    if (times_ms := arrays.get("time_offsets")) is not None:
-        if times_ms.shape != (count,) or not np.isfinite(times_ms).all():
-            raise ValueError("time_offsets must have a finite number for each ray")
-        times_ns = np.rint(np.asarray(times_ms, np.float64) * 1e6).astype(np.int64)
-        if (np.diff(times_ns) < 0).any() or times_ns[0] < 0:
-            raise ValueError("time_offsets go back, or are below zero")
-    origins = matrices[:, :, 3]
-    ranges = np.asarray(arrays.get("ranges", [[0.0, np.inf]]), np.float64).reshape(-1, 2)
-    return FiredRays(
-        directions / lengths[:, None],
-        times_ns,
-        origins=origins.copy() if origins.any() else None,
-        rate_hz=float(header.get("rate_hz", 10.0)),
-        range_m=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
-        name=str(header.get("sensor", "")),
-    )
+    vectors = np.asarray(matrices[:, :, 2:], np.float64).reshape(-1, 6)
+    names = chain.from_iterable(zip(DIRECTION, ORIGIN, strict=True))
+    columns = dict(zip(names, vectors.T, strict=True))
+    if "time_offsets" in arrays:
+        columns[TIME_COLUMN] = np.asarray(arrays["time_offsets"], np.float64) * 1e6
+    if "ring_ids" in arrays:
+        columns["channel"] = arrays["ring_ids"]
+    if "ranges" in arrays:
+        ranges = np.asarray(arrays["ranges"], np.float64)
+        if ranges.shape[-1:] != (2,) or not ranges.size:
+            raise ValueError(f"ranges has the shape {ranges.shape}; (n, 2) is expected")
+        header["min_range_m"], longest_m = float(ranges[..., 0].min()), float(ranges[..., 1].max())
+        header["max_range_m"] = None if longest_m == inf else longest_m
+    return rays_of(columns, header)
