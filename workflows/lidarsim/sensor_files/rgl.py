@@ -93,6 +93,7 @@ def read(path: Path) -> FiredRays | None:
         ranges = np.asarray(arrays["ranges"], np.float64)
         if ranges.shape[-1:] != (2,) or not ranges.size:
             raise ValueError(f"ranges has the shape {ranges.shape}; (n, 2) is expected")
-        header["min_range_m"], longest_m = float(ranges[..., 0].min()), float(ranges[..., 1].max())
+        longest_m = float(ranges[..., 1].max())
+        header["min_range_m"] = float(ranges[..., 0].min())
         header["max_range_m"] = None if longest_m == inf else longest_m
     return rays_of(columns, header)
