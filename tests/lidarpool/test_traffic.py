@@ -339,7 +339,8 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         (FCD.replace('x="40"', ""), "'x' is missing"),
         (
             FCD.replace('x="40"', 'x="40" heading="3"'),
-            "vehicle has the attribute 'heading', which --fcd-output does not define: give ignore",
+            "vehicle has the attribute 'heading', which --fcd-output does not define: leave it "
+            r"out with \{file: …, ignore: \[heading\]\}",
         ),
         (FCD.replace('x="40"', 'x="east"'), "vehicle 'a.1' has the x 'east'; give a number"),
         (FCD.replace('time="3.00"', 'time="3:00"'), "a timestep has the time '3:00'; give a num"),

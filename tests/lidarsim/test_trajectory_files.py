@@ -1,9 +1,11 @@
 """Files of trajectories: what is read, with the right values, and what is refused."""
 
 import gzip
+import re
 
 import numpy as np
 import pytest
+import yaml
 
 from lidarpool import LidarError, Pose, Track, load_trajectory
 from lidarpool.scenario.build import build
@@ -95,7 +97,7 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
             "0,40,1,48,2",
             r"'stamp' and 'yaw' have no unit: .* Its column 'latitude' is a geodetic .* Its column "
             r"'roll \[mrad\]' has the unit 'mrad': .* Its column is not known: speed\. Rename it, "
-            r"or give ignore: \[speed\] to leave it out\. Known are ",
+            r"or leave it out with \{file: …, ignore: \[speed\]\}\. Known are ",
         ),
         ("yaw_dge,ptch_deg", "40,2", "mean 'yaw_deg' for yaw_dge, 'pitch_deg' for ptch_deg"),
         ("yaw", "40", r"give columns: \{yaw_deg: yaw\}; yaw_rad is read as well"),
@@ -112,8 +114,8 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
         ("qx,qy,qz,qw,q_w", "0,0,0,1,1", "'qw' and 'q_w' are both qw"),
         ("qz,qw", "0,1", "no columns 'qx' and 'qy'; it has "),
         ("yaw_dge", "40", r"not known: yaw_dge\. Did you mean 'yaw_deg'\?"),
-        ("speed", "40", r"not known: speed\. .*give ignore: \[speed\] to leave it out"),
-        ("speed,course", "40,1", r"speed, course\. .*ignore: \[speed, course\] to leave them out"),
+        ("speed", "40", r"not known: speed\. .*leave it out with \{file: …, ignore: \[speed\]\}"),
+        ("speed,course", "40,1", r"speed, course\. .*leave them out with .*\[speed, course\]"),
         ("q0,q1,q2,q3", "1,0,0,0", "not known: q0, q1, q2, q3"),
         ("latitude", "48", "'latitude' is a geodetic coordinate"),
         ("pos_x", "4", "'x' and 'pos_x' are both x"),
@@ -126,6 +128,16 @@ def test_a_column_that_is_not_understood_is_refused(load, names, values, words):
     with pytest.raises(LidarError, match=words) as raised:
         load(names, values if names else "", rows=rows)
     assert len(str(raised.value).splitlines()) == 1
+
+
+def test_the_mapping_that_a_message_gives_leaves_the_columns_out(load):
+    columns = "vel_x [m/s],num sats,on,07,fix: rtk"
+    with pytest.raises(LidarError) as raised:
+        load(columns, "1,2,3,4,5")
+    advice = re.search(r"\{file: .*?\}", str(raised.value))[0]
+    ignored = yaml.safe_load(advice)["ignore"]
+    assert ignored == columns.split(",")
+    assert len(load(columns, "1,2,3,4,5", ignore=ignored).times_s) == len(ROWS)
 
 
 def test_columns_that_are_named_or_ignored(load):

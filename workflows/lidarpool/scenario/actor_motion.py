@@ -9,7 +9,6 @@ import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from functools import partial
 from io import BufferedIOBase
 from pathlib import Path
@@ -35,7 +34,7 @@ from lidarsim.base.declared import (
 from lidarsim.base.errors import LidarError, message_of, prefixed
 from lidarsim.base.input_files import input_size, open_input
 from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
-from lidarsim.base.words import name_hint, plural, printable
+from lidarsim.base.words import fits, in_yaml, name_hint, plural, printable
 from lidarsim.base.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -451,7 +450,7 @@ class TrafficSection(Section):
     def entry_of(self, vehicle_type: str) -> VehicleSection | None:
         """Return the first entry that fits a type of vehicles, or None."""
         for entry in self.vehicles:
-            if any(fnmatchcase(vehicle_type, pattern) for pattern in entry.types):
+            if any(fits(vehicle_type, pattern) for pattern in entry.types):
                 return entry
         return None
 
@@ -729,10 +728,10 @@ def read_fcd(
 def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
     """Raise ValueError for a name of an attribute that fits no pattern to ignore."""
     for name in sorted(names):
-        if not any(fnmatchcase(name, pattern) for pattern in ignore):
+        if not any(fits(name, pattern) for pattern in ignore):
             raise ValueError(
                 f"its {tag} has the attribute {printable(name)!r}, which --fcd-output does not "
-                f"define: give ignore: [{printable(name)}] to leave it out"
+                f"define: leave it out with {{file: …, ignore: {in_yaml([name])}}}"
             )
 
 

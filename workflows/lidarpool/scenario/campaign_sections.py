@@ -49,7 +49,7 @@ from lidarsim.base.sections import sections_in
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields, sentences
-from lidarsim.base.words import did_you_mean_each, printable
+from lidarsim.base.words import did_you_mean_each, in_yaml, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..datasets.job_table import Value
@@ -588,10 +588,11 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
     if unknown:
         verb = "columns are" if unknown[1:] else "column is"
         pronoun = "them" if unknown[1:] else "it"
-        names = ", ".join(map(printable, unknown))
+        shown = ", ".join(map(printable, unknown))
         raise ValueError(
-            f"its {verb} not known: {names}.{did_you_mean_each(unknown, fields)} Rename {pronoun}, "
-            f"or give ignore: [{names}] to leave {pronoun} out. Known are {', '.join(fields)}"
+            f"its {verb} not known: {shown}.{did_you_mean_each(unknown, fields)} Rename {pronoun}, "
+            f"or leave {pronoun} out with ignore: {in_yaml(unknown)} beside from. Known are "
+            f"{', '.join(fields)}"
         )
 
 

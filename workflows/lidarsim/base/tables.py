@@ -11,7 +11,6 @@ import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import reduce
 from itertools import islice
 from typing import NamedTuple, cast
@@ -20,7 +19,7 @@ import numpy as np
 
 from .arrays import Floats
 from .time_units import SECONDS, TimeUnit, seconds_of
-from .words import did_you_mean_each, printable
+from .words import did_you_mean_each, fits, in_yaml, printable
 
 # {unit: number of these units in the first unit}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
@@ -146,9 +145,7 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
     indices = set[int]()
     unmatched: list[str] = []
     for pattern in ignore:
-        matches = {
-            index for index, name in enumerate(names) if fnmatchcase(name.lower(), pattern.lower())
-        }
+        matches = {index for index, name in enumerate(names) if fits(name.lower(), pattern.lower())}
         unmatched += [] if matches else [repr(pattern)]
         indices |= matches
     if unmatched:
@@ -418,7 +415,7 @@ class _ColumnReader:
                     faults.append(str(error))
             elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
                 faults.append(f"its column {printable(cell)!r} {reason}")
-            elif not any(fnmatchcase(words[index], pattern) for pattern in patterns):
+            elif not any(fits(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
         if without_unit:
             faults.insert(0, self._lacking_units(without_unit))
@@ -432,8 +429,8 @@ class _ColumnReader:
         pronoun = "them" if len(cells) > 1 else "it"
         hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
         return (
-            f"its {columns} not known: {_listed(cells)}.{hint} Rename {pronoun}, or give ignore: "
-            f"[{_listed(cells)}] to leave {pronoun} out. Known are {self.possible}"
+            f"its {columns} not known: {_listed(cells)}.{hint} Rename {pronoun}, or leave "
+            f"{pronoun} out with {_ignoring(cells)}. Known are {self.possible}"
         )
 
     def _lacking_units(self, columns: Sequence[tuple[Quantity, str]]) -> str:
@@ -491,7 +488,7 @@ class _ColumnReader:
                 raise ValueError(f"it has the column {printable(cell)!r} twice")
             raise ValueError(
                 f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} are both "
-                f"{quantity.name}: give ignore: [{printable(cell)}] to leave one out"
+                f"{quantity.name}: leave one out with {_ignoring([cell])}"
             )
         self.assigned[quantity.name] = index, unit
 
@@ -546,6 +543,11 @@ def _all_of(names: Sequence[str]) -> str:
 def _listed(cells: Sequence[str]) -> str:
     """Return the first names of columns in a row, with an ellipsis for the rest."""
     return ", ".join(printable(cell) for cell in cells[:_SHOWN]) + ", …" * (len(cells) > _SHOWN)
+
+
+def _ignoring(cells: Sequence[str]) -> str:
+    """Return the mapping of a scenario that leaves columns out."""
+    return f"{{file: …, ignore: {in_yaml(cells)}}}"
 
 
 def _numbers(

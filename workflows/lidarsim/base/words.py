@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import json
 import os
 import re
 from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
@@ -117,6 +119,40 @@ def printable(text: str, max_letters: int = 200) -> str:
     """Return text from a file in a line of limited length, without control characters."""
     cleaned = "".join(letter if letter.isprintable() else " " for letter in text)
     return " ".join(cleaned.split())[:max_letters]
+
+
+def fits(name: str, pattern: str) -> bool:
+    """Return whether a name is a pattern, or fits its * and ?; brackets are letters as others.
+
+    Examples
+    --------
+    >>> fits("vel_x [m/s]", "vel_x [m/s]"), fits("vel_x [m/s]", "vel_*")
+    (True, True)
+    """
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
+
+
+_PLAIN_IN_YAML = re.compile(r"[A-Za-z_][\w./-]*(?: [\w./-]+)*")
+_WORDS_OF_YAML = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
+
+
+def in_yaml(names: Iterable[str]) -> str:
+    """Return names from a file as a list in YAML, each in quotes if YAML needs them.
+
+    Examples
+    --------
+    >>> print(in_yaml(["fix", "vel_x [m/s]", "on"]))
+    [fix, "vel_x [m/s]", "on"]
+    """
+    return f"[{', '.join(map(_scalar_in_yaml, names))}]"
+
+
+def _scalar_in_yaml(name: str) -> str:
+    """Return one text in YAML."""
+    text = printable(name)
+    if _PLAIN_IN_YAML.fullmatch(text) and text.lower() not in _WORDS_OF_YAML:
+        return text
+    return json.dumps(text, ensure_ascii=False)
 
 
 def distinct(names: Iterable[str]) -> list[str]:

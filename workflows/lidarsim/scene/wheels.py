@@ -72,7 +72,7 @@ def rolling(
 def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
     """Check that each pattern of `wheels` matches a name of an object; LidarError if not."""
     for wheel in wheels:
-        if not any(fnmatchcase(name, wheel) for name in names):
+        if not any(name == wheel or fnmatchcase(name, wheel) for name in names):
             raise LidarError(
                 f"wheels names {wheel!r}, but no object has that name.{name_hint(wheel, names)}"
             )
@@ -85,7 +85,7 @@ def _radii(
     radii: dict[int, float] = {}
     notes: list[str] = []
     for index, mesh in enumerate(meshes):
-        if any(fnmatchcase(mesh.name, wheel) for wheel in wheels):
+        if any(mesh.name == wheel or fnmatchcase(mesh.name, wheel) for wheel in wheels):
             length, _, height = np.ptp(mesh.bounds, axis=0).tolist()
             if abs(length - height) > _ROUNDNESS * height or not height:
                 notes.append(
