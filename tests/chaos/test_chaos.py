@@ -30,7 +30,7 @@ DEATHS = [
 ]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_whoever_dies_each_scan_arrives_once(arena, what, known):
     faults = [Fault(n, kind, point, scan) for n, (kind, point, scan) in enumerate(DEATHS)]
     outcome = disturbed(arena, what, known, faults, **PATIENT)

@@ -87,7 +87,7 @@ def test_odometry_deskews_a_bag_as_one_of_a_driver():
     assert distances[False].median > 0.2
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_odometry_without_kiss_icp_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr(odometry, "find_spec", lambda name: None)
     assert odometry.main(["--quick"]) == 1

@@ -126,7 +126,7 @@ def test_page_shows_what_failed_and_why(card):
     assert "campaign.yaml --retry-failed" in page
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_same_jobs_make_the_same_files(card, tmp_path):
     folder, report = card
     other = [*ROWS[:-1], row(29, sha256="f" * 64)]

@@ -615,7 +615,7 @@ class Mishaps:
         self.chance.choice([*work, *work, *work, *rare])()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(chance=st.randoms(use_true_random=False))
 def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance):

@@ -78,7 +78,7 @@ def test_the_file_is_a_sensor_with_these_figures(fitted, tmp_path):
         fitted.save(tmp_path / "mine.json")
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_page_has_all_figures_and_says_what_is_unknown(fitted, tmp_path):
     page = fitted.save(tmp_path / "mine.yaml")[1].read_text()
     assert page.count("data-figure=") == len(fitted.figures["figures"])
@@ -178,7 +178,7 @@ def block():
     return city(30_000, seed=1)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_sensor_that_moves_is_refused_with_its_speed(block):
     """26 m/s, 0.06 m a sweep, and a turn on the spot; most ranges of a street stay the same."""
     cases = (street(), 0.0, 1.3, 0.0), (block, 1.8, 1.3, 0.0), (block, 1.8, 0.06, 0.0)
@@ -232,7 +232,7 @@ def survey_along(speed_m_s, noise, sweeps=6):
     )  # fmt: skip
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_poses_of_a_result_are_used(cluster_client):
     """The result of a drive at 26 m/s is fitted in its scene, and refused without a scene."""
     scene = parked_street()
@@ -246,7 +246,7 @@ def test_poses_of_a_result_are_used(cluster_client):
     assert "pulses on smooth surfaces of the scene" in repr(fitted)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("dropout", [0.0, 0.02])
 def test_poses_of_sweeps_are_used(cluster_client, dropout):
     """Points without the motion of the sensor: steps of azimuth differ, and no pulse is lost."""
@@ -261,7 +261,7 @@ def test_poses_of_sweeps_are_used(cluster_client, dropout):
         assert figures["range_m"]["value"] == pytest.approx(0.01, rel=0.1)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_poses_that_are_given_are_one_or_one_for_each_sweep_of_a_scene():
     scene = parked_street()
     made = drive(scene, 0.0, 1.3)
@@ -289,7 +289,7 @@ def test_a_slow_sensor_is_refused_with_its_speed(block):
     assert speed == pytest.approx(0.3, rel=0.15)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
     stands = drive(block, 1.8, 0.0)
 

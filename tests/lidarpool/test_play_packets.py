@@ -162,7 +162,7 @@ def test_velodyne_decoder_reads_live_packets_as_the_points_of_the_sweeps(receive
         assert np.allclose(read, cloud[: len(read)] - [0, 0, 1], atol=0.01)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_loop_goes_on_in_time_until_ctrl_c_and_leaves_no_process(receiver, tmp_path):
     (tmp_path / "s.yaml").write_text(VLP16)
     with playing(tmp_path / "s.yaml", "--loop", "--to", f"127.0.0.1:{port_of(receiver)}") as run:

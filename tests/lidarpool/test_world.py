@@ -138,7 +138,7 @@ def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
     assert "500,000" not in " ".join(advice(built))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_stations_and_check_name_the_system(tmp_path):
     scenario = tmp_path / "room.yaml"
     ground = {"height_m": 0, "margin_m": 3}

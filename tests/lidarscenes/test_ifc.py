@@ -533,7 +533,7 @@ def test_unknown_entities_are_noted(house, forked, tmp_path):
     assert any("without which ifcopenshell reads it" in n and "IFCSLEB" in n for n in notes)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
     random = np.random.default_rng(7)
     data = np.frombuffer(house.read_bytes(), np.uint8)

@@ -220,7 +220,7 @@ def test_what_moves_in_instances_moves_in_each(tmp_path):
     assert low == [[5, 0, 0], [5, 10, 0]] and len(scene.names) == 1
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     grows = sampled("scale", t2="(1, 1, 1)", t6="(2, 1, 1)") + order("scale")
     camera = prim("Rig", "Xform", DRIVE + prim("Camera", "Camera", ""))
@@ -626,7 +626,7 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_few_lines_do_not_make_millions_of_objects(tmp_path):
     count = nodes.MAX_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")

@@ -255,7 +255,7 @@ def test_where_the_node_of_a_skin_is_does_not_matter(tmp_path):
     assert np.array_equal(*poses)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_chain_of_many_joints(tmp_path):
     """Each turns by a part of 90°: the last one goes around a circle's quarter."""
     made = skinned()

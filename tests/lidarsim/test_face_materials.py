@@ -485,7 +485,7 @@ def test_only_the_faces_of_sheeting_bloom():
     assert np.linalg.norm(np.asarray(cloud)[blooming] - (4, -5, 1), axis=1).min() > 4.9
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_device_leaves_what_faces_are_made_of_to_numpy(source_backend, monkeypatch):  # noqa: F811
     monkeypatch.setattr(registry, "BACKENDS", (*registry.BACKENDS, source_backend))
     scene = Scene.from_meshes([front(), level("Ground")])

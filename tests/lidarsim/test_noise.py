@@ -133,7 +133,7 @@ def watch_loops(monkeypatch, draws):
             monkeypatch.setattr(loops, name, plain[name])
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
     draws = Draws()

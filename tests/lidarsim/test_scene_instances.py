@@ -106,7 +106,7 @@ def scanned(scene, physics):
     return {tuple(key): row for row, key in enumerate(keys)}, cloud, hits
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(
     placed=st.lists(st.tuples(st.integers(0, 2), transforms), max_size=6),

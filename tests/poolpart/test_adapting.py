@@ -107,7 +107,7 @@ def is_kept(partition, queue, begin):
     return kept
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
     events = itertools.count()
     with cluster_of({"GPU": adaptive(0, 1)}) as client:

@@ -126,7 +126,7 @@ def driver(tmp_path_factory):
     process.communicate()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_scheduler_nannies_workers_and_dashboard_listen_on_loopback_only(driver):
     process, pids = driver
     # Scheduler, nannies and dashboard are in the driver.
@@ -148,7 +148,7 @@ def test_no_worker_outlives_a_driver_that_is_killed(driver, wait_until):
     wait_until(lambda: gone(pids))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tmp_path):
     body = "print(client.submit(defined_here, 20).result(), file=sys.stderr)"
     driver = script(tmp_path, body, call="def defined_here(x): return 2 * x + 2\n\nmain()")

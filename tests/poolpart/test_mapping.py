@@ -384,7 +384,7 @@ def length_and_place(data, other=0):
     return len(data) + other, get_worker().name.partition("-")[0]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, received):
     io = Partition("IO", processes)
     gpu = Partition("GPU", processes)

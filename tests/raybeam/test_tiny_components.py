@@ -208,7 +208,7 @@ def check_instruction_set():
         check("embree", [instance(mesh, name)], ORIGIN, packets(60))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("AVX2",))
 @pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
 def test_packets_of_every_width(isa):

@@ -171,7 +171,7 @@ def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, s
     assert (out / "cloud.ply").read_bytes() == whole["jobs/0005/cloud.ply"]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_any_number_of_workers_gives_the_same_bytes(files, whole):
     many = ({"GPU": 1}, {"GPU": 2, "A": 1}, {"LIDAR": 6}, {"LIDAR": 2, "A": 1})
     with thread_cluster(*many) as cluster, Client(cluster, set_as_default=False) as client:
@@ -205,7 +205,7 @@ pool: {backend: numpy, gpu: 1}
 
 
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("folder",))
 @pytest.mark.parametrize("kept", DATA_SETS)
 def test_a_campaign_has_the_same_bytes_twice(slots, tmp_path, monkeypatch, kept):
@@ -648,7 +648,7 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     assert bytes_of(here / "ds") == three
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=(".jobs/*.json",))
 @pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
 def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, monkeypatch, harm):
@@ -716,7 +716,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.slow(keep=("kitti",))
 @pytest.mark.usefixtures("pictures")
 @pytest.mark.parametrize("kept", DATA_SETS)
@@ -906,7 +906,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
     assert run.done == 6 and bytes_of(files / "ds") == whole
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client):
     monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
     run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)

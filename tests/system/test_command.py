@@ -98,7 +98,7 @@ def test_the_demo_makes_all_files_and_says_so(demo):
     assert ended.stdout.splitlines()[-1] == f"results in {out}: {', '.join(MADE)}"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
     ended = demo.ended
     lines = ended.stderr.splitlines()
@@ -155,7 +155,7 @@ def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
     return run
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("path.png", "mine.txt"):
@@ -252,7 +252,7 @@ def hidden(page: Path) -> list[str]:
     return re.findall(r'data-picture="(\w+)" hidden', page.read_text("utf-8"))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_path):
     out = tmp_path / "out"
     assert run("--no-plan", "--quiet").code == 0

@@ -237,8 +237,8 @@ class Environment:
         return self.run("python", "-I", "example.py", cwd=folder)
 
 
-@pytest.mark.extended
-@pytest.mark.slow(keep=("poolpart",))
+@pytest.mark.slow
+@pytest.mark.extended(keep=("poolpart",))
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
     alone = Environment(tmp_path / "venv", built, name)

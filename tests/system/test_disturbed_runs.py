@@ -53,7 +53,7 @@ def test_frames_come_in_order_and_every_scan_once(
     assert left_over(client) == ([], [], [])
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "lidarpool.run.pipeline.policies.MAX_BATCHES_PER_TASK", 1

@@ -145,7 +145,7 @@ def campaign(tmp_path) -> Path:
     return tmp_path / "c.yaml"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tmp_path):
     given = ("--out", tmp_path / "set", "--scheduler", slots, "--quiet", "--strict", "--json")
     outcome = lidarpool("run", campaign, *given)
@@ -175,7 +175,7 @@ def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, sl
     assert json.loads((tmp_path / "set" / "report.json").read_text())["notes"] == [warning]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_python_logs_a_warning(client, caplog, tmp_path):
     far = Survey(SMALL, poses=[(0, 0, 1000)], steps=2)
     result = simulate(room(), far, client=client)

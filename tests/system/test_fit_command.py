@@ -29,7 +29,7 @@ def sweeps(tmp_path_factory):
     return folder
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
     sweeps, tmp_path, lidarpool, cluster
 ):

@@ -84,7 +84,7 @@ def check(folder: Path, numbers: range, jobs: list[tuple[Scene, Survey]], client
         assert made.read_bytes() == (folder / "alone.ply").read_bytes(), number
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     client, tmp_path, left_over, monkeypatch
 ):

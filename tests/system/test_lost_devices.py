@@ -68,7 +68,7 @@ def test_without_a_nanny_the_run_ends_and_says_what_to_do(cluster_client, break_
         simulate(Scene.seed(), SURVEY, client=cluster_client)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_worker_whose_device_fails_is_replaced(client, break_device, same_cloud, cluster_client):
     undisturbed = simulate(Scene.seed(), SURVEY, client=cluster_client).cloud
     faults = break_device(client, 1)

@@ -7,7 +7,7 @@ import pytest
 from docs.pictures import partitions_page
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_the_page_is_drawn_while_partitions_work(tmp_path, monkeypatch):
     def read(url: str, picture: Path) -> None:
         with urlopen(url, timeout=60) as page:

@@ -87,7 +87,7 @@ def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
     assert lidarpool("highest", "result") == f"{cloud.bounds[1, 2]:.2f} m\n"
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_worker_without_the_plugin_is_named(tmp_path, monkeypatch, installed, client, lidarpool):
     monkeypatch.syspath_prepend(installed)
     assert "lidar-example" in str(plugins_of("lidarpool.clouds")["npy"])

@@ -28,7 +28,7 @@ OPTIONS = {
 CAR = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 1], [[-5, 3, 0], [5, 3, 0]]))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud):
     scene = Scene.seed().with_actors([CAR])
     sensor = load_sensor("velodyne/vlp16")

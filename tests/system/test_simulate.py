@@ -116,7 +116,7 @@ def queue_sizes(plain, names):
     return {name: Queue(name, plain).qsize() for name in names}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_another_client_watches_the_queues_and_variables_of_the_default_survey(client, plain):
     """Stage 1 is ahead of the driver at the start; stages 3 and 4 are while it handles a frame."""
     job = build(Scenario())

@@ -135,7 +135,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
             run()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_path):
     jobs = import_jobqueue().slurm.SLURMJob
     submitted = []

@@ -111,7 +111,7 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(client):
         np.testing.assert_allclose(cosine, expected, atol=2e-3)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
     armed = sabotage("intersect.cast", SCANS)
     pids = set(client.run(os.getpid).values())
