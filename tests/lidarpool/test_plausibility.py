@@ -87,7 +87,11 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
         (TOWN, (0, 0, -0.3), "the sensor is under the scene"),
         (SLAB, (0, 0, -5), "the sensor is under the scene"),
         (SLAB, (0, 0, -0.5), "the sensor is inside a closed body"),
-        (TOWN, (20, 0, 2), "the sensor is inside a closed body at (20.000, 0.000, 2.000), and"),
+        (
+            TOWN,
+            (20, 0, 2),
+            "the sensor is inside a closed body at (20.000, 0.000, 2.000), in 'House', and",
+        ),
         (TOWN, (-20, 0, 2), "the sensor is inside a closed body"),
         (TOWN, (0, 20, 1), "the sensor is inside a closed body"),
         (TOWN, (0, -30, 1), "the sensor is inside a closed body"),
@@ -98,6 +102,17 @@ def test_a_sensor_under_the_scene_or_in_a_body(tmp_path, meshes, position, warni
     warnings = warnings_of(tmp_path, meshes, poses=[[*position]])
     assert len(warnings) == 1 and warnings[0].startswith(warning)
     assert "from outside it is seen by poses: [{position: [" in warnings[0]
+
+
+def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
+    into = drive((0, -40, 0, 2), (4, 20, 0, 2)) | {"steps": 1440}
+    [warning] = warnings_of(tmp_path, TOWN, **into)
+    assert re.match(
+        r"the sensor is inside a closed body at \d+ of 24 positions that were tried, first at "
+        r"\(-\d\d\.\d{3}, 0\.000, 2\.000\), 1\.\d+ s after the start, in 'Shell', and hits",
+        warning,
+    )
+    assert "poses" not in warning
 
 
 def test_one_bad_position_of_several_is_counted(tmp_path):

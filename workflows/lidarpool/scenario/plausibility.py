@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
-from lidarsim.base.words import as_scenario
+from lidarsim.base.words import as_scenario, printable
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Survey, Track
@@ -120,23 +121,29 @@ def _position_warnings(
 ) -> Iterator[str]:
     """Warn of positions under the scene, or inside its bodies or actors that the sensor sees."""
     unseen = unseen_objects(scene, survey)
+    where = partial(_bad_positions, scene, samples, moves=survey.path.moves)
     if surroundings is not None:
         seen_by = _surroundings_of_sensors(scene, surroundings, samples, unseen)
         pairs = [(seen_by[sample.sensor], sample.position) for sample in samples]
         under = np.array([seen is not None and seen.is_covered(xyz) for seen, xyz in pairs])
         inside = np.array([seen is not None and seen.in_a_body(xyz) for seen, xyz in pairs])
-        poses_note = seen_from(scene, survey.carried[0]) if (under | inside).any() else ""
+        advice = ""  # other poses replace poses, and no trajectory
+        if (under | inside).any() and not survey.path.moves:
+            advice = f"; {seen_from(scene, survey.carried[0])}"
         if under.any():
             yield (
-                f"the sensor is under the scene{_bad_positions(scene, samples, under)}: check z, "
-                f"heights and up_axis; {poses_note}"
+                f"the sensor is under the scene{where(under)}: check z, heights and up_axis{advice}"
             )
         inside &= ~under
         if inside.any():
+            first = samples[int(inside.argmax())]
+            seen = seen_by[first.sensor]
+            assert seen is not None  # it is inside a body of these
             yield (
-                f"the sensor is inside a closed body{_bad_positions(scene, samples, inside)}, and "
-                f"hits only the backs of its surfaces; {poses_note}; if it is the sensor's "
-                "housing, give its name as unseen of the sensor"
+                f"the sensor is inside a closed body{where(inside)}, in "
+                f"{printable(seen.name_around(first.position))!r}, and hits only the backs of its "
+                f"surfaces{advice}; if it is the sensor's housing, give its name as unseen of the "
+                "sensor"
             )
     for actor, name in enumerate(scene.all_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
@@ -144,7 +151,7 @@ def _position_warnings(
         inside = _inside_actor(scene.actors[actor], samples) & is_seen
         if inside.any():
             yield (
-                f"the sensor is inside {name}{_bad_positions(scene, samples, inside)}: check "
+                f"the sensor is inside {name}{where(inside)}: check "
                 "its mount, and the trajectories, or give the name as unseen of the sensor"
             )
 
@@ -169,13 +176,20 @@ def _surroundings_of_sensors(
     return [known[key] for key in keys]
 
 
-def _bad_positions(scene: Scene, samples: list[_SensorPosition], is_bad: Bools) -> str:
-    """Return the first bad position in words, with the number of bad positions."""
-    x, y, z = samples[int(is_bad.argmax())].position + scene.origin
+def _bad_positions(
+    scene: Scene, samples: list[_SensorPosition], is_bad: Bools, *, moves: bool
+) -> str:
+    """Return the first bad position in words, with its time if the carrier moves, and the number.
+
+    The time is since the survey's start.
+    """
+    first = samples[int(is_bad.argmax())]
+    x, y, z = first.position + scene.origin
     share = f" at {is_bad.sum()} of {len(is_bad)} positions that were tried, first" * (
         not is_bad.all()
     )
-    return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
+    time = f", {first.time_ns / 1e9:,.4g} s after the start" * moves
+    return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f}){time}"
 
 
 def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:

@@ -142,6 +142,16 @@ class Surroundings:
         closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
+    def name_around(self, position: ArrayLike) -> str:
+        """Return the name of the object that surrounds a local position (3,), "" for none.
+
+        It is the object whose surfaces the most directions meet.
+        """
+        points = np.tile(np.asarray(position, np.float64).reshape(3), (RAYS, 1))
+        hits = self._caster.cast(points, directions_around(RAYS))
+        owners = self._scene.face_object[hits.triangle[hits.hit]]
+        return self._scene.names[int(np.bincount(owners).argmax())] if len(owners) else ""
+
     def is_covered(self, position: ArrayLike) -> bool:
         """Return whether a local position (3,) is under the scene: ground above, and empty below.
 
