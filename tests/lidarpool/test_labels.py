@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from lidarpool.live.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.procedural.city import city as city_scene
+from lidarscenes.writers.scene_file import write_scene
 
 PAGE = (Path(__file__).parents[2] / "docs/how-to/labels.md").read_text("utf-8")
 
@@ -51,6 +54,37 @@ def test_names_of_classes_are_in_the_formats_that_the_page_says(tmp_path):
     listed = {*table_below("Names of classes")}
     files = {Path(row.file).name: name for name, row in FORMATS.items()}
     assert {files.get(name, name) for name in listed} & {*FORMATS} - {"rrd"} == holding
+
+
+def test_the_classes_of_the_page_are_those_of_the_objects_of_the_city():
+    entries, names = re.findall(r"```yaml\n(materials:.*?)(classes: .*?)```", PAGE, re.DOTALL)[0]
+    materials = yaml.safe_load(entries)["materials"]
+    city = city_scene(triangles=20_000)
+    expected = {"pavement": "sidewalk", "ground": "road", "tree": "vegetation", "lamp": "pole"}
+    found = set()
+    for name in city.names:
+        kind = name.partition("-")[0]
+        semantic_class = next(m["class"] for m in materials if fnmatchcase(name, m["objects"]))
+        assert yaml.safe_load(names)["classes"][semantic_class] == expected.get(kind, kind)
+        found.add(kind)
+    assert found == {"ground", "pavement", "building", "tree", "lamp", "car"}
+
+
+def test_classes_without_a_name_are_noted_if_others_have_names(tmp_path):
+    write_scene(tmp_path / "scene.glb", the_scene())
+    scenario = {
+        "scene": "scene.glb",
+        "poses": [[0, 0, 1]],
+        "materials": [{"objects": "*", "class": 4}],
+        "actors": [{"name": "Cart", "box": [1, 1, 1], "at": [4, 0, 0.5], "class": 30}],
+    }
+    for classes, noted in (({4: "stone"}, ["30"]), ({4: "stone", 30: "cart"}, []), ({}, [])):
+        read = Scenario.from_data(scenario | {"classes": classes}, folder=tmp_path)
+        notes = [note for note in advice(build(read)) if "without a name" in note]
+        assert notes == [
+            f"class {n} of materials or actors without a name: add {{{n}: …}} to classes"
+            for n in noted
+        ]
 
 
 def test_the_scenario_of_the_page_labels_its_points():

@@ -1,5 +1,6 @@
 """Scenario files: defaults, what they build, and a message for each way to get one wrong."""
 
+import json
 import re
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -359,6 +360,22 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     assert "expect points in one coordinate system" in las and "use world" in las
     assert "KITTI holds points compensated for motion" in kitti
     assert advice(build(scenario("output: {write: [laz, pcd]}"))) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "start", "noted"),
+    [
+        (1777890600.25, "", "give start: 2026-05-04T10:30:00.250000+00:00 in cloud to keep"),
+        (1777890600.25, 'cloud: {start: "2026-05-04T10:30:00Z"}', ""),
+        (1e8, "", ""),  # of a clock since some start
+    ],
+)
+def test_a_trajectory_since_1970_is_told_that_its_date_is_not_kept(scenario, seconds, start, noted):
+    points = [{"time_s": seconds + t, "position": [t, 0, 1]} for t in (0, 1)]
+    read = scenario(f"trajectory: {json.dumps({'points': points})}\nsteps: 36\n{start}")
+    notes = [note for note in advice(build(read)) if "since 1970" in note]
+    assert len(notes) == bool(noted)
+    assert all(noted in note for note in notes)
 
 
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):

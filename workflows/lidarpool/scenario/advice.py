@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.words import as_scenario, plural
+from lidarsim.base.words import as_scenario, listed, plural
 from lidarsim.columns.table import VELOCITY
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.materials import MaterialTable
+from lidarsim.sensor.survey import START_FROM
 from lidarsim.sensor.trajectory import presence_ns
 
 from ..export.laser_scan import has_planar_sensors
@@ -26,6 +29,7 @@ LARGE_STL_M = 20.0
 LARGE_OBJECT_M = 10.0
 LARGE_STATED_M = 100.0
 SMALL_M = 0.2
+_LAST_DATE = datetime(2100, 1, 1, tzinfo=UTC)  # later seconds since 1970 are likely no dates
 MIN_STEPS = 100  # smallest length of a scene, in steps of the precision
 
 
@@ -56,9 +60,22 @@ def advice(built: Built) -> list[str]:
     unlabelled = [
         note for entry in built.scenario.output.write for note in entry.unlabelled(built.survey)
     ]
-    settings = (*coarse, *scanners, *unlabelled, *_without_effect(built.scenario))
+    labels = (*unlabelled, *_unnamed_classes(built.survey))
+    settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
     lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
+
+
+def _unnamed_classes(survey: Survey) -> Iterator[str]:
+    """Yield a note if some classes have names, and others of the survey's objects have none."""
+    used = {material.semantic_class for material in survey.materials}
+    if unnamed := sorted(used - {0, *survey.classes}) if survey.classes else []:
+        noun = "classes" if unnamed[1:] else "class"
+        names = ", ".join(f"{number}: …" for number in unnamed)
+        yield (
+            f"{noun} {listed([*map(str, unnamed)])} of materials or actors without a name: add "
+            f"{{{names}}} to classes"
+        )
 
 
 def _writes_bags(scenario: Scenario) -> bool:
@@ -148,6 +165,16 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 def _timing_notes(built: Built) -> Iterator[str]:
     """Yield notes on faults without sweeps, and on actors that are absent or end early."""
     survey = built.survey
+    if isinstance(survey.path, Track) and survey.start is None:
+        start_s = survey.path.start_s
+        assert start_s is not None  # of every track
+        if START_FROM.timestamp() <= start_s < _LAST_DATE.timestamp():
+            moment = datetime.fromtimestamp(start_s, UTC).isoformat()
+            yield (
+                f"times of the trajectory begin at {start_s:.0f} s, and times of points at the "
+                f"survey's start: if these seconds are since 1970, give start: {moment} in cloud "
+                "to keep the date"
+            )
     end = np.array([built.survey.duration_ns])
     for number, (_, starts, _) in enumerate(survey.sweeps_each):
         for index, fault in survey.faults_of(number, "frozen").items():
