@@ -1,11 +1,16 @@
 """Stations for terrestrial scans: areas that are known by hand, and where nobody can stand."""
 
+import json
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from tests.shapes import block, wall
 
 from lidarpool import LidarError, Scene, SceneMesh, Sensor
+from lidarpool.cli.commands import cli
 from lidarpool.plan.stations import plan_stations
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.actors import box
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
@@ -146,3 +151,39 @@ def test_what_cannot_be_is_refused(given, says):
     given = {"scene": Scene.from_meshes(rooms()), "sensor": EVERYWHERE, **given}
     with pytest.raises(LidarError, match=says):
         plan_stations(**given)
+
+
+def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
+    """Of a floor of 12 m x 6 m, a cloud has points on the half with x > 0."""
+    write_scene(tmp_path / "hall.glb", Scene.from_meshes(rooms()))
+    y, x = np.mgrid[-3:3:0.05, 0:6:0.05].reshape(2, -1)
+    np.save(tmp_path / "scan.npy", np.stack([x, y, 0 * x], axis=1))
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("scene: hall.glb\nposes: [[-3, 0, 1.7], [3, 0, 1.7]]\nsensor: ouster/os0-128\n")
+    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--slant", "90"]
+    figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
+    floor = figures["objects"]["Floor"]
+    assert floor["covered_m2"] == pytest.approx(6.05 * 6, rel=0.03)
+    assert floor["seen_m2"] > 70 and figures["objects"]["West"]["covered_m2"] == 0
+    assert figures["covered"] == pytest.approx(
+        sum(entry["covered_m2"] for entry in figures["objects"].values()) / figures["seen_m2"]
+    )
+    assert "2 stations see " in CliRunner().invoke(cli, [*command, "--within", "0.02"]).stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["hall.glb", "--of", "scan.npy"], "it has no poses: give stations.yaml"),
+        (["hall.glb", "--of", "scan.npy", "--count", "2"], "--count: not with --of"),
+        (["hall.glb", "--of", "scan.npy", "--within", "0"], "--within is 0; it must be greater"),
+        (["hall.glb"], "--sensor says which instrument"),
+    ],
+)
+def test_a_scan_that_cannot_be_compared(tmp_path, monkeypatch, options, says):
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path / "hall.glb", Scene.from_meshes(rooms()))
+    np.save(tmp_path / "scan.npy", np.zeros((1, 3)) + 1)
+    outcome = CliRunner().invoke(cli, ["stations", *options])
+    assert outcome.exit_code != 0
+    assert says in outcome.output + str(outcome.exception)

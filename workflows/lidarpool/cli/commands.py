@@ -37,7 +37,8 @@ from . import shared_options as shared
 from .first_step import begin
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
-from .scenario_commands import check, import_, init, scene, schema, sensors, stations
+from .scenario_commands import check, import_, init, scene, schema, sensors
+from .stations_command import stations
 
 if TYPE_CHECKING:
     from ..base.tls_files import TlsFiles

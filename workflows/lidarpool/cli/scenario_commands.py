@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +14,7 @@ import click
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import plural, without_common_prefix
+from lidarsim.base.words import plural
 from lidarsim.sensor_files.format_table import FORMATS
 
 from . import completion
@@ -32,15 +29,8 @@ if TYPE_CHECKING:
     from lidarsim.sensor.models import SensorModel
 
     from ..base.tls_files import TlsFiles
-    from ..plan.stations import StationPlan
-    from ..scenario.build import Built
-    from ..scenario.scenario import Scenario
-    from .terminal import Terminal
 
 MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles
-PLAN_FILE = "stations.yaml"
-PICTURE_FILE = "stations.png"
-_SHOWN_OBJECTS = 12
 _SENSOR_FORMATS = "Format of the file: " + ", ".join(row.name for row in FORMATS) + "."
 
 
@@ -603,224 +593,3 @@ def _field_of_view(name: str, model: SensorModel) -> str:
     lowest, highest = np.degrees(np.arcsin(np.clip([z.min(), z.max()], -1, 1)))
     width = 2 * np.degrees(np.abs(np.arctan2(y, x)).max())
     return f"{width:.0f}° x {lowest:.1f}° to {highest:.1f}°"
-
-
-def _share(text: str) -> float:
-    """Parse a percentage such as 95% or 95."""
-    try:
-        share = float(text.removesuffix("%")) / 100
-    except ValueError:
-        share = math.nan
-    if not (0.01 <= share <= 1):
-        raise click.BadParameter(f"{text!r} is not 1% to 100%: give a percentage, such as 95%.")
-    return share
-
-
-@click.command(context_settings={"show_default": True})
-@click.argument("scene", metavar="MESH|SCENARIO", type=click.Path(path_type=Path))
-@click.option(
-    "--sensor",
-    "model",
-    metavar="MODEL|FILE.yaml",
-    shell_complete=completion.sensors,
-    required=True,
-    help="The instrument: a model of lidarpool sensors, with or without its maker.",
-)
-@click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
-@click.option(
-    "--coverage",
-    type=_share,
-    metavar="SHARE",
-    help="Choose until this share of what can be seen is covered, such as 95%; without --count "
-    "and --coverage, for as long as each station adds 1%.",
-)
-@click.option(
-    "--height", "height_m", default=1.7, metavar="M", help="Of the instrument above the floor."
-)
-@click.option(
-    "--spacing",
-    "spacing_m",
-    type=float,
-    metavar="M",
-    help="Between the places that are tried.  [default: for about 600 places]",
-)
-@click.option(
-    "--slant", "slant_deg", default=80.0, metavar="DEG", help="Largest angle of incidence."
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="FOLDER",
-    help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
-)
-@options.mesh_reading
-@overwrite
-@options.as_json
-def stations(
-    scene: Path,
-    model: str,
-    out: Path | None,
-    of_mesh: dict[str, Any],
-    overwrite: bool,
-    as_json: bool,
-    **settings: Any,
-) -> None:
-    """Choose stations for a terrestrial scan.
-
-    Places on the floor are tried, and whichever adds most to what is covered comes next. Coverage
-    is by area, of what any of these places sees. A scenario with the stations is written, and a
-    picture of what they cover.
-
-    \b
-    Examples:
-      lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
-      lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
-      lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
-    """  # noqa: D301 - click wants the character, not its name
-    if settings["count"] is not None and settings["coverage"] is not None:
-        raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
-    begin("reading the scene", quiet=as_json)
-    from lidarsim.base.model_names import full_name
-    from lidarsim.sensor.models import load_sensor
-
-    from ..plan.stations import plan_stations
-    from ..report.result_pictures import draw_stations
-    from ..scenario.scenario import Scenario
-    from .terminal import Terminal
-
-    folder = Path(f"{scene.stem}-stations") if out is None else out
-    existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
-    if existing and not overwrite:
-        raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
-    model = full_name(model)
-    sensor = load_sensor(model)
-    scenario = Scenario.load(scene, of_mesh)
-    terminal = Terminal(quiet=as_json)
-    built, notes = _built_with_notes(scenario, terminal)
-    with terminal.status("looking from all places"):
-        plan = plan_stations(built.scene, sensor, **settings)
-    with terminal.status("drawing the picture"):
-        page = draw_stations(built.scene, plan)
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / PLAN_FILE
-    file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
-    page.save(folder / PICTURE_FILE)
-    shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
-    figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
-    note_lines = map("note: {}".format, shortfalls)
-    options.show(figures, chain(_plan_lines(plan, built), note_lines), as_json)
-    if not as_json:
-        click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
-        click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
-
-
-def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
-    """Build a scenario whose poses do not matter; return its notes, which are printed at once."""
-    from ..scenario.advice import advice
-    from ..scenario.build import build
-    from ..scenario.placing import Placing
-
-    with terminal.status("reading the scene", logged=False):
-        built = build(scenario, plans=False)
-    notes = advice(replace(built, placing=Placing(())))
-    for note in notes:
-        terminal.tell(note)
-    return built, notes
-
-
-def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
-    """Yield notes on a plan with less than `coverage`, or fewer stations than `count`."""
-    from ..plan.stations import MAX_STATIONS
-
-    reached = float(plan.coverage[-1])
-    if coverage is not None and reached < coverage:
-        yield (
-            f"{coverage:.0%} is not reached: {MAX_STATIONS} stations, which is the most, cover "
-            f"{reached:.1%}; try a greater --height, --slant or --spacing"
-        )
-    if count is not None and len(plan.stations) < count:
-        yield f"{len(plan.stations)} of {count} stations already see all that can be seen"
-
-
-def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
-    """Return the text of a scenario whose poses are the stations."""
-    import yaml
-
-    def relative(file: Path) -> str:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-
-    entry = scenario.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
-    copies = entry.get("copies", [])
-    named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
-    for file_entry in filter(None, named):
-        file_entry["file"] = relative(scenario.path(file_entry["file"]))
-    world = scenario.world.model_dump(exclude_unset=True, mode="json")
-    is_file = model.endswith((".yaml", ".yml"))
-    data = {
-        **({"scene": entry} if entry else {}),
-        **({"world": world} if world else {}),
-        "sensor": {"model": relative(Path(model)) if is_file else model},
-        "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
-        "steps": 36,
-        "cloud": {"columns": ["range"]},
-    }
-    head = (
-        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "
-        f"{plan.coverage[-1]:.1%} of what\n# can be seen is covered. Steps are of 10 degrees: one "
-        "turn from each.\n"
-    )
-    return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
-
-
-def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
-    """Return the figures of a plan for --json."""
-    names = built.scene.names
-    return {
-        "sensor": sensor,
-        "places": len(plan.candidates),
-        "spacing_m": plan.spacing_m,
-        "stations": [
-            {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
-            for position, share in zip(plan.stations, plan.coverage, strict=True)
-        ],
-        "objects": {
-            name: {"visible_m2": float(visible), "covered_m2": float(covered)}
-            for name, visible, covered in zip(names, plan.visible_m2, plan.covered_m2, strict=True)
-        },
-        "epsg": built.survey.epsg,
-        "world_origin": [*built.scenario.world.origin],
-        "notes": notes,
-    }
-
-
-def _plan_lines(plan: StationPlan, built: Built) -> Iterator[str]:
-    """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
-    names = built.scene.names
-    yield (
-        f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
-        f"{plan.visible_m2.sum():,.0f} m²"
-    )
-    yield "station        x          y          z   covered     added"
-    previous_share = 0.0
-    rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
-    for number, ((x, y, z), share) in enumerate(rows, 1):
-        gain = share - previous_share
-        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
-        previous_share = share
-    uncovered_m2 = plan.visible_m2 - plan.covered_m2
-    order = [k for k in (-uncovered_m2).argsort(kind="stable").tolist() if plan.visible_m2[k] > 0]
-    shown = order[:_SHOWN_OBJECTS]
-    labels = without_common_prefix(names)
-    groups = [(labels[k], [k]) for k in shown]
-    if further := order[_SHOWN_OBJECTS:]:
-        groups.append((f"{len(further):,} others", further))
-    width = max(6, *(len(label) for label, _ in groups))
-    yield f"{'object':<{width}}  can be seen   covered"
-    for label, members in groups:
-        visible = plan.visible_m2[members].sum()
-        covered = plan.covered_m2[members].sum()
-        yield f"{label:<{width}} {visible:9,.1f} m² {covered / visible:9.1%}"
-    blind = len(names) - len(order)
-    if blind:
-        yield f"out of sight from all places: {plural(blind, 'object')}"
-    yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)

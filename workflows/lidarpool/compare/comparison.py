@@ -25,7 +25,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
-from ..base.open3d_module import load_open3d
+from ..base.neighbours import nearest
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..export.folder import result_folder, staging
@@ -452,16 +452,6 @@ class _Comparing:
                 for ring, (elevation, count) in rings
             ],
         }
-
-
-def nearest(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
-    """Return distances (n,) to the nearest points of a reference, metres, and indices (n,)."""
-    core = load_open3d().core
-    origin = reference.mean(axis=0)  # far from zero, squares would lose their digits
-    tree = core.nns.NearestNeighborSearch(core.Tensor(reference - origin))
-    tree.knn_index()
-    index, square = tree.knn_search(core.Tensor(points - origin), 1)
-    return np.sqrt(square.numpy()[:, 0]), index.numpy()[:, 0]
 
 
 def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -18,6 +19,8 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
+
+from ..base.neighbours import nearest
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # share of the visible area that each adds, if no number or coverage is given
@@ -102,6 +105,17 @@ class StationPlan:
     sight: Sight
 
 
+@dataclass(frozen=True, eq=False)
+class SurveyCoverage:
+    """The area that stations see, and how much of it a cloud has points on.
+
+    Areas are of the sides of surfaces; the sides of a thin wall count separately.
+    """
+
+    seen_m2: Floats  # (objects,) area that the stations see
+    covered_m2: Floats  # (objects,) area of that with a point of the cloud nearby
+
+
 @checked
 def plan_stations(
     scene: Scene,
@@ -177,6 +191,70 @@ def plan_stations(
         visible_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
         covered_m2=np.bincount(owner, covered_m2, objects).astype(np.float64),
         sight=sight,
+    )
+
+
+def survey_coverage(
+    scene: Scene,
+    sensor: Sensor,
+    positions: Floats,
+    clouds: Iterable[Floats],
+    *,
+    within_m: float = 0.1,
+    slant_deg: float = 80.0,
+) -> SurveyCoverage:
+    """Compare what stations see with the points of a cloud.
+
+    Parameters
+    ----------
+    scene
+        The scene that was scanned; actors are ignored.
+    sensor
+        The instrument, upright. Its range and field of view count.
+    positions
+        The stations (s, 3), world metres.
+    clouds
+        Points (n, 3) each, world metres, which are held in memory one by one.
+    within_m
+        Surface within this distance of a point is covered, metres.
+    slant_deg
+        Largest angle of incidence that counts as seen, degrees from the normal.
+
+    Raises
+    ------
+    LidarError
+        If the sensor does not look all around.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lidarpool import Sensor
+    >>> from lidarsim.scene.actors import box
+    >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
+    >>> floor = np.mgrid[-4:4.1:0.1, -3:3.1:0.1, -1.5:-1.4].reshape(3, -1).T
+    >>> found = survey_coverage(
+    ...     room, Sensor.grid(vertical_fov_deg=180), np.zeros((1, 3)), [floor], slant_deg=90
+    ... )
+    >>> found.seen_m2.round().tolist(), bool(48 <= found.covered_m2[0] < 54)
+    ([180.0], True)
+    """
+    scene = SimplifiedScene.from_scene(scene).scene
+    sight = Sight(scene, sensor, slant_deg)
+    samples = _sample_surfaces(scene)
+    has_point = np.zeros(len(samples.points), np.bool_)
+    for points in clouds:
+        missing = np.flatnonzero(~has_point)
+        if len(points) and len(missing):
+            distance_m, _ = nearest(samples.points[missing], points - scene.origin)
+            has_point[missing] = distance_m <= within_m
+    sides = np.stack(
+        [sight.sides(p, samples.points, samples.normals) for p in positions - scene.origin]
+    )
+    seen_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
+    objects = len(scene.names)
+    return SurveyCoverage(
+        np.bincount(samples.owner, seen_m2, objects).astype(np.float64),
+        np.bincount(samples.owner, seen_m2 * has_point, objects).astype(np.float64),
     )
 
 

@@ -1,0 +1,376 @@
+"""`lidarpool stations`: stations of a terrestrial scan, and what a scan covers."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.words import plural, without_common_prefix
+
+from . import completion
+from . import shared_options as options
+from .first_step import begin
+from .shared_options import overwrite
+
+if TYPE_CHECKING:
+    from lidarsim.base.arrays import Floats
+
+    from ..plan.stations import StationPlan, SurveyCoverage
+    from ..scenario.build import Built
+    from ..scenario.scenario import Scenario
+    from .terminal import Terminal
+
+PLAN_FILE = "stations.yaml"
+PICTURE_FILE = "stations.png"
+_SHOWN_OBJECTS = 12
+
+
+def _share(text: str) -> float:
+    """Parse a percentage such as 95% or 95."""
+    try:
+        share = float(text.removesuffix("%")) / 100
+    except ValueError:
+        share = math.nan
+    if not (0.01 <= share <= 1):
+        raise click.BadParameter(f"{text!r} is not 1% to 100%: give a percentage, such as 95%.")
+    return share
+
+
+@click.command(context_settings={"show_default": True})
+@click.argument("scene", metavar="MESH|SCENARIO", type=click.Path(path_type=Path))
+@click.option(
+    "--sensor",
+    "model",
+    metavar="MODEL|FILE.yaml",
+    shell_complete=completion.sensors,
+    help="The instrument: a model of lidarpool sensors, with or without its maker.  [default: the "
+    "scenario's]",
+)
+@options.path(
+    "--of",
+    "cloud",
+    help="Choose no stations: compare what those of SCENARIO see with this result or cloud.",
+)
+@click.option(
+    "--within",
+    "within_m",
+    default=0.1,
+    metavar="M",
+    help="With --of: surface this near to a point is covered.",
+)
+@click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
+@click.option(
+    "--coverage",
+    type=_share,
+    metavar="SHARE",
+    help="Choose until this share of what can be seen is covered, such as 95%; without --count "
+    "and --coverage, for as long as each station adds 1%.",
+)
+@click.option(
+    "--height", "height_m", default=1.7, metavar="M", help="Of the instrument above the floor."
+)
+@click.option(
+    "--spacing",
+    "spacing_m",
+    type=float,
+    metavar="M",
+    help="Between the places that are tried.  [default: for about 600 places]",
+)
+@click.option(
+    "--slant", "slant_deg", default=80.0, metavar="DEG", help="Largest angle of incidence."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
+)
+@options.mesh_reading
+@overwrite
+@options.as_json
+def stations(
+    scene: Path,
+    model: str | None,
+    cloud: Path | None,
+    of_mesh: dict[str, Any],
+    **settings: Any,
+) -> None:
+    """Choose stations for a terrestrial scan, or say what a scan has covered.
+
+    Places on the floor are tried, and whichever adds most to what is covered comes next. Coverage
+    is by area, of what any of these places sees. A scenario with the stations is written, and a
+    picture of what they cover.
+
+    With --of, the stations of the scenario are taken, and of the area that they see, the share
+    near points of a result, or of any cloud that `lidarpool compare` reads.
+
+    \b
+    Examples:
+      lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
+      lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
+      lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
+      lidarpool stations hall-stations/stations.yaml --of hall-scan
+    """  # noqa: D301 - click wants the character, not its name
+    if settings["count"] is not None and settings["coverage"] is not None:
+        raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
+    begin("reading the scene", quiet=settings["as_json"])
+    from ..scenario.scenario import Scenario
+
+    within_m = settings.pop("within_m")
+    if cloud is not None:
+        _refuse_beside_cloud(scene, settings | {"model": model})
+        if not within_m > 0:
+            raise LidarError(f"--within is {within_m:g}; it must be greater than 0 m.")
+        scenario = Scenario.load(scene, of_mesh)
+        _show_coverage(scenario, cloud, within_m, settings["slant_deg"], settings["as_json"])
+    elif model is None:
+        raise click.UsageError("--sensor says which instrument stands there: give its model.")
+    else:
+        out = settings.pop("out")
+        overwrites = settings.pop("overwrite")
+        folder = Path(f"{scene.stem}-stations") if out is None else out
+        existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
+        if existing and not overwrites:
+            raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
+        _plan(Scenario.load(scene, of_mesh), model, folder, **settings)
+
+
+def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
+    """Choose stations, write them as a scenario and a picture, and print them."""
+    from lidarsim.base.model_names import full_name
+    from lidarsim.sensor.models import load_sensor
+
+    from ..plan.stations import plan_stations
+    from ..report.result_pictures import draw_stations
+    from .terminal import Terminal
+
+    model = full_name(model)
+    sensor = load_sensor(model)
+    terminal = Terminal(quiet=as_json)
+    built, notes = _built_with_notes(scenario, terminal)
+    with terminal.status("looking from all places"):
+        plan = plan_stations(built.scene, sensor, **settings)
+    with terminal.status("drawing the picture"):
+        page = draw_stations(built.scene, plan)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / PLAN_FILE
+    file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
+    page.save(folder / PICTURE_FILE)
+    shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
+    figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
+    note_lines = map("note: {}".format, shortfalls)
+    options.show(figures, chain(_plan_lines(plan, built), note_lines), as_json)
+    if not as_json:
+        click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
+        click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
+
+
+def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
+    """Raise UsageError for options that choose stations, beside the cloud of a scan."""
+    chosen = {
+        "--sensor": settings["model"],
+        "--out": settings["out"],
+        "--count": settings["count"],
+        "--coverage": settings["coverage"],
+        "--spacing": settings["spacing_m"],
+    }
+    if unused := [name for name, value in chosen.items() if value is not None]:
+        raise click.UsageError(
+            f"{' and '.join(unused)}: not with --of, which takes stations and sensor of {scene}."
+        )
+
+
+def _show_coverage(
+    scenario: Scenario, cloud: Path, within_m: float, slant_deg: float, as_json: bool
+) -> None:
+    """Print what the stations of a scenario see, and what a cloud covers of it."""
+    from ..plan.stations import survey_coverage
+    from ..recordings.recordings import open_recording
+    from .terminal import Terminal
+
+    if scenario.poses is None:
+        raise LidarError(
+            "--of compares the stations of a scenario, and it has no poses: give stations.yaml of "
+            "lidarpool stations, or list the poses of the scan."
+        )
+    recording = open_recording(cloud)
+    terminal = Terminal(quiet=as_json)
+    built, notes = _built_with_notes(scenario, terminal)
+    if len(built.survey.carried) > 1:
+        raise LidarError("--of compares the scan of one sensor, and the scenario has several.")
+    positions = _station_positions(built)
+    clouds = (
+        recording.read_points(number, in_world=True).points for number in range(recording.count)
+    )
+    with terminal.status("looking for points on what the stations see"):
+        coverage = survey_coverage(
+            built.scene,
+            built.survey.carried[0].sensor,
+            positions,
+            clouds,
+            within_m=within_m,
+            slant_deg=slant_deg,
+        )
+    if not coverage.seen_m2.any():
+        raise LidarError("The stations see no surface: check their poses, and the scene's unit.")
+    figures = _coverage_figures(coverage, built) | {
+        "stations": len(positions),
+        "within_m": within_m,
+        "notes": [*notes, *recording.left_out_notes],
+    }
+    head = (
+        f"{plural(len(positions), 'station')} see {figures['seen_m2']:,.0f} m², and "
+        f"{figures['covered']:.1%} of it is within {within_m:g} m of a point"
+    )
+    table = _object_lines(built.scene.names, coverage.seen_m2, coverage.covered_m2, "seen")
+    note_lines = map("note: {}".format, recording.left_out_notes)
+    options.show(figures, chain([head], table, note_lines), as_json)
+
+
+def _station_positions(built: Built) -> Floats:
+    """Return the positions (s, 3) of the sensor at all stations, world metres."""
+    path = built.survey.path
+    mount = built.survey.carried[0].mount
+    poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]
+    return built.scene.origin + [pose.position for pose in poses]
+
+
+def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
+    """Return the figures of what a cloud covers for --json."""
+    rows = zip(built.scene.names, coverage.seen_m2, coverage.covered_m2, strict=True)
+    seen_m2 = float(coverage.seen_m2.sum())
+    return {
+        "seen_m2": seen_m2,
+        "covered": float(coverage.covered_m2.sum()) / seen_m2,
+        "objects": {
+            name: {"seen_m2": float(seen), "covered_m2": float(area)} for name, seen, area in rows
+        },
+    }
+
+
+def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
+    """Build a scenario whose poses do not matter; return its notes, which are printed at once."""
+    from ..scenario.advice import advice
+    from ..scenario.build import build
+    from ..scenario.placing import Placing
+
+    with terminal.status("reading the scene", logged=False):
+        built = build(scenario, plans=False)
+    notes = advice(replace(built, placing=Placing(())))
+    for note in notes:
+        terminal.tell(note)
+    return built, notes
+
+
+def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
+    """Yield notes on a plan with less than `coverage`, or fewer stations than `count`."""
+    from ..plan.stations import MAX_STATIONS
+
+    reached = float(plan.coverage[-1])
+    if coverage is not None and reached < coverage:
+        yield (
+            f"{coverage:.0%} is not reached: {MAX_STATIONS} stations, which is the most, cover "
+            f"{reached:.1%}; try a greater --height, --slant or --spacing"
+        )
+    if count is not None and len(plan.stations) < count:
+        yield f"{len(plan.stations)} of {count} stations already see all that can be seen"
+
+
+def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
+    """Return the text of a scenario whose poses are the stations."""
+    import yaml
+
+    def relative(file: Path) -> str:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+
+    entry = scenario.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
+    copies = entry.get("copies", [])
+    named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
+    for file_entry in filter(None, named):
+        file_entry["file"] = relative(scenario.path(file_entry["file"]))
+    world = scenario.world.model_dump(exclude_unset=True, mode="json")
+    is_file = model.endswith((".yaml", ".yml"))
+    data = {
+        **({"scene": entry} if entry else {}),
+        **({"world": world} if world else {}),
+        "sensor": {"model": relative(Path(model)) if is_file else model},
+        "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
+        "steps": 36,
+        "cloud": {"columns": ["range"]},
+    }
+    head = (
+        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "
+        f"{plan.coverage[-1]:.1%} of what\n# can be seen is covered. Steps are of 10 degrees: one "
+        "turn from each.\n"
+    )
+    return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
+    """Return the figures of a plan for --json."""
+    names = built.scene.names
+    return {
+        "sensor": sensor,
+        "places": len(plan.candidates),
+        "spacing_m": plan.spacing_m,
+        "stations": [
+            {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
+            for position, share in zip(plan.stations, plan.coverage, strict=True)
+        ],
+        "objects": {
+            name: {"visible_m2": float(visible), "covered_m2": float(covered)}
+            for name, visible, covered in zip(names, plan.visible_m2, plan.covered_m2, strict=True)
+        },
+        "epsg": built.survey.epsg,
+        "world_origin": [*built.scenario.world.origin],
+        "notes": notes,
+    }
+
+
+def _plan_lines(plan: StationPlan, built: Built) -> Iterator[str]:
+    """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
+    names = built.scene.names
+    yield (
+        f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
+        f"{plan.visible_m2.sum():,.0f} m²"
+    )
+    yield "station        x          y          z   covered     added"
+    previous_share = 0.0
+    rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
+    for number, ((x, y, z), share) in enumerate(rows, 1):
+        gain = share - previous_share
+        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
+        previous_share = share
+    yield from _object_lines(names, plan.visible_m2, plan.covered_m2, "can be seen")
+    blind = int((plan.visible_m2 == 0).sum())
+    if blind:
+        yield f"out of sight from all places: {plural(blind, 'object')}"
+    yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)
+
+
+def _object_lines(
+    names: Sequence[str], visible_m2: Floats, covered_m2: Floats, heading: str
+) -> Iterator[str]:
+    """Yield a table of the covered area of objects, the largest uncovered area first."""
+    uncovered_m2 = visible_m2 - covered_m2
+    order = [k for k in (-uncovered_m2).argsort(kind="stable").tolist() if visible_m2[k] > 0]
+    shown = order[:_SHOWN_OBJECTS]
+    labels = without_common_prefix(names)
+    groups = [(labels[k], [k]) for k in shown]
+    if further := order[_SHOWN_OBJECTS:]:
+        groups.append((f"{len(further):,} others", further))
+    width = max(6, *(len(label) for label, _ in groups))
+    yield f"{'object':<{width}} {heading:>12}   covered"
+    for label, members in groups:
+        visible = visible_m2[members].sum()
+        covered = covered_m2[members].sum()
+        yield f"{label:<{width}} {visible:9,.1f} m² {covered / visible:9.1%}"
