@@ -23,9 +23,9 @@ from lidarpool import (
     load_sensor,
     simulate,
 )
+from lidarpool.clouds.formats import Format
 from lidarpool.compare.fit.estimates import Estimate
 from lidarpool.compare.fit.fitting import _with_performance
-from lidarpool.export.formats import Format
 from lidarpool.recordings.recordings import Recording, open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.sensor.models import read_model

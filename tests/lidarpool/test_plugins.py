@@ -10,8 +10,8 @@ from tests.plugin_files import write_distribution
 from lidarpool import Cloud, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
-from lidarpool.export.format_table import row_of
-from lidarpool.export.formats import Format
+from lidarpool.clouds.format_table import row_of
+from lidarpool.clouds.formats import Format
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of

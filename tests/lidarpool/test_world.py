@@ -14,7 +14,7 @@ from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
 
 from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.export.formats import Format
+from lidarpool.clouds.formats import Format
 from lidarpool.live.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build

@@ -41,8 +41,8 @@ import poolpart
 import raybeam
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
+from lidarpool.clouds.format_table import EXPORTS, LAYOUTS
 from lidarpool.datasets.dataset import DATA_SETS
-from lidarpool.export.format_table import EXPORTS, LAYOUTS
 from lidarpool.scenario import point_files as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection

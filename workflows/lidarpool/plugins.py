@@ -3,7 +3,7 @@
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .export.format_table import FormatRow
-from .export.pieces import Pieces
+from .clouds.format_table import FormatRow
+from .clouds.pieces import Pieces
 
 __all__ = ["Cloud", "CloudLike", "FormatRow", "Pieces", "Sweeps"]

@@ -32,7 +32,7 @@ from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.scene.transform import affine
 from lidarsim.sensor.trajectory import matrices
 
-from ..export.images import points_of_images
+from ..clouds.images import points_of_images
 
 Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
@@ -118,12 +118,7 @@ def open_parquet(path: Path, name: str) -> SweepFiles:
     Only columns of numbers are read: the memory of others is not known before.
     """
     need("pyarrow", "parquet", f"{name} is read")
-    from ..export.parquet_groups import (  # imports pyarrow
-        check_groups,
-        group_allowance,
-        number_columns,
-        read_group,
-    )
+    from ..clouds.parquet_groups import check_groups, group_allowance, number_columns, read_group
 
     if path.is_file():
         input_size(path)

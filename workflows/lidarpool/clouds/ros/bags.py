@@ -27,19 +27,8 @@ from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
 from .. import reading
 from ..frames import survey_start_ns
-from .layouts import (
-    EXTRA_FIELDS,
-    LAYOUTS,
-    LaidOut,
-    message_stamp_ns,
-    sensor_traits,
-)
-from .messages import (
-    LATCHED_TOPICS,
-    message_store,
-    survey_messages,
-    sweep_topic,
-)
+from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
+from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topic
 
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
 _LATCHED = Qos(

@@ -30,13 +30,13 @@ class FormatRow:
     file
         File or folder in the folder of a result; an ending chooses the format.
     module
-        Dotted name of the module that writes it. A class `Reader` there (`export/reading.py`) reads
+        Dotted name of the module that writes it. A class `Reader` there (`clouds/reading.py`) reads
         single sweeps of data sets.
     title
         Proper name in sentences, such as KITTI; by default the name of the format.
     write
         Name of the function of the module that writes it, `write(path, cloud, sweeps)`, or with
-        `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which defines the content of
+        `in_pieces` of a subclass of `Pieces` (`clouds/pieces.py`), which defines the content of
         each file.
     in_pieces
         Whether it has many files, which workers can write.
@@ -173,7 +173,7 @@ _NUSCENES_FILES = (
 def _las(name: str) -> FormatRow:
     return FormatRow(
         f"cloud.{name}",
-        "lidarpool.export.las",
+        "lidarpool.clouds.las",
         f"write_{name}",
         name.upper(),
         packages=("laspy", "lazrs"),
@@ -185,7 +185,7 @@ def _las(name: str) -> FormatRow:
 def _osi(name: str, file: str, title: str) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.osi",
+        "lidarpool.clouds.osi",
         f"write_{name}",
         title,
         packages=("betterosi",),
@@ -200,7 +200,7 @@ def _osi(name: str, file: str, title: str) -> FormatRow:
 def _bag(name: str, file: str, **fields: Any) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.ros.bags",
+        "lidarpool.clouds.ros.bags",
         f"write_{name}",
         packages=("rosbags",),
         extra="ros",
@@ -219,7 +219,7 @@ def _bag(name: str, file: str, **fields: Any) -> FormatRow:
 FORMATS = {
     "ply": FormatRow(
         "cloud.ply",
-        "lidarpool.export.ply",
+        "lidarpool.clouds.ply",
         "write_ply",
         "PLY",
         data_set="folder",
@@ -229,7 +229,7 @@ FORMATS = {
     "laz": _las("laz"),
     "parquet": FormatRow(
         "cloud.parquet",
-        "lidarpool.export.parquet",
+        "lidarpool.clouds.parquet",
         "Pieces",
         "Parquet",
         in_pieces=True,
@@ -241,7 +241,7 @@ FORMATS = {
     ),
     "pcd": FormatRow(
         "pcd",
-        "lidarpool.export.pcd",
+        "lidarpool.clouds.pcd",
         "Pieces",
         "PCD",
         in_pieces=True,
@@ -251,7 +251,7 @@ FORMATS = {
     ),
     "images": FormatRow(
         "images",
-        "lidarpool.export.images",
+        "lidarpool.clouds.images",
         "Pieces",
         "range images",
         in_pieces=True,
@@ -263,7 +263,7 @@ FORMATS = {
     ),
     "e57": FormatRow(
         "cloud.e57",
-        "lidarpool.export.e57",
+        "lidarpool.clouds.e57",
         "write_e57",
         "E57",
         packages=("pye57",),
@@ -274,7 +274,7 @@ FORMATS = {
     ),
     "kitti": FormatRow(
         "kitti",
-        "lidarpool.export.kitti",
+        "lidarpool.clouds.kitti",
         "Pieces",
         "KITTI",
         in_pieces=True,
@@ -289,7 +289,7 @@ FORMATS = {
     ),
     "nuscenes": FormatRow(
         "nuscenes",
-        "lidarpool.export.nuscenes",
+        "lidarpool.clouds.nuscenes",
         "Pieces",
         "nuScenes",
         in_pieces=True,
@@ -306,7 +306,7 @@ FORMATS = {
     ),
     "webdataset": FormatRow(
         "webdataset",
-        "lidarpool.export.webdataset",
+        "lidarpool.clouds.webdataset",
         "Pieces",
         "WebDataset",
         in_pieces=True,
@@ -318,7 +318,7 @@ FORMATS = {
     ),
     "pcap": FormatRow(
         "packets",
-        "lidarpool.export.packets",
+        "lidarpool.clouds.packets",
         "write_pcap",
         "PCAP",
         needs=("scan", *_ALL_RAYS),
@@ -327,7 +327,7 @@ FORMATS = {
     ),
     "rrd": FormatRow(
         "cloud.rrd",
-        "lidarpool.export.rrd",
+        "lidarpool.clouds.rrd",
         "write_rrd",
         "RRD",
         packages=("rerun",),
