@@ -17,7 +17,7 @@ from lidarsim.sensor import Fault
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.boxes import Boxes, SweepBoxes
-from ..clouds.reading import PointColumns
+from ..clouds.sweep_reader import PointColumns
 from .job_table import JobRow, Value
 
 
