@@ -16,6 +16,7 @@ from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene import Scene
 
 # A mesh of one triangle, whatever is in the file.
 TRIANGLE = """
@@ -54,6 +55,36 @@ def test_a_plugin_reads_files_of_its_ending(tmp_path, distribution):
     mesh(distribution, "plain-mesh", "plain", TRIANGLE.format(ending="plain"))
     (triangle,) = load_meshes(write(tmp_path / "a.PLAIN", "anything"))
     assert triangle.name == "Triangle"
+
+
+SIZED = """
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from lidarsim.plugins import Content, MeshFormat, SceneMesh, about, checked_fields
+
+@dataclass(frozen=True)
+@checked_fields
+class SizedOptions:
+    size_m: Annotated[float, about("length of the edges, metres", gt=0, le=100)] = 1.0
+
+def read(data, path, wanted):
+    mesh = SceneMesh("Triangle", wanted.own.size_m * np.eye(3), np.array([[0, 1, 2]]))
+    return Content([mesh], unit_m=1.0, up_axis="z")
+
+FORMAT = MeshFormat((".sized",), read, options=SizedOptions)
+"""
+
+
+def test_a_plugin_has_options_of_its_own(tmp_path, distribution):
+    mesh(distribution, "sized-mesh", "sized", SIZED)
+    path = write(tmp_path / "a.sized", "anything")
+    assert load_meshes(path)[0].vertices.max() == 1
+    assert Scene.load(path, size_m=3.0).vertices.max() == 3
+    assert "above 0" in refused(Scene.load, path, size_m=0.0)
+    told = refused(Scene.load, write(tmp_path / "a.obj", "v 0 0 0\n"), size_m=3.0)
+    assert "a.obj has no size_m: leave out size_m, or give a file that has it (.sized)." in told
 
 
 def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distribution):

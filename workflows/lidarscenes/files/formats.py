@@ -12,6 +12,7 @@ MODELS = (".xml",)  # of MuJoCo
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"
 _IFC = "lidarscenes.files.ifc:read_ifc"
+_IFC_OPTIONS = "lidarscenes.files.ifc:IfcOptions"
 _ZIP = b"PK\x03\x04"
 _CRATE = b"PXR-USDC"  # binary OpenUSD
 _USD_TEXT = b"#usda "
@@ -37,7 +38,9 @@ MESH_FORMATS = (
     MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
     MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
     MeshFormat(MODELS, "lidarscenes.mujoco.model_file:read_mjcf", models=True),
-    MeshFormat((".ifc",), _IFC, from_path=True, storeys=True, signatures=(b"ISO-10303-21;",)),
-    MeshFormat((".ifczip",), _IFC, from_path=True, storeys=True, signatures=(_ZIP,)),
+    MeshFormat(
+        (".ifc",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(b"ISO-10303-21;",)
+    ),
+    MeshFormat((".ifczip",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(_ZIP,)),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

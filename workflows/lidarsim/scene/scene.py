@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -167,13 +167,13 @@ class Scene:
         window: Window | None = None,
         epsg: int | None = None,
         sag_m: float | None = None,
-        storeys: Sequence[str] | None = None,
         assets: str | Path | None = None,
         geometry: Geometry | None = None,
         keyframe: str | None = None,
         groups: Sequence[int] | None = None,
         exclude: Sequence[str] = (),
         same_names: SameNames = "number",
+        **of_format: Any,
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, .ifc, or a raster (.tif).
 
@@ -205,8 +205,6 @@ class Scene:
         sag_m
             Of roads (.xodr): largest distance of triangles from curves in plan, metres; None takes
             0.01.
-        storeys
-            Of a building (.ifc): names of the storeys whose elements are read. None takes all.
         assets
             A folder: further files that the scene file names are read from this folder and from
             the folder of the scene file, and from the folders below. Of a world of Gazebo, models
@@ -223,6 +221,9 @@ class Scene:
         same_names
             With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
             objects of a name are one object.
+        **of_format
+            Options that the format of the file alone has. Of a building (.ifc): `storeys`, names
+            of the storeys whose elements are read.
 
         Returns
         -------
@@ -245,12 +246,12 @@ class Scene:
             window=window,
             epsg=epsg,
             sag_m=sag_m,
-            storeys=storeys,
             assets=assets,
             geometry=geometry,
             keyframe=keyframe,
             groups=groups,
             exclude=exclude,
+            **of_format,
         )
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")

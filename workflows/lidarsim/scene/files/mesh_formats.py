@@ -9,14 +9,16 @@ here imports these packages. Endings that no table has are looked up among plug-
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
-from ...base.errors import LidarError
+from ...base.errors import LidarError, prefixed
 from ...base.plugins import Plugin, find_plugin, plugins_of
 from .scene_graph import Content, ReadOptions
 
@@ -56,8 +58,10 @@ class MeshFormat:
         Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
     models
         Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
-    storeys
-        Whether files are buildings, whose reader takes `ReadOptions.storeys`.
+    options
+        Dataclass of the options that the reader alone has, or its name, "module:Class"; None for
+        a reader without such options. The reader gets an instance, `ReadOptions.own`. Options
+        have defaults; None means that an option is not given.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -73,7 +77,7 @@ class MeshFormat:
     collisions: bool = False
     roads: bool = False
     models: bool = False
-    storeys: bool = False
+    options: type | str | None = None
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -85,13 +89,26 @@ class MeshFormat:
         assert self.read is not None, "of a format that is read"
         if not isinstance(self.read, str):
             return self.read
-        reader: MeshReader
-        if self.plugin is not None:
-            reader = replace(self.plugin, value=self.read).load(Callable)  # type: ignore[arg-type]
-        else:
-            module, _, function = self.read.partition(":")
-            reader = getattr(import_module(module), function)
+        reader: MeshReader = self._named(self.read, Callable)
         return reader
+
+    @property
+    def own_options(self) -> type | None:
+        """Dataclass of the options of the reader; a dataclass given by its name is imported.
+
+        LidarError if the dataclass of a plug-in cannot be imported.
+        """
+        if not isinstance(self.options, str):
+            return self.options
+        options: type = self._named(self.options, type)
+        return options
+
+    def _named(self, name: str, kind: Any) -> Any:
+        """Return an object by its name, "module:object"; of a plug-in, of a kind."""
+        if self.plugin is not None:
+            return replace(self.plugin, value=name).load(kind)
+        module, _, attribute = name.partition(":")
+        return getattr(import_module(module), attribute)
 
 
 _GLTF = "lidarsim.scene.files.gltf:read_gltf"
@@ -229,6 +246,53 @@ def _row_of_plugin(plugin: Plugin) -> MeshFormat:
 def plugin_endings() -> tuple[str, ...]:
     """Return the endings that plug-ins read."""
     return tuple(plugins_of(GROUP))
+
+
+def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> Any:
+    """Return the options of a format's reader, an instance of its dataclass, or None.
+
+    Parameters
+    ----------
+    row
+        The format of the file.
+    path
+        The file, for the error.
+    given
+        {name of an option: value}; None for an option that is left out.
+
+    Raises
+    ------
+    LidarError
+        If the format lacks an option, with the formats that have it, or a value is refused.
+    """
+    kind = row.own_options
+    names = _option_names(row)
+    values = {name: value for name, value in given.items() if value is not None}
+    for name in values:
+        if name not in names:
+            having = endings_with(name)
+            instead = f", or give a file that has it ({' '.join(having)})" if having else ""
+            raise LidarError(f"{path} has no {name}: leave out {name}{instead}.")
+    if kind is None:
+        return None
+    with prefixed(path):
+        return kind(**values)
+
+
+def _option_names(row: MeshFormat) -> tuple[str, ...]:
+    """Return the names of the options that a format's reader alone has."""
+    kind = row.own_options
+    return () if kind is None else tuple(entry.name for entry in fields(kind))
+
+
+def endings_with(option: str) -> tuple[str, ...]:
+    """Return the endings of the formats whose readers have an option, also those of plug-ins."""
+    found = list(endings(lambda row: option in _option_names(row)))
+    for ending, plugins in plugins_of(GROUP).items():
+        with suppress(LidarError):  # a plug-in that cannot be used has no options
+            if any(option in _option_names(_row_of_plugin(plugin)) for plugin in plugins):
+                found.append(ending)
+    return tuple(found)
 
 
 def advice_on(path: str | Path) -> str:

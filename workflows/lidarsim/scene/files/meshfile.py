@@ -38,6 +38,7 @@ from .mesh_formats import (
     endings_for,
     format_of,
     missing_packages,
+    options_of,
     plugin_endings,
 )
 from .scene_graph import (
@@ -109,7 +110,6 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     sag_m: Annotated[float, Field(gt=0, le=1)] | None = None,
-    storeys: Annotated[Sequence[str], Field(min_length=1)] | None = None,
     assets: str | Path | Sequence[Path] | None = None,
     animation: str | None = None,
     geometry: Geometry | None = None,
@@ -118,6 +118,7 @@ def load_objects(
     exclude: Sequence[str] = (),
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
+    **of_format: Any,
 ) -> Objects:
     """Read all objects of a mesh file.
 
@@ -141,8 +142,6 @@ def load_objects(
     sag_m
         Of roads (.xodr): largest distance of triangles from curves in plan, metres, above 0 to 1;
         heights are ten times as exact. None takes 0.01.
-    storeys
-        Of a building (.ifc): names of the storeys whose elements are read. None takes all elements.
     animation
         Name of the animation to play by the meshes, or the number of an animation without a name;
         "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
@@ -157,6 +156,9 @@ def load_objects(
     axes
         Called with a line on axes that a file did not state, or that were rotated; by default this
         module's logger gets the line, as a warning if the scene seems to lie on its side.
+    **of_format
+        Options that the format of the file alone has, such as `storeys` of `IfcOptions`; see
+        `MeshFormat.options`.
 
     Returns
     -------
@@ -180,11 +182,7 @@ def load_objects(
             f"({' '.join(endings(lambda row: row.roads))})."
         )
     model = _model_options(path, row, keyframe, groups, exclude)
-    if storeys is not None and not row.storeys:
-        raise LidarError(
-            f"{path} has no storeys: leave out storeys, or give a building "
-            f"({' '.join(endings(lambda row: row.storeys))})."
-        )
+    own = options_of(row, path, of_format)
     if row.raster:  # the reader of rasters converts the unit itself
         unit = None
     asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
@@ -198,7 +196,7 @@ def load_objects(
         collisions=geometry == "collision",
         sag_m=sag_m,
         model=model,
-        storeys=None if storeys is None else tuple(storeys),
+        own=own,
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):

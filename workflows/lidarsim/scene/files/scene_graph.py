@@ -87,9 +87,7 @@ class ReadOptions(NamedTuple):
     model: ModelOptions = ModelOptions()
     skins_at_rest: bool = False  # meshes that a skeleton moves, which else are refused
     sag_m: float | None = None  # tolerance of triangles along curves; None for the reader's
-    storeys: tuple[str, ...] | None = (
-        None  # names of the storeys to read, of buildings; None for all
-    )
+    own: Any = None  # options of this format alone, an instance of `MeshFormat.options`
 
     def allows(self, file: Path) -> bool:
         """Return True if a file that the mesh file names may be read."""
