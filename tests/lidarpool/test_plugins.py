@@ -12,7 +12,10 @@ from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.export.format_table import row_of
 from lidarpool.export.formats import Format
+from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.schema import scenario_schema
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
@@ -84,7 +87,39 @@ def test_a_plugin_has_options_of_its_own(tmp_path, distribution):
     assert Scene.load(path, size_m=3.0).vertices.max() == 3
     assert "above 0" in refused(Scene.load, path, size_m=0.0)
     told = refused(Scene.load, write(tmp_path / "a.obj", "v 0 0 0\n"), size_m=3.0)
-    assert "a.obj has no size_m: leave out size_m, or give a file that has it (.sized)." in told
+    assert "a.obj has no size_m, an option of .sized: leave out size_m." in told
+
+
+def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
+    mesh(distribution, "scenario-mesh", "sized", SIZED)
+    write(tmp_path / "a.sized", "anything")
+
+    def scene(entry):
+        data = {"scene": [entry], "poses": [[0, 0, 1]]}
+        return build(Scenario.from_data(data, folder=tmp_path)).scene
+
+    assert scene({"file": "a.sized", "size_m": 3.0}).vertices.max() == 3
+    told = refused(scene, {"file": "a.sized", "size_m": 0})
+    assert told == "scenario: scene.files[0].size_m is 0; it must be above 0, at most 100."
+    told = refused(scene, {"file": "a.obj", "size_m": 3})
+    assert "scene.files[0]: a.obj has no size_m, an option of .sized: leave out size_m." in told
+    assert scenario_schema()["$defs"]["MeshFile"]["properties"]["size_m"]["maximum"] == 100
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "message"),
+    [
+        ("unchecked", "size_m: float = 1.0", "are no dataclass with checked_fields"),
+        ("no-default", "size_m: float", "have no default for size_m"),
+        ("shared", "unit: str = 'm'", "have unit, an option of all formats"),
+    ],
+)
+def test_options_of_a_plugin_that_cannot_be_used(tmp_path, distribution, name, fields, message):
+    text = SIZED.replace("    size_m: Annotated", f"    {fields}\n    other_m: Annotated")
+    text = text.replace("@checked_fields\n", "") if name == "unchecked" else text
+    mesh(distribution, f"flawed-{name}", name, text)
+    path = write(tmp_path / f"a.{name}", "anything")
+    assert f"has options that {message}" in refused(Scene.load, path)
 
 
 def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distribution):

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.base.arrays import AnyArray, Floats
-from lidarsim.base.declared import about
+from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.extras import install_command
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
@@ -78,14 +78,15 @@ class IfcOptions:
     """Options of buildings."""
 
     storeys: Annotated[
-        Annotated[Sequence[str], Field(min_length=1)] | None,
+        Annotated[Several[Text], Field(min_length=1)] | None,
         about("of a building (.ifc): take only the elements of these storeys"),
     ] = None
 
 
 def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the elements of a building, all or of the storeys in `options.own`."""
-    storeys = options.own.storeys
+    own: IfcOptions = options.own
+    storeys = own.storeys
     is_packed = path.suffix.lower() == ".ifczip"
     if not is_packed and b"ISO-10303-21" not in data:
         raise ValueError("it does not begin with ISO-10303-21")

@@ -152,6 +152,30 @@ def shown_readably(function: F) -> F:
     return function
 
 
+def with_fields_of(kind: type) -> Callable[[F], F]:
+    """Let the readable signature of a function list the fields of a dataclass before `**options`.
+
+    Examples
+    --------
+    >>> from dataclasses import make_dataclass
+    >>> @with_fields_of(make_dataclass("Reading", [("unit", str, "m")], kw_only=True))
+    ... def load(path: str, **options: Any) -> None: ...
+    >>> inspect.signature(load)
+    <Signature (path: str, *, unit: str = 'm', **options: Any) -> None>
+    """
+
+    def decorated(function: F) -> F:
+        signature = readable(inspect.signature(function), function.__globals__)
+        *parameters, options = signature.parameters.values()
+        fields = inspect.signature(kind).parameters.values()
+        function.__signature__ = signature.replace(  # type: ignore[attr-defined]
+            parameters=[*parameters, *fields, options]
+        )
+        return function
+
+    return decorated
+
+
 def _shown(default: Any) -> Any:
     """Return a default, or its name if it is a function, which would be shown with its address."""
     if inspect.isroutine(default):

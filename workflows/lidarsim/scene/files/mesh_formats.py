@@ -9,9 +9,9 @@ here imports these packages. Endings that no table has are looked up among plug-
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
 from itertools import chain
@@ -20,9 +20,14 @@ from typing import Any
 
 from ...base.errors import LidarError, prefixed
 from ...base.plugins import Plugin, find_plugin, plugins_of
+from ...base.sections import is_section
+from ...base.words import did_you_mean, joined
+from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions
 
 GROUP = "lidarsim.meshes"
+
+_SHARED = tuple(entry.name for entry in fields(MeshOptions))
 
 # Reader of the content of a file, with its path and options. It raises `MeshFileError` for
 # content that it does not support, and any other error for a broken file.
@@ -42,7 +47,7 @@ class MeshFormat:
     advice
         Advice on files of a format that is not read, as a clause; empty if the format is read.
     animated
-        Whether the reader can bake an animation.
+        Whether the reader can bake an animation, `ReadOptions.animation`.
     unitless
         Whether files state no unit, nor does the format.
     signatures
@@ -50,18 +55,11 @@ class MeshFormat:
         advises to use one of these endings.
     from_path
         Whether the reader opens the path itself: it gets the first bytes of the file only.
-    raster
-        Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
-    collisions
-        Whether files may have shapes for collisions, see `ReadOptions.collisions`.
-    roads
-        Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
-    models
-        Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
     options
-        Dataclass of the options that the reader alone has, or its name, "module:Class"; None for
-        a reader without such options. The reader gets an instance, `ReadOptions.own`. Options
-        have defaults; None means that an option is not given.
+        Dataclass of the options that the format alone has, or its name, "module:Class"; None for
+        a format without such options. The reader gets an instance, `ReadOptions.own`. Options
+        have defaults; None means that an option is not given. Scenarios have the options that are
+        described by `about`; others are arguments in Python only.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -73,10 +71,6 @@ class MeshFormat:
     unitless: bool = False
     signatures: tuple[bytes, ...] = ()
     from_path: bool = False
-    raster: bool = False
-    collisions: bool = False
-    roads: bool = False
-    models: bool = False
     options: type | str | None = None
     plugin: Plugin | None = field(default=None, compare=False)
 
@@ -94,13 +88,18 @@ class MeshFormat:
 
     @property
     def own_options(self) -> type | None:
-        """Dataclass of the options of the reader; a dataclass given by its name is imported.
+        """Dataclass of the options of the format; a dataclass given by its name is imported.
 
-        LidarError if the dataclass of a plug-in cannot be imported.
+        LidarError if the dataclass of a plug-in cannot be imported or used.
         """
-        if not isinstance(self.options, str):
-            return self.options
-        options: type = self._named(self.options, type)
+        options = self.options
+        if isinstance(options, str):
+            options = self._named(options, type)
+        if options is not None and self.plugin is not None and (flaw := _flaw(options)):
+            raise LidarError(
+                f"{self.plugin} has options that {flaw}: install another version of "
+                f"{self.plugin.distribution}."
+            )
         return options
 
     def _named(self, name: str, kind: Any) -> Any:
@@ -109,6 +108,18 @@ class MeshFormat:
             return replace(self.plugin, value=name).load(kind)
         module, _, attribute = name.partition(":")
         return getattr(import_module(module), attribute)
+
+
+def _flaw(options: type) -> str:
+    """Return why a class cannot be the options of a format, as a clause; empty if it can."""
+    if not (is_dataclass(options) and is_section(options)):
+        return "are no dataclass with checked_fields"
+    for entry in fields(options):
+        if entry.default is MISSING:
+            return f"have no default for {entry.name}"
+        if entry.name in _SHARED:
+            return f"have {entry.name}, an option of all formats"
+    return ""
 
 
 _GLTF = "lidarsim.scene.files.gltf:read_gltf"
@@ -248,8 +259,8 @@ def plugin_endings() -> tuple[str, ...]:
     return tuple(plugins_of(GROUP))
 
 
-def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> Any:
-    """Return the options of a format's reader, an instance of its dataclass, or None.
+def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
+    """Return the options for reading a file: the shared options, and those of its format.
 
     Parameters
     ----------
@@ -260,39 +271,74 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> Any:
     given
         {name of an option: value}; None for an option that is left out.
 
+    Returns
+    -------
+    The shared options, and an instance of the dataclass of the format, or None if the format has
+    no options of its own.
+
     Raises
     ------
     LidarError
         If the format lacks an option, with the formats that have it, or a value is refused.
     """
-    kind = row.own_options
-    names = _option_names(row)
     values = {name: value for name, value in given.items() if value is not None}
-    for name in values:
-        if name not in names:
-            having = endings_with(name)
-            instead = f", or give a file that has it ({' '.join(having)})" if having else ""
-            raise LidarError(f"{path} has no {name}: leave out {name}{instead}.")
-    if kind is None:
-        return None
-    with prefixed(path):
-        return kind(**values)
-
-
-def _option_names(row: MeshFormat) -> tuple[str, ...]:
-    """Return the names of the options that a format's reader alone has."""
+    if problem := lacking(path, row, values):
+        raise LidarError(f"{path} {problem}")
+    own_values = {name: value for name, value in values.items() if name not in _SHARED}
+    shared_values = {name: value for name, value in values.items() if name in _SHARED}
     kind = row.own_options
-    return () if kind is None else tuple(entry.name for entry in fields(kind))
+    with prefixed(path):
+        return MeshOptions(**shared_values), None if kind is None else kind(**own_values)
 
 
-def endings_with(option: str) -> tuple[str, ...]:
-    """Return the endings of the formats whose readers have an option, also those of plug-ins."""
-    found = list(endings(lambda row: option in _option_names(row)))
-    for ending, plugins in plugins_of(GROUP).items():
-        with suppress(LidarError):  # a plug-in that cannot be used has no options
-            if any(option in _option_names(_row_of_plugin(plugin)) for plugin in plugins):
-                found.append(ending)
-    return tuple(found)
+def lacking(path: str | Path, row: MeshFormat | None, options: Iterable[str]) -> str:
+    """Return a clause on options that a file does not have by its format; empty if it has all.
+
+    The clause follows the name of the file, and names the formats that have the options.
+    """
+    names = option_names(row)
+    lacks = [name for name in options if name not in names]
+    if not lacks:
+        return ""
+    groups: dict[str, list[str]] = {}  # {endings of formats that have them: options}
+    for name in lacks:
+        groups.setdefault(" ".join(_endings_with(name)), []).append(name)
+    parts = []
+    for having, group in groups.items():
+        kind = "options" if group[1:] else "an option"
+        parts.append(f"no {joined(group)}" + (f", {kind} of {having}" if having else ""))
+    hint = did_you_mean(groups[""][0], names) if "" in groups else ""
+    return f"has {'; '.join(parts)}: leave out {joined(lacks)}.{hint}"
+
+
+def option_names(row: MeshFormat | None) -> tuple[str, ...]:
+    """Return the names of all options of a format, shared and own; of None the shared options."""
+    if row is None:
+        return _SHARED
+    shared = _SHARED if row.animated else tuple(name for name in _SHARED if name != "animation")
+    kind = row.own_options
+    return shared if kind is None else (*shared, *(entry.name for entry in fields(kind)))
+
+
+def _endings_with(option: str) -> list[str]:
+    """Return the endings of the formats, also of plug-ins, that have an option."""
+    return [
+        ending
+        for row in formats_with_plugins()
+        if option in option_names(row)
+        for ending in row.endings
+    ]
+
+
+def formats_with_plugins() -> Iterator[MeshFormat]:
+    """Yield the formats that are read, also those of plug-ins that can be used."""
+    yield from _formats_read()
+    for plugins in plugins_of(GROUP).values():
+        for plugin in plugins:
+            with suppress(LidarError):
+                row = _row_of_plugin(plugin)
+                row.own_options  # noqa: B018 - raises LidarError if they cannot be used
+                yield row
 
 
 def advice_on(path: str | Path) -> str:
