@@ -2,6 +2,7 @@
 
 import pickle
 from inspect import signature
+from typing import get_args
 
 import pytest
 
@@ -9,8 +10,9 @@ from lidarpool import LidarError
 from lidarpool.scenario.campaign_jobs import ScenarioJobs
 from lidarpool.scenario.field_paths import find_field, replace_value
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.scene.files.mesh_formats import known_formats
-from lidarsim.scene.files.mesh_options import MeshOptions
+from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions
 from lidarsim.scene.scene import Scene
 
 
@@ -91,3 +93,7 @@ def test_each_option_of_a_format_has_a_default_and_a_name_of_its_own():
     for row in with_options:
         assert row.own_options() is not None
         assert not shared & {*signature(row.own_options).parameters}
+
+
+def test_units_of_files_are_those_of_the_vocabulary():
+    assert get_args(get_args(get_args(LengthUnit)[0])[0]) == tuple(UNITS_M)

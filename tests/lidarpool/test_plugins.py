@@ -116,6 +116,7 @@ def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
 )
 def test_options_of_a_plugin_that_cannot_be_used(tmp_path, distribution, name, fields, message):
     text = SIZED.replace("    size_m: Annotated", f"    {fields}\n    other_m: Annotated")
+    text = text.replace(".sized", f".{name}")
     text = text.replace("@checked_fields\n", "") if name == "unchecked" else text
     mesh(distribution, f"flawed-{name}", name, text)
     path = write(tmp_path / f"a.{name}", "anything")

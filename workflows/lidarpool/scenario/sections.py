@@ -43,6 +43,7 @@ from lidarsim.base.sections import fields_of
 from lidarsim.base.validation import STRICT
 from lidarsim.base.vocabulary import BACKENDS
 from lidarsim.scene.files.mesh_formats import (
+    endings,
     format_of,
     formats_with_plugins,
     lacking,
@@ -93,10 +94,8 @@ class MeshFile(Section):
     file: Annotated[
         str,
         about(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), roads of "
-            "OpenDRIVE (.xodr), buildings of IFC (.ifc), voxels of AMAPVox (.vox), a world of "
-            "Gazebo (.sdf), a model of MuJoCo (.xml), a robot that stands still (.urdf), or a "
-            "raster of heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
+            f"a mesh file or a raster of heights, {' '.join(endings())}, or a robot that stands "
+            "still (.urdf); from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
@@ -136,7 +135,7 @@ class MeshFile(Section):
             if further and not isinstance(file, str):  # the error is the missing name of the file
                 return handler({name: v for name, v in value.items() if name not in further})
             if further:
-                problem = lacking(file, row, [name for name in value if name in further])
+                problem = lacking(row, [name for name in value if name in further])
                 raise ValueError(f"{file} {problem}")
         except LidarError as error:  # of a plug-in
             raise ValueError(str(error)) from error
@@ -150,7 +149,7 @@ class MeshFile(Section):
     def kinds() -> list[type[MeshFile]]:
         """Return the sections of files of all formats with options, also those of plug-ins."""
         options = dict.fromkeys(row.own_options for row in formats_with_plugins())
-        return [_kind_of_file(kind) for kind in options if kind is not None]
+        return [kind for kind in map(_kind_of_file, options) if kind is not MeshFile]
 
     @property
     def reading_options(self) -> dict[str, Any]:

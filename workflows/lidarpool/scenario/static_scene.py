@@ -45,8 +45,8 @@ from .sections import (
     file_states,
 )
 
-# Fields of a mesh file's entry that are refused if the file is a robot.
-_REFUSED_OF_ROBOTS = {"unit", "up_axis"}
+# Fields of a mesh file's entry that are allowed if the file is a robot.
+_ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}
 
 
 @dataclass
@@ -269,7 +269,7 @@ class Shapes:
 
     def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
         """Return the links of a robot as static objects, with the joints at zero."""
-        if refused_fields := sorted(entry.model_fields_set & _REFUSED_OF_ROBOTS):
+        if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
                 f"out {' and '.join(refused_fields)}."

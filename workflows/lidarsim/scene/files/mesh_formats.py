@@ -282,7 +282,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
         If the format lacks an option, with the formats that have it, or a value is refused.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    if problem := lacking(path, row, values):
+    if problem := lacking(row, values):
         raise LidarError(f"{path} {problem}")
     own_values = {name: value for name, value in values.items() if name not in _SHARED}
     shared_values = {name: value for name, value in values.items() if name in _SHARED}
@@ -291,7 +291,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
         return MeshOptions(**shared_values), None if kind is None else kind(**own_values)
 
 
-def lacking(path: str | Path, row: MeshFormat | None, options: Iterable[str]) -> str:
+def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
     """Return a clause on options that a file does not have by its format; empty if it has all.
 
     The clause follows the name of the file, and names the formats that have the options.

@@ -12,18 +12,17 @@ from typing import Annotated, Literal
 
 from ...base.declared import about
 from ...base.validation import checked_fields
-from ...base.vocabulary import UNITS_M
-from ..transform import UP_AXES, Transform
+from ..transform import Transform
 
 LengthUnit = Annotated[
-    Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
+    Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # of UNITS_M
     about(
         "length unit of the file, or of a raster's heights; by default the one it states, else "
         "metres"
     ),
 ]
 UpAxis = Annotated[
-    Literal[tuple(UP_AXES)] | None,  # type: ignore[valid-type]
+    Literal["x", "y", "z"] | None,
     about("axis of the file that points up; by default that of its format"),
 ]
 OpacityMode = Literal["mask", "ignore"]
