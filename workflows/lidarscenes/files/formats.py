@@ -14,7 +14,6 @@ _RASTER = "lidarscenes.files.rasters:read_raster"
 _RASTER_OPTIONS = "lidarscenes.files.rasters:RasterOptions"
 _IFC = "lidarscenes.files.ifc:read_ifc"
 _IFC_OPTIONS = "lidarscenes.files.ifc:IfcOptions"
-_TOY = "lidarscenes.files.toy"
 _GAZEBO = "lidarscenes.gazebo.world"
 _ROADS = "lidarscenes.roads.opendrive"
 _MUJOCO = "lidarscenes.mujoco.model_file"
@@ -26,7 +25,6 @@ MESH_FORMATS = (
     MeshFormat((".dae",), "lidarscenes.files.dae:read_dae"),
     MeshFormat((".3mf",), "lidarscenes.files.threemf:read_3mf", signatures=(_ZIP,)),
     MeshFormat((".vox",), "lidarscenes.files.vox:read_vox"),
-    MeshFormat((".toy",), f"{_TOY}:read_toy", options=f"{_TOY}:ToyOptions"),
     MeshFormat((".usd",), _USD, animated=True, signatures=(_CRATE, _USD_TEXT)),
     MeshFormat((".usda",), _USD, animated=True, signatures=(_USD_TEXT,)),
     MeshFormat((".usdc",), _USD, animated=True, signatures=(_CRATE,)),
