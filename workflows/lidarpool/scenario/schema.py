@@ -33,7 +33,11 @@ class _Plain(GenerateJsonSchema):
         for kind in kinds_of(schema["cls"]):
             reference = self.generate_inner(kind.__pydantic_core_schema__)["$ref"]
             further = self.get_schema_from_definitions(JsonRef(reference)) or {}
-            result["properties"] = further["properties"] | result["properties"]
+            for name, content in further["properties"].items():
+                other = result["properties"].setdefault(name, content)
+                if other != content:  # options of the same name of two formats
+                    choice = {"anyOf": [other, content], "description": content["description"]}
+                    result["properties"][name] = choice
         return result
 
     def dataclass_schema(self, schema: Any) -> dict[str, Any]:
