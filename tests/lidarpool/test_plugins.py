@@ -106,6 +106,15 @@ def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
     assert scenario_schema()["$defs"]["MeshFile"]["properties"]["size_m"]["maximum"] == 100
 
 
+def test_an_option_of_two_formats_has_the_limits_of_the_file(distribution):
+    mesh(distribution, "sag-mesh", "sized", SIZED.replace("size_m", "sag_m"))
+    schema = scenario_schema()["$defs"]["MeshFile"]["properties"]["sag_m"]
+    assert [entry["maximum"] for entry in schema["anyOf"]] == [1, 100]
+    Scenario.from_data({"scene": [{"file": "a.sized", "sag_m": 90}]})
+    told = refused(Scenario.from_data, {"scene": [{"file": "a.xodr", "sag_m": 90}]})
+    assert "sag_m is 90; it must be at most 1." in told
+
+
 @pytest.mark.parametrize(
     ("name", "fields", "message"),
     [

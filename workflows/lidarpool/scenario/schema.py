@@ -29,7 +29,9 @@ class _Plain(GenerateJsonSchema):
 
     def model_schema(self, schema: Any) -> dict[str, Any]:
         # pydantic 2.12 leaves out the docstrings of models that are dataclasses as well.
-        result = {"description": inspect.getdoc(schema["cls"])} | super().model_schema(schema)
+        result: dict[str, Any] = {
+            "description": inspect.getdoc(schema["cls"])
+        } | super().model_schema(schema)
         for kind in kinds_of(schema["cls"]):
             reference = self.generate_inner(kind.__pydantic_core_schema__)["$ref"]
             further = self.get_schema_from_definitions(JsonRef(reference)) or {}
