@@ -60,7 +60,10 @@ def test_a_misspelt_option_in_python(tmp_path):
         Scene.load(tmp_path / "a.obj", opactiy="mask")
     with pytest.raises(LidarError, match="unit is 'mile'"):
         Scene.load(tmp_path / "a.obj", unit="mile")
-    assert {*signature(MeshOptions).parameters} < {*signature(Scene.load).parameters}
+    with pytest.raises(LidarError, match="a scene plays no animation: leave out animation"):
+        Scene.load(tmp_path / "a.glb", animation="Walk")
+    of_scenes = {*signature(MeshOptions).parameters} - {"animation"}
+    assert of_scenes < {*signature(Scene.load).parameters}
 
 
 def test_scenarios_with_options_are_compared_and_stored(tmp_path):

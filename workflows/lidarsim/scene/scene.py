@@ -153,7 +153,7 @@ class Scene:
         return cls.from_meshes(seed_objects())
 
     @classmethod
-    @with_fields_of(MeshOptions)
+    @with_fields_of(MeshOptions, without=("animation",))
     def load(
         cls,
         path: str | Path,
@@ -211,6 +211,11 @@ class Scene:
         LidarError
             If the file cannot be read completely, has no triangles, or lacks an option.
         """
+        if options.get("animation") is not None:
+            raise LidarError(
+                f"{path}: a scene plays no animation: leave out animation, and give an Actor the "
+                "meshes of load_objects(path, animation=…), joined by join_meshes."
+            )
         objects = load_objects(path, **options)
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")
