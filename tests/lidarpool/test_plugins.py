@@ -14,11 +14,15 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
 from lidarpool.clouds.formats import Format
 from lidarpool.recordings.recordings import open_recording
+from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.schema import scenario_schema
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.scene import Scene
 
 # A mesh of one triangle, whatever is in the file.
 TRIANGLE = """
@@ -57,6 +61,78 @@ def test_a_plugin_reads_files_of_its_ending(tmp_path, distribution):
     mesh(distribution, "plain-mesh", "plain", TRIANGLE.format(ending="plain"))
     (triangle,) = load_meshes(write(tmp_path / "a.PLAIN", "anything"))
     assert triangle.name == "Triangle"
+
+
+SIZED = """
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from lidarsim.plugins import Content, MeshFormat, SceneMesh, about, checked_fields
+
+@dataclass(frozen=True)
+@checked_fields
+class SizedOptions:
+    size_m: Annotated[float, about("length of the edges, metres", gt=0, le=100)] = 1.0
+
+def read(data, path, wanted):
+    mesh = SceneMesh("Triangle", wanted.own.size_m * np.eye(3), np.array([[0, 1, 2]]))
+    return Content([mesh], unit_m=1.0, up_axis="z")
+
+FORMAT = MeshFormat((".sized",), read, options=SizedOptions)
+"""
+
+
+def test_a_plugin_has_options_of_its_own(tmp_path, distribution):
+    mesh(distribution, "sized-mesh", "sized", SIZED)
+    path = write(tmp_path / "a.sized", "anything")
+    assert load_meshes(path)[0].vertices.max() == 1
+    assert Scene.load(path, size_m=3.0).vertices.max() == 3
+    assert "above 0" in refused(Scene.load, path, size_m=0.0)
+    told = refused(Scene.load, write(tmp_path / "a.obj", "v 0 0 0\n"), size_m=3.0)
+    assert "a.obj has no size_m, an option of .sized: leave out size_m." in told
+
+
+def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
+    mesh(distribution, "scenario-mesh", "sized", SIZED)
+    write(tmp_path / "a.sized", "anything")
+
+    def scene(entry):
+        data = {"scene": [entry], "poses": [[0, 0, 1]]}
+        return build(Scenario.from_data(data, folder=tmp_path)).scene
+
+    assert scene({"file": "a.sized", "size_m": 3.0}).vertices.max() == 3
+    told = refused(scene, {"file": "a.sized", "size_m": 0})
+    assert told == "scenario: scene.files[0].size_m is 0; it must be above 0, at most 100."
+    told = refused(scene, {"file": "a.obj", "size_m": 3})
+    assert "scene.files[0]: a.obj has no size_m, an option of .sized: leave out size_m." in told
+    assert scenario_schema()["$defs"]["MeshFile"]["properties"]["size_m"]["maximum"] == 100
+
+
+def test_an_option_of_two_formats_has_the_limits_of_the_file(distribution):
+    mesh(distribution, "sag-mesh", "sized", SIZED.replace("size_m", "sag_m"))
+    schema = scenario_schema()["$defs"]["MeshFile"]["properties"]["sag_m"]
+    assert [entry["maximum"] for entry in schema["anyOf"]] == [1, 100]
+    Scenario.from_data({"scene": [{"file": "a.sized", "sag_m": 90}]})
+    told = refused(Scenario.from_data, {"scene": [{"file": "a.xodr", "sag_m": 90}]})
+    assert "sag_m is 90; it must be at most 1." in told
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "message"),
+    [
+        ("unchecked", "size_m: float = 1.0", "are no dataclass with checked_fields"),
+        ("no-default", "size_m: float", "have no default for size_m"),
+        ("shared", "unit: str = 'm'", "have unit, an option of all formats"),
+    ],
+)
+def test_options_of_a_plugin_that_cannot_be_used(tmp_path, distribution, name, fields, message):
+    text = SIZED.replace("    size_m: Annotated", f"    {fields}\n    other_m: Annotated")
+    text = text.replace(".sized", f".{name}")
+    text = text.replace("@checked_fields\n", "") if name == "unchecked" else text
+    mesh(distribution, f"flawed-{name}", name, text)
+    path = write(tmp_path / f"a.{name}", "anything")
+    assert f"has options that {message}" in refused(Scene.load, path)
 
 
 def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distribution):

@@ -167,8 +167,11 @@ def test_a_scenario_takes_the_options(room):
         ({"keyframe": "hom"}, "no keyframe 'hom'. Did you mean 'home'"),
         ({"exclude": ["flor"]}, "no body or geom 'flor'. Did you mean 'floor'"),
         ({"groups": [5]}, r"sees in the groups \(5,\)"),
-        ({"file": "meshes/wedge.obj"}, "is no model of MuJoCo: leave out keyframe, groups"),
-        ({"geometry": "collision"}, "has no shapes for collisions"),
+        (
+            {"file": "meshes/wedge.obj"},
+            "wedge.obj has no keyframe, groups and exclude, options of .xml",
+        ),
+        ({"geometry": "collision"}, "room.xml has no geometry, an option of .sdf .world"),
     ):
         with pytest.raises(LidarError, match=message):
             changed = {**data, "scene": {"files": [{**entry, **change}]}}

@@ -250,7 +250,7 @@ def test_tolerance_of_curves(tmp_path):
         radii = np.hypot(middles[..., 0], middles[..., 1] - 50)
         assert np.abs(radii - [[50], [54]]).max() <= sag
     assert counts[0.001] > 2.5 * counts[0.01] > 6 * counts[0.1]
-    with pytest.raises(LidarError, match="has no curves that are read: leave out sag_m"):
+    with pytest.raises(LidarError, match=r"has no sag_m, an option of \.xodr: leave out sag_m"):
         Scene.load(_obj(tmp_path), sag_m=0.01)
 
 

@@ -327,12 +327,14 @@ def test_garbled_files_are_read_or_refused_in_a_line(tmp_path, data, suffix):
 
 def test_options_of_others_are_refused(tmp_path):
     (tmp_path / "m.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
-    with pytest.raises(LidarError, match="is no raster: leave out step_m and window"):
+    with pytest.raises(LidarError, match=r"no step_m and window, options of \.tif .* leave out"):
         load_meshes(tmp_path / "m.off", step_m=2, window=(0, 0, 1, 1))
     with pytest.raises(LidarError, match="is a raster, whose heights are z"):
         load_meshes(write(tmp_path / "m.tif"), up_axis="y")
     with pytest.raises(LidarError, match=r"window is .* \[x0, y0, x1, y1\]"):
         Scenario.from_data({"scene": {"files": [{"file": "m.tif", "window": [1, 0, 0, 1]}]}})
+    with pytest.raises(LidarError, match="has no epsg, an option of"):
+        load_meshes(tmp_path / "m.off", epsg=25832)
     complex_one = write(tmp_path / "c.tif", SLOPE.astype(np.complex64))
     with pytest.raises(LidarError, match="type complex64, which are no heights"):
         read(complex_one)

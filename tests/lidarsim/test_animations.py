@@ -287,7 +287,7 @@ def test_a_chain_of_many_joints(tmp_path):
 
 def test_only_gltf_has_animations(tmp_path):
     path = write(tmp_path / "m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(LidarError, match=r"has no animations that are read: give a .glb"):
+    with pytest.raises(LidarError, match=r"has no animation, an option of \.glb \.gltf"):
         load_objects(path, animation="Walk")
 
 

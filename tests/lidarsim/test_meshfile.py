@@ -309,7 +309,7 @@ def test_each_format_that_is_read_has_a_reader():
     assert all(callable(row.reader) for row in rows)
     named = [ending for row in known_formats() for ending in row.endings]
     assert len(named) == len({*named})
-    assert {*endings(lambda row: row.raster)} == {*rasters.DRIVERS}
+    assert {*endings(lambda row: row.own_options is rasters.RasterOptions)} == {*rasters.DRIVERS}
 
 
 def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatch):

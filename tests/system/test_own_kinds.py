@@ -93,7 +93,7 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
 
 
 @pytest.mark.usefixtures("pictures")
-def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result):
+def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result, local_client):
     told = repr(result)
     assert told.startswith("survey: 60 scans (60 sweeps), 28,800 rays")
     assert (
@@ -106,7 +106,7 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     assert list(frame) == [*"xyz", "scan", "channel", "object", "brightness", *frame.columns[7:]]
     np.testing.assert_array_equal(frame["z"], cloud.positions[:, 2])
     assert lazy.npartitions == sum(rows > 0 for rows in result.points.rows)
-    np.testing.assert_array_equal(lazy.compute()["time"], cloud["time"])
+    np.testing.assert_array_equal(local_client.compute(lazy).result()["time"], cloud["time"])
     found = to_open3d(cloud).point
     np.testing.assert_array_equal(found["positions"].numpy(), cloud.positions)
     np.testing.assert_array_equal(found["ring"].numpy()[:, 0], cloud.channel)

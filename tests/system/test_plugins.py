@@ -70,11 +70,13 @@ def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
     file = tmp_path / "walk" / "scenario.yaml"
     scenario = yaml.safe_load(file.read_text())
     scenario |= {
-        "scene": {"files": "../hall.boxes"},
+        "scene": {"files": {"file": "../hall.boxes", "grow_m": 0.01}},
         "output": {"write": ["npy", "pcap"]},
         "steps": 36,
     }
     file.write_text(yaml.safe_dump(scenario))
+    mesh_file = json.loads(lidarpool("schema"))["$defs"]["MeshFile"]
+    assert mesh_file["properties"]["grow_m"]["maximum"] == 10
     lidarpool("run", "walk/scenario.yaml", "--out", "result", "--only", "cloud", "--quiet")
 
     cloud = read_cloud(tmp_path / "result" / "cloud.ply")

@@ -1,5 +1,7 @@
 """What plug-ins of mesh files and packets import; docs/how-to/plugins.md has examples."""
 
+from .base.declared import about
+from .base.validation import checked_fields
 from .packets.encoders import Datagrams, PacketEncoder, PacketSource
 from .packets.service import Destination, Service
 from .packets.shots import CarryOver, Shots
@@ -20,4 +22,6 @@ __all__ = [
     "SceneMesh",
     "Service",
     "Shots",
+    "about",
+    "checked_fields",
 ]

@@ -21,8 +21,8 @@ def read(data: bytes, path: Path, options: ReadOptions) -> Content:
         if len(figures) != 6:
             raise MeshFileError(f"has {len(figures)} numbers in line {number}, not 6")
         position, size = np.array(figures, np.float64).reshape(2, 3)
-        meshes.append(SceneMesh(name, CORNERS * size + position, FACES))
+        meshes.append(SceneMesh(name, CORNERS * (size + options.own.grow_m) + position, FACES))
     return Content(meshes, unit_m=1.0, up_axis="z")
 
 
-FORMAT = MeshFormat((".boxes",), read)
+FORMAT = MeshFormat((".boxes",), read, options="lidar_example.mesh_options:BoxesOptions")

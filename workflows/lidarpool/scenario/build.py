@@ -19,7 +19,6 @@ from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import name_hint, plural
 from lidarsim.scene.actors import Actor, check_spray
 from lidarsim.scene.files.coordinate_systems import target_problem
-from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
 from lidarsim.sensor.materials import (
@@ -58,7 +57,7 @@ from .ground import StandingSurfaces
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .placing import Placing, place_sensor
 from .scenario import Scenario
-from .sections import CopiesSection, MeshFile, SensorSection
+from .sections import CopiesSection, SensorSection
 from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
@@ -319,17 +318,11 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
     return place_sensor(
         scene,
         sensor,
-        landscape=bool(findings.rasters) or any(map(_has_roads, scenario.scene.files)),
+        landscape=bool(findings.landscapes),
         buildings=findings.named(BUILDING),
         roads=findings.named(ROAD_SURFACE),
         narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
-
-
-def _has_roads(entry: MeshFile) -> bool:
-    """Return True if a file is a network of roads."""
-    row = format_of(entry.file)
-    return row is not None and row.roads
 
 
 def _build_traffic(

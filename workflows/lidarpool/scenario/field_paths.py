@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.field_advice import owner_of_file, owners_by_level
-from lidarsim.base.sections import fields_of, is_section, sections_in
+from lidarsim.base.sections import fields_by_name, fields_of, is_section, sections_in
 from lidarsim.base.words import did_you_mean, plural, shortened
 
 from .scenario import Scenario
@@ -64,15 +64,17 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
 
 def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[str, Any, Any]:
     """Return a field of the section at a path by its name in YAML: name, value, annotation."""
-    attributes = {
-        field.alias or attribute: attribute for attribute, field in fields_of(type(node)).items()
-    }
+    section = type(node)
+    fields = fields_of(section)
+    attributes = {field.alias or attribute: attribute for attribute, field in fields.items()}
+    if name not in attributes and name in (further := fields_by_name(section)):
+        return name, None, further[name].annotation
     if name not in attributes:
         kind = f"a field of {path}" if path else "a section of a scenario"
         hint = did_you_mean(name, attributes) or _path_hint(scenario, name)
         raise LidarError(f"{name!r} is not {kind}.{hint}")
     attribute = attributes[name]
-    return name, getattr(node, attribute, None), fields_of(type(node))[attribute].annotation
+    return name, getattr(node, attribute, None), fields[attribute].annotation
 
 
 def _path_hint(scenario: Scenario, name: str) -> str:

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic.fields import FieldInfo
-from pydantic.json_schema import GenerateJsonSchema
+from pydantic.json_schema import GenerateJsonSchema, JsonRef
 
-from lidarsim.base.sections import fields_of, is_section
+from lidarsim.base.sections import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
 from .placing import on_one_line
@@ -29,7 +29,18 @@ class _Plain(GenerateJsonSchema):
 
     def model_schema(self, schema: Any) -> dict[str, Any]:
         # pydantic 2.12 leaves out the docstrings of models that are dataclasses as well.
-        return {"description": inspect.getdoc(schema["cls"])} | super().model_schema(schema)
+        result: dict[str, Any] = {
+            "description": inspect.getdoc(schema["cls"])
+        } | super().model_schema(schema)
+        for kind in kinds_of(schema["cls"]):
+            reference = self.generate_inner(kind.__pydantic_core_schema__)["$ref"]
+            further = self.get_schema_from_definitions(JsonRef(reference)) or {}
+            for name, content in further["properties"].items():
+                other = result["properties"].setdefault(name, content)
+                if other != content:  # options of the same name of two formats
+                    choice = {"anyOf": [other, content], "description": content["description"]}
+                    result["properties"][name] = choice
+        return result
 
     def dataclass_schema(self, schema: Any) -> dict[str, Any]:
         summary, _, _ = (inspect.getdoc(schema["cls"]) or "").partition("\n\n")

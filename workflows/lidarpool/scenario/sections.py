@@ -4,18 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializeAsAny,
+    create_model,
+    model_validator,
+)
 
 from lidarsim.base.declared import (
     AngleDeg,
     Coordinate,
     Four,
     MinMax,
+    Rectangle,
     Seed,
     Several,
     Text,
@@ -29,9 +38,17 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
+from lidarsim.base.errors import LidarError
+from lidarsim.base.sections import fields_of
 from lidarsim.base.validation import STRICT
-from lidarsim.base.vocabulary import BACKENDS, UNITS_M
-from lidarsim.scene.files.meshfile import Geometry, OpacityMode
+from lidarsim.base.vocabulary import BACKENDS
+from lidarsim.scene.files.mesh_formats import (
+    endings,
+    format_of,
+    formats_with_plugins,
+    lacking,
+)
+from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions, Opacity, UpAxis
 from lidarsim.scene.transform import Transform
 from lidarsim.sensor import Mounted, Noise, Pose, Returns, Sensor
 from lidarsim.sensor.beams import Rate, Step
@@ -54,14 +71,6 @@ Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Two[Coordinate]
 
 
-def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Return a rectangle, or raise an error if its lowest x and y are not first."""
-    if sides[0] >= sides[2] or sides[1] >= sides[3]:
-        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
-    return sides
-
-
-Rectangle = Annotated[Four[Coordinate], AfterValidator(_upright)]
 Factors = Three[Factor]
 Scale = Annotated[
     Factors, short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors)
@@ -85,25 +94,14 @@ class MeshFile(Section):
     file: Annotated[
         str,
         about(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), roads of "
-            "OpenDRIVE (.xodr), buildings of IFC (.ifc), voxels of AMAPVox (.vox), a world of "
-            "Gazebo (.sdf), a model of MuJoCo (.xml), a robot that stands still (.urdf), or a "
-            "raster of heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
+            f"a mesh file or a raster of heights, {' '.join(endings())}, or a robot that stands "
+            "still (.urdf); from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
     ]
-    unit: Annotated[
-        Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
-        about(
-            "length unit of the file, or of a raster's heights; by default the one it states, else "
-            "metres"
-        ),
-    ] = None
-    up_axis: Annotated[
-        Literal["x", "y", "z"] | None,
-        about("axis of the file that points up; by default that of its format"),
-    ] = None
+    unit: LengthUnit = None
+    up_axis: UpAxis = None
     translation: Annotated[Triple, about("translation in metres, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
         Three[AngleDeg], about("rotation about the world's x, y and z axes, degrees")
@@ -112,41 +110,7 @@ class MeshFile(Section):
     matrix: Annotated[
         Four[Four[Factor]] | None, about("instead of the three: 4 rows of 4, metres")
     ] = None
-    step_m: Annotated[
-        float | None,
-        about("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
-    ] = None
-    window: Annotated[
-        Rectangle | None,
-        about("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
-    ] = None
-    sag_m: Annotated[
-        float | None,
-        about("of roads (.xodr): largest distance of triangles from curves, metres", gt=0, le=1),
-    ] = None
-    storeys: Annotated[
-        Several[Text] | None,
-        about("of a building (.ifc): take only the elements of these storeys"),
-    ] = None
-    opacity: Annotated[
-        OpacityMode,
-        about("mask: light passes where the image of a material is transparent; ignore: nowhere"),
-    ] = "mask"
-    geometry: Annotated[
-        Geometry | None,
-        about("of a world of Gazebo: its visual shapes, or those for collision", "collision"),
-    ] = None
-    keyframe: Annotated[
-        Text | None,
-        about("of a model of MuJoCo: the keyframe at which its bodies are", "home"),
-    ] = None
-    groups: Annotated[
-        Several[Annotated[int, Field(ge=0, le=5)]] | None,
-        about("of a model of MuJoCo: groups of the geoms that are seen; by default 0, 1 and 2"),
-    ] = None
-    exclude: Annotated[
-        Several[Text], about("of a model of MuJoCo: bodies and geoms that are left out")
-    ] = ()
+    opacity: Opacity = "mask"
     assets: Annotated[
         Text | None,
         about(
@@ -154,6 +118,45 @@ class MeshFile(Section):
             "..",
         ),
     ] = None
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_options(cls, value: Any, handler: Callable[[Any], MeshFile]) -> MeshFile:
+        """Validate a file with the options of its format; ValueError for those of others."""
+        if cls is not MeshFile or not isinstance(value, dict):
+            return handler(value)
+        file = value.get("file")
+        try:
+            row = format_of(file) if isinstance(file, str) else None
+            kind = MeshFile if row is None else _kind_of_file(row.own_options)
+            further = value.keys() - kind.model_fields.keys()
+            if further:  # imports the options of all formats
+                further &= {name for other in MeshFile.kinds() for name in other.model_fields}
+            if further and not isinstance(file, str):  # the error is the missing name of the file
+                return handler({name: v for name, v in value.items() if name not in further})
+            if further:
+                problem = lacking(row, [name for name in value if name in further])
+                raise ValueError(f"{file} {problem}")
+        except LidarError as error:  # of a plug-in
+            raise ValueError(str(error)) from error
+        return handler(value) if kind is MeshFile else kind.model_validate(value)
+
+    def __reduce__(self) -> Any:
+        """Return what pickle stores, since the sections of formats are made in each process."""
+        return MeshFile.model_validate, (self.model_dump(exclude_unset=True),)
+
+    @staticmethod
+    def kinds() -> list[type[MeshFile]]:
+        """Return the sections of files of all formats with options, also those of plug-ins."""
+        options = dict.fromkeys(row.own_options for row in formats_with_plugins())
+        return [kind for kind in map(_kind_of_file, options) if kind is not MeshFile]
+
+    @property
+    def reading_options(self) -> dict[str, Any]:
+        """Options of `load_objects`, except folders: {name: value}."""
+        own = type(self).model_fields.keys() - MeshFile.model_fields.keys()
+        shared = {field.name for field in fields(MeshOptions)} & MeshFile.model_fields.keys()
+        return self.model_dump(include={*own, *shared} - {"assets"}, exclude_unset=True)
 
     @model_validator(mode="after")
     def _check_placement(self) -> MeshFile:
@@ -172,7 +175,18 @@ class MeshFile(Section):
         return Transform.from_parts(self.translation, self.rotation_deg, self.scale)
 
 
-MeshEntry = Annotated[MeshFile, by_text("file", MeshFile)]
+@cache
+def _kind_of_file(options: type | None) -> type[MeshFile]:
+    """Return the section of files of a format, with its options that `about` describes."""
+    declared = {} if options is None else fields_of(options)
+    described = {name: field for name, field in declared.items() if field.description}
+    if options is None or not described:
+        return MeshFile
+    further: Any = {name: (field.annotation, field) for name, field in described.items()}
+    return create_model(options.__name__, __base__=MeshFile, __module__=__name__, **further)
+
+
+MeshEntry = Annotated[MeshFile, SerializeAsAny(), by_text("file", MeshFile)]
 MeshEntries = Several[MeshEntry]
 
 

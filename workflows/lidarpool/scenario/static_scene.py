@@ -18,6 +18,7 @@ from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
 from lidarsim.scene.actors import Actor, box, join_meshes
+from lidarsim.scene.files.mesh_formats import format_of, option_names
 from lidarsim.scene.files.meshfile import Objects, load_objects
 from lidarsim.scene.files.scene_graph import ObjectClass, Raster
 from lidarsim.scene.object_names import resolve_same_names
@@ -44,20 +45,6 @@ from .sections import (
     file_states,
 )
 
-# Fields of a mesh file's entry that are options of `load_objects`, with the same names.
-_READING_FIELDS = {
-    "unit",
-    "up_axis",
-    "opacity",
-    "step_m",
-    "window",
-    "sag_m",
-    "storeys",
-    "geometry",
-    "keyframe",
-    "groups",
-    "exclude",
-}
 # Fields of a mesh file's entry that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}
 
@@ -70,6 +57,7 @@ class Findings:
     remarks: list[str] = field(default_factory=list)  # about the up-axes of files
     sources: dict[str, str] = field(default_factory=dict)  # {file: its content in words}
     rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)  # entry, description
+    landscapes: list[str] = field(default_factory=list)  # files of land, never of single objects
     # {file of the scene: {number: class}} of files whose format gives classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
 
@@ -256,19 +244,25 @@ class Shapes:
             transform = entry.transform()
         if entry.file.lower().endswith(ROBOTS):
             return self._still_robot(entry, transform)
+        path = scenario.path(entry.file)
+        world_options = {}
+        if "epsg" in option_names(format_of(path)):
+            world_options["epsg"] = scenario.world.epsg
         objects = load_objects(
-            scenario.path(entry.file),
-            **entry.model_dump(include=_READING_FIELDS),
+            path,
+            **entry.reading_options,
+            **world_options,
             transform=transform,
             colours=scenario.coloured,
             materials=scenario.names_materials,
-            epsg=scenario.world.epsg,
             assets=self._assets_of(entry),
             animation=animation,
             tell=findings.notes.append,
             axes=findings.remarks.append,
         )
         findings.sources.setdefault(entry.file, objects.summary)
+        if objects.is_landscape:
+            findings.landscapes.append(entry.file)
         if objects.raster is not None:
             findings.rasters.append((entry, objects.raster))
         return objects

@@ -144,7 +144,7 @@ class _CityFile:
         self._allowance = allowance
         self._colours = options.colours
         self._names_materials = options.materials
-        self._unit = options.raster.unit  # that the user gives
+        self._unit = options.unit  # that the user gives
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(

@@ -11,7 +11,12 @@ MODELS = (".xml",)  # of MuJoCo
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"
+_RASTER_OPTIONS = "lidarscenes.files.rasters:RasterOptions"
 _IFC = "lidarscenes.files.ifc:read_ifc"
+_IFC_OPTIONS = "lidarscenes.files.ifc:IfcOptions"
+_GAZEBO = "lidarscenes.gazebo.world"
+_ROADS = "lidarscenes.roads.opendrive"
+_MUJOCO = "lidarscenes.mujoco.model_file"
 _ZIP = b"PK\x03\x04"
 _CRATE = b"PXR-USDC"  # binary OpenUSD
 _USD_TEXT = b"#usda "
@@ -26,18 +31,24 @@ MESH_FORMATS = (
     MeshFormat((".usdz",), _USD, animated=True, signatures=(_ZIP,)),
     MeshFormat(CITYJSON, "lidarscenes.files.cityjson:read_cityjson"),
     MeshFormat(
-        (".tif", ".tiff"), _RASTER, from_path=True, raster=True, signatures=(b"II*\0", b"MM\0*")
+        (".tif", ".tiff"),
+        _RASTER,
+        from_path=True,
+        options=_RASTER_OPTIONS,
+        signatures=(b"II*\0", b"MM\0*"),
     ),
     MeshFormat(
         (".asc", ".hgt", ".img", ".dem", ".dt0", ".dt1", ".dt2"),
         _RASTER,
         from_path=True,
-        raster=True,
+        options=_RASTER_OPTIONS,
     ),
-    MeshFormat(WORLDS, "lidarscenes.gazebo.world:read_sdf", collisions=True),
-    MeshFormat((".xodr",), "lidarscenes.roads.opendrive:read_xodr", roads=True),
-    MeshFormat(MODELS, "lidarscenes.mujoco.model_file:read_mjcf", models=True),
-    MeshFormat((".ifc",), _IFC, from_path=True, storeys=True, signatures=(b"ISO-10303-21;",)),
-    MeshFormat((".ifczip",), _IFC, from_path=True, storeys=True, signatures=(_ZIP,)),
+    MeshFormat(WORLDS, f"{_GAZEBO}:read_sdf", options=f"{_GAZEBO}:GazeboOptions"),
+    MeshFormat((".xodr",), f"{_ROADS}:read_xodr", options=f"{_ROADS}:RoadOptions"),
+    MeshFormat(MODELS, f"{_MUJOCO}:read_mjcf", options=f"{_MUJOCO}:MujocoOptions"),
+    MeshFormat(
+        (".ifc",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(b"ISO-10303-21;",)
+    ),
+    MeshFormat((".ifczip",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(_ZIP,)),
     MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
 )

@@ -9,16 +9,21 @@ from __future__ import annotations
 import re
 import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.extras import install_command
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -67,8 +72,21 @@ _ADVICE = "export it in parts"
 _EMPTY = "holds no elements with a shape, such as walls and slabs, or none in these storeys"
 
 
+@dataclass(frozen=True)
+@checked_fields
+class IfcOptions:
+    """Options of buildings."""
+
+    storeys: Annotated[
+        Annotated[Several[Text], Field(min_length=1)] | None,
+        about("of a building (.ifc): take only the elements of these storeys"),
+    ] = None
+
+
 def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the elements of a building, all or of the storeys in `options`."""
+    """Read the elements of a building, all or of the storeys in `options.own`."""
+    own: IfcOptions = options.own
+    storeys = own.storeys
     is_packed = path.suffix.lower() == ".ifczip"
     if not is_packed and b"ISO-10303-21" not in data:
         raise ValueError("it does not begin with ISO-10303-21")
@@ -91,7 +109,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
         hidden=("IFCOPENSHELL_",),
     )
     request = {
-        "storeys": options.storeys,
+        "storeys": None if storeys is None else list(storeys),
         "max_unpacked": min(UNPACKED_TIMES * size, memory_share()),
     }
     shapes = _Shapes(options, allowance)
@@ -106,7 +124,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
                     )
                 case "building":
                     building = frame
-                    _check_storeys(options.storeys, frame["storeys"])
+                    _check_storeys(storeys, frame["storeys"])
                 case "shape":
                     shapes.add(frame, arrays)
                 case "elements":
@@ -122,7 +140,7 @@ def _check_end(path: Path) -> None:
             raise ValueError("the end of the file is missing")
 
 
-def _check_storeys(wanted: tuple[str, ...] | None, storeys: list[str]) -> None:
+def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
     """Check that a building has all storeys asked for; MeshFileError with their names if not."""
     missing = [name for name in wanted or () if name not in storeys]
     if missing:

@@ -14,17 +14,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from uuid import uuid4
 
 import numpy as np
 
 from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
+from lidarsim.base.declared import Rectangle, about
 from lidarsim.base.elementary import decade
 from lidarsim.base.errors import CutShortError
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.scene.files.coordinate_systems import (
@@ -46,12 +48,11 @@ from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
     Raster,
-    RasterOptions,
     ReadOptions,
-    Window,
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.survey import EpsgCode
 
 DRIVERS = {  # {ending: GDAL's name of the driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",
@@ -69,6 +70,7 @@ MAX_UNASKED_PIXELS = 5_000_000  # pixels that are read without a window and a st
 _MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
+Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
 PixelRange = tuple[int, int]  # half-open
 
 # Heights of the Earth's surface.
@@ -85,31 +87,51 @@ _UNIT_NAMES = {  # of heights, as files spell the names
 }
 
 
+@dataclass(frozen=True)
+@checked_fields
+class RasterOptions:
+    """Options of rasters of heights."""
+
+    step_m: Annotated[
+        float | None,
+        about("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
+    ] = None
+    window: Annotated[
+        Rectangle | None,
+        about("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
+    ] = None
+    # Code of the mesh's coordinate system, `world.epsg` of scenarios; None chooses by the file.
+    epsg: EpsgCode | None = None
+
+
 def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
     Cells with a pixel without height are holes. Coordinates are of the system `epsg` in
-    `options.raster`; else the raster's own if they are in metres that are true to scale in its
+    `options.own`; else the raster's own if they are in metres that are true to scale in its
     middle, or of the UTM zone of its middle. The window has the pixels whose middles are within.
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(
             f"is a raster, which rasterio reads: {install_command('lidarpool[geo]')}"
         )
-    request = options.raster
+    if options.up_axis is not None:
+        raise MeshFileError("is a raster, whose heights are z: leave out up_axis")
+    request: RasterOptions = options.own
     with _open_raster(path) as file:
         source = _source(file, path)
         notes = _notes(source, path)
         target_crs = _target_crs(source, request.epsg, notes)
-        mesh, summary = _raster_mesh(source, target_crs, path, request, notes)
+        mesh, summary = _raster_mesh(source, target_crs, path, options, notes)
     raster = Raster(*crs_key(target_crs), summary)
-    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster, is_landscape=True)
 
 
 def _raster_mesh(
-    source: _Source, target_crs: Any, path: Path, request: RasterOptions, notes: list[str]
+    source: _Source, target_crs: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[SceneMesh, str]:
     """Return the mesh of a raster in a coordinate system, and its summary; append notes."""
+    request: RasterOptions = options.own
     window = request.window
     chosen = request.step_m is not None or window is not None
     pixels = _RasterGrid(source.file, source.affine, source.crs, target_crs)
@@ -121,7 +143,7 @@ def _raster_mesh(
         columns, rows = grid.pixels_in(window)
         _check_size(grid, columns, rows, path.name, chosen=chosen)
         values, valid = _read_values(grid, columns, rows)
-        unit_m = UNITS_M[request.unit] if request.unit else _height_unit_m(source, notes)
+        unit_m = UNITS_M[options.unit] if options.unit else _height_unit_m(source, notes)
         heights = source.heights_m(values, unit_m)
         mesh = _grid_mesh(path.stem, grid, columns, rows, heights, valid)
         no_data_m = float(source.heights_m(np.array(_NO_DATA), unit_m))

@@ -22,7 +22,7 @@ from ..writers.lidar_scenario import write_scenario
 from .frames import numbers_of
 from .lidars import lidars_of, unknown_sensors
 from .visibility import ALL_BITS, flags_of
-from .world import World, content_of, load_world
+from .world import GazeboOptions, World, content_of, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
@@ -76,7 +76,7 @@ def _unseen_objects(
     flags = {flags_of(visual) for visual in visuals} - {0}
     if all(mask and all(mask & value for value in flags) for mask in masks):
         return {}
-    options = ReadOptions(masks=False, colours=False, folders=folders)
+    options = ReadOptions(masks=False, colours=False, folders=folders, own=GazeboOptions())
     with np.errstate(all="ignore"):
         content, placed = content_of(world, options)
     # Objects without an area are not in the content, which is else in the same order.

@@ -61,6 +61,11 @@ class LinkMeshes:
     _files: dict[tuple[Path, str], list[SceneMesh]] = field(default_factory=dict)
     _links: dict[tuple[int, tuple[float, ...]], list[LinkMesh]] = field(default_factory=dict)
 
+    @property
+    def _collisions(self) -> bool:
+        """True if shapes for collisions are read in place of visuals."""
+        return bool(self.options.own.geometry == "collision")
+
     def meshes_of(
         self, body: Body, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
@@ -83,7 +88,7 @@ class LinkMeshes:
         # {whether each mask sees a shape: the first shape, its flags, and meshes of all shapes}
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):
-            flags = ALL_BITS if self.options.collisions else self._flags_of(shape, name)
+            flags = ALL_BITS if self._collisions else self._flags_of(shape, name)
             parts = self._shape_meshes(body, link, shape, name, scale) if flags else []
             if parts:
                 seen_by = tuple(flags & mask != 0 for mask in self.masks)
@@ -108,10 +113,10 @@ class LinkMeshes:
     def _shapes(self, link: Link, name: str) -> list[Element]:
         """Return the shapes of a link that are read."""
         self.notes.check_children(link.element)
-        kind = "collision" if self.options.collisions else "visual"
+        kind = "collision" if self._collisions else "visual"
         shapes = link.element.findall(kind)
         has_collisions = link.element.find("collision/geometry") is not None
-        if has_collisions and not shapes and not self.options.collisions:
+        if has_collisions and not shapes and not self._collisions:
             self.notes.without_visuals[name] = None
         return shapes
 

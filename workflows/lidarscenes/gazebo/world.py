@@ -11,14 +11,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import about
 from lidarsim.base.errors import prefixed
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import listed, printable
 from lidarsim.scene.files.scene_graph import (
@@ -48,6 +50,17 @@ _OLD_ROOT = "gazebo"  # of Gazebo before 1.9
 # A model that is farther along x, y or z from the origin of its world has fallen, or physics has
 # thrown it there: northings of maps reach 10,000 km, and no world is 1,000 km high.
 _REACH_M = np.array([1e7, 1e7, 1e6])
+
+
+@dataclass(frozen=True)
+@checked_fields
+class GazeboOptions:
+    """Options of worlds of Gazebo."""
+
+    geometry: Annotated[
+        Literal["visual", "collision"],
+        about("of a world of Gazebo: its visual shapes, or those for collision", "collision"),
+    ] = "visual"
 
 
 class PlacedLink(NamedTuple):

@@ -21,12 +21,12 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import length, turned
 from lidarsim.base.words import printable
 from lidarsim.mujoco.model_bodies import Choice, names_of, seen_geoms
-from lidarsim.scene.files.scene_graph import MeshFileError, ModelOptions, ReadOptions
+from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
 
 from ..writers.lidar_scenario import Lidar, clean, write_scenario
-from .model_file import body_matrix, load_model, objects_of_bodies
+from .model_file import MujocoOptions, body_matrix, load_model, objects_of_bodies
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
@@ -99,7 +99,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
 def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
     """Return the options of reading a model without its images."""
     folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
-    return ReadOptions(masks=False, colours=False, folders=folders)
+    return ReadOptions(masks=False, colours=False, folders=folders, own=MujocoOptions())
 
 
 def _loaded(path: Path, assets: Sequence[Path]) -> Any:
@@ -249,7 +249,7 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
         if (reason := _unusable(model, group.camera))
     ]
     all_groups = np.unique(model.geom_group)
-    further = sorted({*all_groups.tolist()} - {*ModelOptions().groups})
+    further = sorted({*all_groups.tolist()} - {*MujocoOptions().groups})
     if further and seen_geoms(model, Choice(further, (), (), "body")):
         numbers = ", ".join(map(str, further))
         lines.append(

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import listed, name_hint, printable
 from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
 from lidarsim.mujoco.model_bodies import (
@@ -35,7 +38,6 @@ from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
     Content,
     MeshFileError,
-    ModelOptions,
     PlacedNode,
     ReadOptions,
     placed_content,
@@ -57,6 +59,24 @@ _MAX_ROUND_TRIANGLES = 4_000_000  # of balls, ellipsoids, capsules and cylinders
 _MAX_SAG_M = 1.0
 
 
+@dataclass(frozen=True)
+@checked_fields
+class MujocoOptions:
+    """Options of models of MuJoCo."""
+
+    keyframe: Annotated[
+        Text | None,
+        about("of a model of MuJoCo: the keyframe at which its bodies are", "home"),
+    ] = None
+    groups: Annotated[
+        Several[Annotated[int, Field(ge=0, le=5)]],
+        about("of a model of MuJoCo: groups of the geoms that are seen"),
+    ] = (0, 1, 2)
+    exclude: Annotated[
+        Several[Text], about("of a model of MuJoCo: bodies and geoms that are left out")
+    ] = ()
+
+
 def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the geoms of a model at its initial state, as objects of its bodies.
 
@@ -68,7 +88,7 @@ def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.up_axis = "z"
     content.notes = _notes(model, options)
     if not content.meshes and not content.skipped:
-        groups = tuple(options.model.groups)
+        groups = tuple(options.own.groups)
         raise MeshFileError(f"has nothing that a lidar sees in the groups {groups}: give groups")
     return content
 
@@ -90,7 +110,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         raise MeshFileError(f"is a model of MuJoCo, which MuJoCo reads: {command}")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise MeshFileError("is a model of MuJoCo, which is not read on Windows")
-    request = {"keyframe": options.model.keyframe, "colours": options.colours}
+    request = {"keyframe": options.own.keyframe, "colours": options.colours}
     with TemporaryDirectory() as folder:
         child = Child(
             Path(__file__).with_name("model_child.py"),
@@ -103,7 +123,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         with closing(frames):
             frame, arrays = next(frames)
     if frame["what"] == "keyframes":
-        keyframe = str(options.model.keyframe)
+        keyframe = str(options.own.keyframe)
         hint = name_hint(keyframe, frame["names"])
         raise LidarError(f"the model has no keyframe {keyframe!r}.{hint}")
     fields = dict(zip(frame.pop("names"), arrays, strict=True))
@@ -117,8 +137,8 @@ def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
 
     Bodies without an object, and the world itself, are missing.
     """
-    bodies, geoms = excluded(model, options.model.exclude)
-    seen = seen_geoms(model, _choice(model, options.model, bodies, geoms))
+    bodies, geoms = excluded(model, options.own.exclude)
+    seen = seen_geoms(model, _choice(model, options.own, bodies, geoms))
     content = placed_content(_placed(model, options))
     names = [printable(item.name) for item in content.meshes]
     # The last object of a name is that of a body: geoms of the world come first.
@@ -130,8 +150,8 @@ def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
 
 def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     """Return the meshes of the bodies of a model, at the poses of its initial state."""
-    bodies, geoms = excluded(model, options.model.exclude)
-    choice = _choice(model, options.model, bodies, geoms)
+    bodies, geoms = excluded(model, options.own.exclude)
+    choice = _choice(model, options.own, bodies, geoms)
     named = _named_geoms_of_world(model)
     others = np.arange(1, len(model.body_parentid)).tolist()
     unnamed = sorted({*range(len(model.geom_type))} - {*named})
@@ -154,7 +174,7 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     return nodes
 
 
-def _choice(model: Any, options: ModelOptions, bodies: list[int], geoms: list[int]) -> Choice:
+def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]) -> Choice:
     """Return what is seen of a model; MeshFileError for too many geoms."""
     plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
     choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)

@@ -8,13 +8,17 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
+from lidarsim.base.declared import about
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -36,7 +40,6 @@ from .road_marks import painted_quads
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
-SAG_M = 0.01  # tolerance of curves in plan unless the reader gets another
 # Roads of a junction lie on each other. These lanes are lower by metres, so that lanes on which
 # vehicles drive are hit.
 _SINK_OF_NONE_M = 0.005
@@ -48,6 +51,17 @@ _UTM = re.compile(r"\+proj=utm\b.*\+zone=(\d{1,2})\b")
 _EPSG = re.compile(r"(?i)\bepsg:(\d{4,6})\b")
 
 Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
+
+
+@dataclass(frozen=True)
+@checked_fields
+class RoadOptions:
+    """Options of roads."""
+
+    sag_m: Annotated[
+        float,
+        about("of roads (.xodr): largest distance of triangles from curves, metres", gt=0, le=1),
+    ] = 0.01
 
 
 def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -72,6 +86,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.unit_m = 1.0
     content.up_axis = "z"
     content.classes = CLASSES
+    content.is_landscape = True
     content.notes = _notes(header, content.meshes, unread)
     return content
 
@@ -84,7 +99,8 @@ class _RoadReader:
         self._allowance = allowance
         self._unread = unread
         self._pieces: Pieces = defaultdict(list)
-        self._sag_m = options.sag_m or SAG_M
+        own: RoadOptions = options.own
+        self._sag_m = own.sag_m
 
     def meshes(self, network: Network) -> list[SceneMesh]:
         """Return the meshes of all objects."""

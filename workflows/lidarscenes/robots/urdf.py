@@ -27,7 +27,8 @@ from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
-from lidarsim.scene.files.meshfile import OpacityMode, load_meshes, warn
+from lidarsim.scene.files.mesh_options import OpacityMode
+from lidarsim.scene.files.meshfile import load_meshes, warn
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule

@@ -49,6 +49,18 @@ def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
 
 MinMax = Annotated[Two[T], WrapValidator(_in_order)]  # least and largest number
 
+
+def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
+    """Validate a rectangle, whose lowest x and y come first."""
+    sides = handler(value)
+    if sides[0] >= sides[2] or sides[1] >= sides[3]:
+        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
+    return sides
+
+
+# Lowest x and y, highest x and y.
+Rectangle = Annotated[Four[Coordinate], WrapValidator(_upright)]
+
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
 

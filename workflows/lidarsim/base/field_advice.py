@@ -14,7 +14,7 @@ from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
 from .sections import FieldPath, classes_in, fields_by_name, is_section
-from .words import did_you_mean
+from .words import did_you_mean, joined
 
 # Returns True for the content of a file whose fields contradict each other.
 Contradictory = Callable[[Any], bool]
@@ -127,7 +127,7 @@ def _in_words(
 ) -> str:
     """Return the advice on a field, which is valid in `direct` sections; "" is the file itself."""
     sections = [section for section in direct if section]
-    listed = " and ".join(filter(None, [", ".join(sections[:-1]), *sections[-1:]]))
+    listed = joined(sections)
     if suggestion and listed:
         return f"{suggestion} Or {path[-1]} of {listed}?"
     if suggestion and "" in direct:

@@ -14,9 +14,19 @@ FieldPath = tuple[int | str, ...]
 
 
 def fields_by_name(hint: Any) -> Fields:
-    """Return the fields of the sections in an annotation: {name in a file: field}."""
-    fields = (pair for kind in sections_in(hint) for pair in fields_of(kind).items())
+    """Return the fields of all kinds of the sections in an annotation: {name in a file: field}."""
+    kinds = (kind for section in sections_in(hint) for kind in (section, *kinds_of(section)))
+    fields = (pair for kind in kinds for pair in fields_of(kind).items())
     return {field.alias or name: field for name, field in fields}
+
+
+def kinds_of(section: Any) -> Sequence[Any]:
+    """Return the sections that a section becomes by its content, such as of files with options.
+
+    A section names these by a function `kinds`, which is called only for messages and schemas,
+    since it imports what declares their fields.
+    """
+    return section.kinds() if "kinds" in vars(section) else ()
 
 
 def fields_of(section: Any) -> Fields:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
@@ -150,6 +150,33 @@ def shown_readably(function: F) -> F:
     signature = readable(inspect.signature(function), function.__globals__)
     function.__signature__ = signature  # type: ignore[attr-defined]
     return function
+
+
+def with_fields_of(kind: type, without: Collection[str] = ()) -> Callable[[F], F]:
+    """Let the readable signature of a function list the fields of a dataclass before `**options`.
+
+    Fields of the names `without` are not listed.
+
+    Examples
+    --------
+    >>> from dataclasses import make_dataclass
+    >>> @with_fields_of(make_dataclass("Reading", [("unit", str, "m")], kw_only=True))
+    ... def load(path: str, **options: Any) -> None: ...
+    >>> inspect.signature(load)
+    <Signature (path: str, *, unit: str = 'm', **options: Any) -> None>
+    """
+
+    def decorated(function: F) -> F:
+        signature = readable(inspect.signature(function), function.__globals__)
+        *parameters, options = signature.parameters.values()
+        listed = inspect.signature(kind).parameters.values()
+        fields = [parameter for parameter in listed if parameter.name not in without]
+        function.__signature__ = signature.replace(  # type: ignore[attr-defined]
+            parameters=[*parameters, *fields, options]
+        )
+        return function
+
+    return decorated
 
 
 def _shown(default: Any) -> Any:

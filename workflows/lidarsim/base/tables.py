@@ -19,7 +19,7 @@ import numpy as np
 
 from .arrays import Floats
 from .time_units import SECONDS, TimeUnit, seconds_of
-from .words import did_you_mean_each, fits, in_yaml, printable
+from .words import did_you_mean_each, fits, in_yaml, joined, printable
 
 # {unit: number of these units in the first unit}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
@@ -150,9 +150,7 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
         indices |= matches
     if unmatched:
         verb = "are no columns" if len(unmatched) > 1 else "is no column"
-        raise ValueError(
-            f"ignore names {_all_of(unmatched)}, which {verb}; it has {_listed(names)}"
-        )
+        raise ValueError(f"ignore names {joined(unmatched)}, which {verb}; it has {_listed(names)}")
     return indices
 
 
@@ -302,7 +300,7 @@ def read_table(
     if missing := [repr(name) for name in required_names if name not in names]:
         columns_word = "columns" if len(missing) > 1 else "column"
         raise ValueError(
-            f"it has no {columns_word} {_all_of(missing)}; it has {_listed(header.cells)}"
+            f"it has no {columns_word} {joined(missing)}; it has {_listed(header.cells)}"
         )
     values = _numbers(lines, header, names, [*required_names, *(columns or {})])
     return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
@@ -443,8 +441,8 @@ class _ColumnReader:
         ]
         pairs = ", ".join(f"{quantity.name}: {cell}" for quantity, cell in columns)
         return (
-            f"its columns {_all_of([repr(cell) for _, cell in columns])} have no unit: call them "
-            f"{_all_of(names)}" + f", or give columns: {{{pairs}}}" * self.can_choose
+            f"its columns {joined([repr(cell) for _, cell in columns])} have no unit: call them "
+            f"{joined(names)}" + f", or give columns: {{{pairs}}}" * self.can_choose
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
@@ -533,11 +531,6 @@ def _refuse(faults: Sequence[str]) -> None:
     if faults:
         first, *others = faults
         raise ValueError(". ".join([first, *(fault[0].upper() + fault[1:] for fault in others)]))
-
-
-def _all_of(names: Sequence[str]) -> str:
-    """Return names as text: «a, b and c»."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _listed(cells: Sequence[str]) -> str:

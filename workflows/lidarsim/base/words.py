@@ -197,6 +197,17 @@ def without_common_prefix(names: Sequence[str]) -> list[str]:
     return shorter if all(shorter) else list(names)
 
 
+def joined(names: Sequence[str]) -> str:
+    """Return names as an enumeration.
+
+    Examples
+    --------
+    >>> joined(["x", "y", "z"])
+    'x, y and z'
+    """
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
 def listed(names: Sequence[str], max_names: int = 3) -> str:
     """Return the first names, and the number of further names.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
-from ..base.signatures import shown_readably
+from ..base.signatures import shown_readably, with_fields_of
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import listed, plural
@@ -26,8 +26,8 @@ from ..sensor.materials import SurfaceKinds
 from .actors import Actor
 from .colours import GREY, Colours, are_indices, join_colours
 from .face_materials import ObjectMaterials
-from .files.meshfile import Geometry, Objects, OpacityMode, load_objects, warn
-from .files.scene_graph import Window
+from .files.mesh_options import MeshOptions
+from .files.meshfile import Objects, load_objects, warn
 from .object_names import SameNames, resolve_same_names, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
 from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
@@ -153,27 +153,13 @@ class Scene:
         return cls.from_meshes(seed_objects())
 
     @classmethod
+    @with_fields_of(MeshOptions, without=("animation",))
     def load(
         cls,
         path: str | Path,
         *,
-        unit: str | None = None,
-        up_axis: str | None = None,
-        transform: Transform | None = None,
-        opacity: OpacityMode = "mask",
-        colours: bool = False,
-        materials: bool = False,
-        step_m: float | None = None,
-        window: Window | None = None,
-        epsg: int | None = None,
-        sag_m: float | None = None,
-        storeys: Sequence[str] | None = None,
-        assets: str | Path | None = None,
-        geometry: Geometry | None = None,
-        keyframe: str | None = None,
-        groups: Sequence[int] | None = None,
-        exclude: Sequence[str] = (),
         same_names: SameNames = "number",
+        **options: Any,
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, .ifc, or a raster (.tif).
 
@@ -181,6 +167,17 @@ class Scene:
         ----------
         path
             The file; its objects keep their names.
+        same_names
+            With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
+            objects of a name are one object.
+        **options
+            Options of all formats, see below, and options that the format of the file alone has,
+            by the names of `scene.files` in scenarios: `storeys` of a building (.ifc), `step_m` of
+            a raster. `epsg`, the code of the coordinate system to which a raster is transformed,
+            is `world.epsg` there.
+
+        Other Parameters
+        ----------------
         unit
             Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes the unit
             that the file states (.dae, .3mf, .usd, .glb and .gltf), else metres.
@@ -200,29 +197,10 @@ class Scene:
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
             CityJSON, .xodr, .ifc), by which `Material` may choose them.
-        step_m, window, epsg
-            Options of a raster: see `lidarsim.scene.files.meshfile.load_objects`.
-        sag_m
-            Of roads (.xodr): largest distance of triangles from curves in plan, metres; None takes
-            0.01.
-        storeys
-            Of a building (.ifc): names of the storeys whose elements are read. None takes all.
         assets
             A folder: further files that the scene file names are read from this folder and from
             the folder of the scene file, and from the folders below. Of a world of Gazebo, models
             are looked for in it first.
-        geometry
-            Of a world of Gazebo, its "visual" shapes, as by default, or those for "collision".
-        keyframe
-            Of a model of MuJoCo: name of the keyframe at which its bodies are, or the number of a
-            keyframe without a name; None for the reference pose.
-        groups
-            Of a model of MuJoCo: groups of the geoms to read; None for 0, 1 and 2.
-        exclude
-            Of a model of MuJoCo: names of bodies and geoms to leave out.
-        same_names
-            With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
-            objects of a name are one object.
 
         Returns
         -------
@@ -231,27 +209,14 @@ class Scene:
         Raises
         ------
         LidarError
-            If the file cannot be read completely, or has no triangles.
+            If the file cannot be read completely, has no triangles, or lacks an option.
         """
-        objects = load_objects(
-            path,
-            unit=unit,
-            up_axis=up_axis,
-            transform=transform,
-            opacity=opacity,
-            colours=colours,
-            materials=materials,
-            step_m=step_m,
-            window=window,
-            epsg=epsg,
-            sag_m=sag_m,
-            storeys=storeys,
-            assets=assets,
-            geometry=geometry,
-            keyframe=keyframe,
-            groups=groups,
-            exclude=exclude,
-        )
+        if options.get("animation") is not None:
+            raise LidarError(
+                f"{path}: a scene plays no animation: leave out animation, and give an Actor the "
+                "meshes of load_objects(path, animation=…), joined by join_meshes."
+            )
+        objects = load_objects(path, **options)
         static = resolve_same_names(
             objects.static, same_names, lambda note: warn(f"{path}: {note}")
         )

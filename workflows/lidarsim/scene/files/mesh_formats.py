@@ -9,18 +9,25 @@ here imports these packages. Endings that no table has are looked up among plug-
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
-from ...base.errors import LidarError
+from ...base.errors import LidarError, prefixed
 from ...base.plugins import Plugin, find_plugin, plugins_of
+from ...base.sections import is_section
+from ...base.words import did_you_mean, joined
+from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions
 
 GROUP = "lidarsim.meshes"
+
+_SHARED = tuple(entry.name for entry in fields(MeshOptions))
 
 # Reader of the content of a file, with its path and options. It raises `MeshFileError` for
 # content that it does not support, and any other error for a broken file.
@@ -40,7 +47,7 @@ class MeshFormat:
     advice
         Advice on files of a format that is not read, as a clause; empty if the format is read.
     animated
-        Whether the reader can bake an animation.
+        Whether the reader can bake an animation, `ReadOptions.animation`.
     unitless
         Whether files state no unit, nor does the format.
     signatures
@@ -48,16 +55,11 @@ class MeshFormat:
         advises to use one of these endings.
     from_path
         Whether the reader opens the path itself: it gets the first bytes of the file only.
-    raster
-        Whether files are rasters of heights, whose reader takes `ReadOptions.raster`.
-    collisions
-        Whether files may have shapes for collisions, see `ReadOptions.collisions`.
-    roads
-        Whether files are networks of roads, whose reader takes `ReadOptions.sag_m`.
-    models
-        Whether files are models of MuJoCo, whose reader takes `ReadOptions.model`.
-    storeys
-        Whether files are buildings, whose reader takes `ReadOptions.storeys`.
+    options
+        Dataclass of the options that the format alone has, or its name, "module:Class"; None for
+        a format without such options. The reader gets an instance, `ReadOptions.own`. Options
+        have defaults; None means that an option is not given. Scenarios have the options that are
+        described by `about`; others are arguments in Python only.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -69,11 +71,7 @@ class MeshFormat:
     unitless: bool = False
     signatures: tuple[bytes, ...] = ()
     from_path: bool = False
-    raster: bool = False
-    collisions: bool = False
-    roads: bool = False
-    models: bool = False
-    storeys: bool = False
+    options: type | str | None = None
     plugin: Plugin | None = field(default=None, compare=False)
 
     @property
@@ -85,13 +83,43 @@ class MeshFormat:
         assert self.read is not None, "of a format that is read"
         if not isinstance(self.read, str):
             return self.read
-        reader: MeshReader
-        if self.plugin is not None:
-            reader = replace(self.plugin, value=self.read).load(Callable)  # type: ignore[arg-type]
-        else:
-            module, _, function = self.read.partition(":")
-            reader = getattr(import_module(module), function)
+        reader: MeshReader = self._named(self.read, Callable)
         return reader
+
+    @property
+    def own_options(self) -> type | None:
+        """Dataclass of the options of the format; a dataclass given by its name is imported.
+
+        LidarError if the dataclass of a plug-in cannot be imported or used.
+        """
+        options = self.options
+        if isinstance(options, str):
+            options = self._named(options, type)
+        if options is not None and self.plugin is not None and (flaw := _flaw(options)):
+            raise LidarError(
+                f"{self.plugin} has options that {flaw}: install another version of "
+                f"{self.plugin.distribution}."
+            )
+        return options
+
+    def _named(self, name: str, kind: Any) -> Any:
+        """Return an object by its name, "module:object"; of a plug-in, of a kind."""
+        if self.plugin is not None:
+            return replace(self.plugin, value=name).load(kind)
+        module, _, attribute = name.partition(":")
+        return getattr(import_module(module), attribute)
+
+
+def _flaw(options: type) -> str:
+    """Return why a class cannot be the options of a format, as a clause; empty if it can."""
+    if not (is_dataclass(options) and is_section(options)):
+        return "are no dataclass with checked_fields"
+    for entry in fields(options):
+        if entry.default is MISSING:
+            return f"have no default for {entry.name}"
+        if entry.name in _SHARED:
+            return f"have {entry.name}, an option of all formats"
+    return ""
 
 
 _GLTF = "lidarsim.scene.files.gltf:read_gltf"
@@ -229,6 +257,88 @@ def _row_of_plugin(plugin: Plugin) -> MeshFormat:
 def plugin_endings() -> tuple[str, ...]:
     """Return the endings that plug-ins read."""
     return tuple(plugins_of(GROUP))
+
+
+def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
+    """Return the options for reading a file: the shared options, and those of its format.
+
+    Parameters
+    ----------
+    row
+        The format of the file.
+    path
+        The file, for the error.
+    given
+        {name of an option: value}; None for an option that is left out.
+
+    Returns
+    -------
+    The shared options, and an instance of the dataclass of the format, or None if the format has
+    no options of its own.
+
+    Raises
+    ------
+    LidarError
+        If the format lacks an option, with the formats that have it, or a value is refused.
+    """
+    values = {name: value for name, value in given.items() if value is not None}
+    if problem := lacking(row, values):
+        raise LidarError(f"{path} {problem}")
+    own_values = {name: value for name, value in values.items() if name not in _SHARED}
+    shared_values = {name: value for name, value in values.items() if name in _SHARED}
+    kind = row.own_options
+    with prefixed(path):
+        return MeshOptions(**shared_values), None if kind is None else kind(**own_values)
+
+
+def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
+    """Return a clause on options that a file does not have by its format; empty if it has all.
+
+    The clause follows the name of the file, and names the formats that have the options.
+    """
+    names = option_names(row)
+    lacks = [name for name in options if name not in names]
+    if not lacks:
+        return ""
+    groups: dict[str, list[str]] = {}  # {endings of formats that have them: options}
+    for name in lacks:
+        groups.setdefault(" ".join(_endings_with(name)), []).append(name)
+    parts = []
+    for having, group in groups.items():
+        kind = "options" if group[1:] else "an option"
+        parts.append(f"no {joined(group)}" + (f", {kind} of {having}" if having else ""))
+    hint = did_you_mean(groups[""][0], names) if "" in groups else ""
+    return f"has {'; '.join(parts)}: leave out {joined(lacks)}.{hint}"
+
+
+def option_names(row: MeshFormat | None) -> tuple[str, ...]:
+    """Return the names of all options of a format, shared and own; of None the shared options."""
+    if row is None:
+        return _SHARED
+    shared = _SHARED if row.animated else tuple(name for name in _SHARED if name != "animation")
+    kind = row.own_options
+    return shared if kind is None else (*shared, *(entry.name for entry in fields(kind)))
+
+
+def _endings_with(option: str) -> list[str]:
+    """Return the endings of the formats, also of plug-ins, that have an option."""
+    return [
+        ending
+        for row in formats_with_plugins()
+        if option in option_names(row)
+        for ending in row.endings
+    ]
+
+
+def formats_with_plugins() -> Iterator[MeshFormat]:
+    """Yield the formats that are read, also those of plug-ins that can be used."""
+    yield from _formats_read()
+    for plugins in plugins_of(GROUP).values():
+        for plugin in plugins:
+            with suppress(LidarError):
+                row = _row_of_plugin(plugin)
+                row.own_options  # noqa: B018 - raises LidarError if they cannot be used
+                yield row
 
 
 def advice_on(path: str | Path) -> str:

@@ -10,10 +10,9 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
@@ -38,18 +37,16 @@ from .mesh_formats import (
     endings_for,
     format_of,
     missing_packages,
+    options_of,
     plugin_endings,
 )
 from .scene_graph import (
     Content,
     MeshFileError,
-    ModelOptions,
     ObjectClass,
     Raster,
-    RasterOptions,
     ReadOptions,
     RigidPart,
-    Window,
 )
 from .text_cloud import is_text_raster
 
@@ -62,9 +59,6 @@ _MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
 _ZIP = b"PK\x03\x04"  # first bytes of an archive
 _ZIP_END = b"PK\x05\x06"  # before the end of an archive
 _HEAD_BYTES = 200  # bytes of a file that contain such a comment
-
-OpacityMode = Literal["mask", "ignore"]
-Geometry = Literal["visual", "collision"]
 
 _log = logging.getLogger(__name__)
 
@@ -82,6 +76,7 @@ class Objects(NamedTuple):
     summary: str = ""  # objects, triangles, unit, axes and colours
     raster: Raster | None = None  # description, if the file is a raster
     classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
+    is_landscape: bool = False  # whether the file is of land, never of a single object
 
     def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return the static objects, and the actors as static objects at their first pose.
@@ -99,25 +94,9 @@ class Objects(NamedTuple):
 def load_objects(
     path: str | Path,
     *,
-    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
-    up_axis: Literal[tuple(UP_AXES)] | None = None,  # type: ignore[valid-type]
-    transform: Transform | None = None,
-    opacity: OpacityMode = "mask",
-    colours: bool = False,
-    materials: bool = False,
-    step_m: float | None = None,
-    window: Window | None = None,
-    epsg: int | None = None,
-    sag_m: Annotated[float, Field(gt=0, le=1)] | None = None,
-    storeys: Annotated[Sequence[str], Field(min_length=1)] | None = None,
-    assets: str | Path | Sequence[Path] | None = None,
-    animation: str | None = None,
-    geometry: Geometry | None = None,
-    keyframe: str | None = None,
-    groups: Sequence[int] | None = None,
-    exclude: Sequence[str] = (),
     tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
+    **options: Any,
 ) -> Objects:
     """Read all objects of a mesh file.
 
@@ -127,36 +106,17 @@ def load_objects(
 
     Parameters
     ----------
-    path, unit, up_axis, transform, opacity, colours, materials, assets
-        See `Scene.load`; the path has an ending of `mesh_formats`, in upper or lower case. The unit
-        of a raster is the unit of its heights. `assets` may be several folders.
-    step_m
-        Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
-    window
-        Of a raster: lowest x and y, highest x and y of the area to read, metres in the coordinate
-        system of the result.
-    epsg
-        Code of the coordinate system to which a raster is transformed, in metres. None keeps the
-        system of the file if it is in metres, else takes the UTM zone of the raster's middle.
-    sag_m
-        Of roads (.xodr): largest distance of triangles from curves in plan, metres, above 0 to 1;
-        heights are ten times as exact. None takes 0.01.
-    storeys
-        Of a building (.ifc): names of the storeys whose elements are read. None takes all elements.
-    animation
-        Name of the animation to play by the meshes, or the number of an animation without a name;
-        "" for the first, in .usd for the bound animation. Animated meshes have no masks. None
-        leaves all meshes static.
-    geometry
-        Of a world of Gazebo: its "visual" shapes, which is None as well, or those for "collision".
-    keyframe, groups, exclude
-        Of a model of MuJoCo, see `Scene.load`.
+    path
+        The file, with an ending of `mesh_formats`, in upper or lower case.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were rotated; by default this
         module's logger gets the line, as a warning if the scene seems to lie on its side.
+    **options
+        Options that all formats share, the fields of `MeshOptions`, and options that the format of
+        the file alone has, see `MeshFormat.options`. Animated meshes have no masks.
 
     Returns
     -------
@@ -171,57 +131,40 @@ def load_objects(
     path = Path(path)
     row = _format_to_read(path)
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
-    raster = RasterOptions(unit, step_m, window, epsg)
-    _check_options(path, row, raster, up_axis, animation)
-    _check_geometry(path, row, geometry)
-    if sag_m is not None and not row.roads:
-        raise LidarError(
-            f"{path} has no curves that are read: leave out sag_m, or give a file of roads "
-            f"({' '.join(endings(lambda row: row.roads))})."
-        )
-    model = _model_options(path, row, keyframe, groups, exclude)
-    if storeys is not None and not row.storeys:
-        raise LidarError(
-            f"{path} has no storeys: leave out storeys, or give a building "
-            f"({' '.join(endings(lambda row: row.storeys))})."
-        )
-    if row.raster:  # the reader of rasters converts the unit itself
-        unit = None
-    asset_folders = [Path(assets)] if isinstance(assets, (str, Path)) else [*(assets or ())]
-    options = ReadOptions(
-        masks=opacity == "mask" and animation is None,
-        colours=colours,
-        folders=tuple(folder.resolve() for folder in (path.parent, *asset_folders)),
-        animation=animation,
-        materials=materials,
-        raster=raster,
-        collisions=geometry == "collision",
-        sag_m=sag_m,
-        model=model,
-        storeys=None if storeys is None else tuple(storeys),
+    shared, own = options_of(row, path, options)
+    wanted = ReadOptions(
+        masks=shared.opacity == "mask" and shared.animation is None,
+        colours=shared.colours,
+        folders=tuple(folder.resolve() for folder in (path.parent, *shared.asset_folders)),
+        unit=shared.unit,
+        up_axis=shared.up_axis,
+        animation=shared.animation,
+        materials=shared.materials,
+        own=own,
     )
     # Files may have infinite numbers and NaN, which are refused where they matter.
     with np.errstate(all="ignore"):
-        content = _read(path, row, data, options)
+        content = _read(path, row, data, wanted)
+        # The reader of rasters converts the unit itself.
+        unit = None if content.raster is not None else shared.unit
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
-        axis = up_axis or content.up_axis or "z"
-        objects = _in_world(
-            path, content, Transform(UP_AXES[axis] * unit_m, np.zeros(3)), transform
-        )
+        axis = shared.up_axis or content.up_axis or "z"
+        upright = Transform(UP_AXES[axis] * unit_m, np.zeros(3))
+        objects = _in_world(path, content, upright, shared.transform)
     _tell_notes(path, content, tell, unit_given=unit is not None)
     meshes = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
         raise LidarError(f"{path} has no triangle with an area.")
     if (
-        up_axis is None
+        shared.up_axis is None
         and content.generator != GENERATOR
         and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
     ):
         _tell_axes(path, content, meshes, axes)
+    objects = objects._replace(classes=content.classes, is_landscape=content.is_landscape)
     if content.raster is not None:
         return objects._replace(summary=content.raster.summary, raster=content.raster)
-    summary = _summary(meshes, unit_m, axis, options)
-    return objects._replace(summary=summary, classes=content.classes)
+    return objects._replace(summary=_summary(meshes, unit_m, axis, wanted))
 
 
 def _in_world(
@@ -276,58 +219,6 @@ def _tell_notes(
         tell(f"{path} {note}")
     if content.unit_note and not unit_given:
         tell(f"{path} {content.unit_note}")
-
-
-def _check_options(
-    path: Path,
-    row: MeshFormat,
-    raster: RasterOptions,
-    up_axis: str | None,
-    animation: str | None,
-) -> None:
-    """Check that a format has the options that are set; LidarError if not."""
-    if row.raster and up_axis:
-        raise LidarError(f"{path} is a raster, whose heights are z: leave out up_axis.")
-    of_rasters = {"step_m": raster.step_m, "window": raster.window}
-    raster_options = [name for name, value in of_rasters.items() if value is not None]
-    if raster_options and not row.raster:
-        raise LidarError(
-            f"{path} is no raster: leave out {' and '.join(raster_options)}, or give a raster "
-            f"({' '.join(endings(lambda row: row.raster))})."
-        )
-    if animation is not None and not row.animated:
-        animated = endings(lambda row: row.animated)
-        raise LidarError(
-            f"{path} has no animations that are read: give a {' or '.join(animated)}, or leave out "
-            "animation."
-        )
-
-
-def _check_geometry(path: Path, row: MeshFormat, geometry: Geometry | None) -> None:
-    """Check that a format has shapes for collisions if a kind is asked for; LidarError if not."""
-    if geometry is not None and not row.collisions:
-        raise LidarError(
-            f"{path} has no shapes for collisions: leave out geometry, or give a "
-            f"{' or '.join(endings(lambda row: row.collisions))}."
-        )
-
-
-def _model_options(
-    path: Path,
-    row: MeshFormat,
-    keyframe: str | None,
-    groups: Sequence[int] | None,
-    exclude: Sequence[str],
-) -> ModelOptions:
-    """Return the options of a model of MuJoCo; LidarError if a file of another format has any."""
-    seen_groups = ModelOptions().groups if groups is None else tuple(groups)
-    options = ModelOptions(keyframe, seen_groups, tuple(exclude))
-    if options != ModelOptions() and not row.models:
-        raise LidarError(
-            f"{path} is no model of MuJoCo: leave out keyframe, groups and exclude, or give a "
-            f"{' or '.join(endings(lambda row: row.models))}."
-        )
-    return options
 
 
 def load_meshes(

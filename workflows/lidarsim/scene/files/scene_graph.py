@@ -53,26 +53,6 @@ class MeshFileError(Exception):
     """An error of a mesh file, as a clause that follows the file's name."""
 
 
-Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
-
-
-class RasterOptions(NamedTuple):
-    """Options for reading a raster of heights; see `read_raster`."""
-
-    unit: str | None = None  # unit of the heights; None for the unit of the file
-    step_m: float | None = None  # step of the grid of mean heights; None takes the pixels
-    window: Window | None = None  # metres, in the coordinate system of the mesh; None takes all
-    epsg: int | None = None  # coordinate system of the mesh; None chooses by the file
-
-
-class ModelOptions(NamedTuple):
-    """Options for reading a model of MuJoCo."""
-
-    keyframe: str | None = None  # name or number of the state; None for the reference pose
-    groups: Sequence[int] = (0, 1, 2)  # groups of the geoms that are read
-    exclude: Sequence[str] = ()  # names of bodies and geoms that are left out
-
-
 class ReadOptions(NamedTuple):
     """Content to read from a mesh file, besides triangles."""
 
@@ -80,16 +60,14 @@ class ReadOptions(NamedTuple):
     colours: bool
     # Resolved folders: files that the mesh file names are read only from these and below.
     folders: tuple[Path, ...]
+    # Unit and up axis that the user gives, else None. They are applied to the content, except the
+    # unit of rasters, for which the reader applies the unit to the heights.
+    unit: str | None = None
+    up_axis: str | None = None
     animation: str | None = None  # name of the animation to bake; "" for the first
     materials: bool = False  # names of the materials of faces
-    raster: RasterOptions = RasterOptions()
-    collisions: bool = False  # shapes for collisions in place of visible ones, of worlds
-    model: ModelOptions = ModelOptions()
     skins_at_rest: bool = False  # meshes that a skeleton moves, which else are refused
-    sag_m: float | None = None  # tolerance of triangles along curves; None for the reader's
-    storeys: tuple[str, ...] | None = (
-        None  # names of the storeys to read, of buildings; None for all
-    )
+    own: Any = None  # options of this format alone, an instance of `MeshFormat.options`
 
     def allows(self, file: Path) -> bool:
         """Return True if a file that the mesh file names may be read."""
@@ -123,6 +101,7 @@ class Content:
     skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
+    is_landscape: bool = False  # whether the file is of land, never of a single object
     # {number of ASPRS LAS: class} of formats whose objects have types
     classes: Mapping[int, ObjectClass] = field(default_factory=dict)
 

@@ -1,0 +1,56 @@
+"""Options for reading mesh files that all formats share.
+
+Further options belong to formats: `MeshFormat.options` names the dataclass of a reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from ...base.declared import about
+from ...base.validation import checked_fields
+from ..transform import Transform
+
+LengthUnit = Annotated[
+    Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # of UNITS_M
+    about(
+        "length unit of the file, or of a raster's heights; by default the one it states, else "
+        "metres"
+    ),
+]
+UpAxis = Annotated[
+    Literal["x", "y", "z"] | None,
+    about("axis of the file that points up; by default that of its format"),
+]
+OpacityMode = Literal["mask", "ignore"]
+Opacity = Annotated[
+    OpacityMode,
+    about("mask: light passes where the image of a material is transparent; ignore: nowhere"),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+@checked_fields
+class MeshOptions:
+    """Options for reading a mesh file of any format; see `lidarsim.scene.scene.Scene.load`."""
+
+    unit: LengthUnit = None
+    up_axis: UpAxis = None
+    transform: Transform | None = None  # placement in the world, after unit and up axis
+    opacity: Opacity = "mask"
+    colours: bool = False  # whether base colours are read
+    materials: bool = False  # whether faces keep the names of their materials
+    # Folders from which further files may be read, besides the folder of the file.
+    assets: str | Path | Sequence[str | Path] | None = None
+    # Name or number of the animation to play by the meshes; "" for the first, None for none.
+    animation: str | None = None
+
+    @property
+    def asset_folders(self) -> tuple[Path, ...]:
+        """The folders of `assets`."""
+        one_folder = isinstance(self.assets, (str, Path))
+        folders = [self.assets] if one_folder else self.assets or ()
+        return tuple(map(Path, folders))  # type: ignore[arg-type]
