@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
+from lidarpool.clouds.formats import save_cloud
 from lidarpool.columns.parts import StoredCloud, pack
-from lidarpool.export.formats import save_cloud
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import ALWAYS

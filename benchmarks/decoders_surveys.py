@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarpool import Material, Mounted, Pose, Scene, Survey, Track, load_sensor
-from lidarpool.export.packets import with_packet_columns
+from lidarpool.clouds.packets import with_packet_columns
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN

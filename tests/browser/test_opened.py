@@ -12,7 +12,7 @@ from tests.packet_surveys import points_of
 from tests.shapes import room
 
 from lidarpool import Mounted, Pose, Survey, Track, load_sensor
-from lidarpool.export.formats import Format
+from lidarpool.clouds.formats import Format
 from lidarpool.live import opened, recorded
 from lidarpool.live.job_list import JobList
 from lidarpool.live.opened import growing_view, is_data_set, open_view

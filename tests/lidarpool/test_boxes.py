@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.formats import Format
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.formats import Format
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation

@@ -18,10 +18,10 @@ from tests.drives import SCANS, points_of, the_scene, the_sweeps
 import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.clouds.format_table import DATA_SETS
+from lidarpool.clouds.formats import Format
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarpool.export.format_table import DATA_SETS
-from lidarpool.export.formats import Format
 from lidarpool.report.charts import draw_sweep
 from lidarpool.scenario.field_paths import find_field
 from lidarpool.scenario.scenario import Scenario

@@ -23,10 +23,11 @@ from lidarpool import (
     load_sensor,
     simulate,
 )
+from lidarpool.clouds.formats import Format
+from lidarpool.clouds.recording import Recording
 from lidarpool.compare.fit.estimates import Estimate
 from lidarpool.compare.fit.fitting import _with_performance
-from lidarpool.export.formats import Format
-from lidarpool.recordings.recordings import Recording, open_recording
+from lidarpool.recordings.recordings import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.sensor.models import read_model
 from lidarsim.sweeps.sweeps import Sweeps

@@ -41,11 +41,11 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.export import parquet, pieces, well_known_text
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.format_table import EXPORTS, FORMATS, LAYOUTS
-from lidarpool.export.formats import Format
-from lidarpool.export.well_known_text import wkt
+from lidarpool.clouds import parquet, pieces, well_known_text
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.format_table import EXPORTS, FORMATS, LAYOUTS
+from lidarpool.clouds.formats import Format
+from lidarpool.clouds.well_known_text import wkt
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
@@ -449,7 +449,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
     with pytest.raises(LidarError, match="gone does not exist: make it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
-    monkeypatch.setattr("lidarpool.export.format_table.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'laspy and lazrs: pip install "\.\[las\]"'):
         Format("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}

@@ -12,7 +12,7 @@ from tests.committing import commit
 from tests.daemons import wait_until
 
 from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
-from lidarpool.export import ply
+from lidarpool.clouds import ply
 from lidarpool.report.cloud_counts import CloudCounts
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
 from lidarpool.run.job_source import OneJob

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarpool.export.format_table import FORMATS
-from lidarpool.export.formats import Format
+from lidarpool.clouds.format_table import FORMATS
+from lidarpool.clouds.formats import Format
 from lidarpool.live.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import lidarpool
 from lidarpool import Pose, Scene, Survey, load_sensor
-from lidarpool.export.ros.bags import write_mcap
+from lidarpool.clouds.ros.bags import write_mcap
 from lidarsim.sweeps.sweeps import Sweeps
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

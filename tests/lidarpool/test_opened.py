@@ -21,7 +21,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import view as view_command
-from lidarpool.export.formats import Format
+from lidarpool.clouds.formats import Format
 from lidarpool.live import recorded
 from lidarpool.live.job_list import JobList
 from lidarpool.live.opened import growing_view, is_data_set, open_view, open_views

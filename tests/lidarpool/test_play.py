@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.export.formats import Format
+from lidarpool.clouds.formats import Format
 from lidarpool.playback import bridge as bridges
 from lidarpool.playback.bridge import Bridge
 from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry

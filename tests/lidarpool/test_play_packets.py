@@ -37,7 +37,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.export.formats import Format
+from lidarpool.clouds.formats import Format
 from lidarpool.playback.packets import RepeatedInstruments
 from lidarpool.playback.recording import Recording
 from lidarpool.playback.sources import open_source, scenario_job

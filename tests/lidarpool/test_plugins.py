@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from tests.meshes import write
 from tests.plugin_files import write_distribution
@@ -10,10 +11,12 @@ from tests.plugin_files import write_distribution
 from lidarpool import Cloud, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
-from lidarpool.export.format_table import row_of
-from lidarpool.export.formats import Format
+from lidarpool.clouds.format_table import row_of
+from lidarpool.clouds.formats import Format
+from lidarpool.recordings.recordings import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
+from lidarpool.scenario.point_files import read_points
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import scenario_schema
 from lidarsim.base.errors import LidarError
@@ -283,6 +286,33 @@ def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
     object.__setattr__(row_of("text"), "packages", ())
     save_cloud(cloud, tmp_path / "a.text", format="text")
     assert (tmp_path / "a.text").read_text() == "1 points"
+
+
+# -- what is read --------------------------------------------------------------------------------
+
+
+def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
+    distribution(
+        "line-cloud",
+        {"lidarpool.clouds": {"lines": "line_cloud:ROW"}},
+        {
+            "line_cloud.py": "import numpy as np\n"
+            "from lidarpool.plugins import FilePoints, FormatRow\n"
+            "ROW = FormatRow('', 'line_cloud', suffixes=('.lines',), reads=('sweeps', 'points'))\n"
+            "def open_file(source):\n"
+            "    points = np.loadtxt(source.path)\n"
+            "    return source.recording(1, lambda number: (points, {}, np.eye(4)))\n"
+            "def read_points(path): return FilePoints(np.loadtxt(path), {})\n"
+        },
+    )
+    points = np.arange(60.0).reshape(20, 3)
+    np.savetxt(tmp_path / "a.lines", points)
+    recording = open_recording(tmp_path / "a.lines")
+    np.testing.assert_array_equal(recording.read_points(0).points, points)
+    scanned = read_points(tmp_path / "a.lines", None, tell=print)
+    np.testing.assert_array_equal(scanned.positions, points)
+    told = refused(save_cloud, Cloud(points, {}), tmp_path / "b.lines", format="lines")
+    assert told == "'lines' is only read: write another format, such as ply."
 
 
 # -- software ------------------------------------------------------------------------------------

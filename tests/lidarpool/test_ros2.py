@@ -20,7 +20,7 @@ from tests.shapes import room
 
 from lidarpool import Cloud, LidarError, Sensor, Survey
 from lidarpool.cli.play_command import play
-from lidarpool.export.ros.messages import RosMessage, message_store
+from lidarpool.clouds.ros.messages import RosMessage, message_store
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarscenes.writers.scene_file import write_scene

@@ -28,10 +28,10 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import export
-from lidarpool.export.format_table import FORMATS
-from lidarpool.export.formats import Format
-from lidarpool.export.ros import layouts
-from lidarpool.export.ros.livox import CUSTOM_DEFINITION
+from lidarpool.clouds.format_table import FORMATS
+from lidarpool.clouds.formats import Format
+from lidarpool.clouds.ros import layouts
+from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION
 from lidarpool.recordings.recordings import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import SCAN

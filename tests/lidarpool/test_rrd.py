@@ -19,8 +19,8 @@ from tests.lidarpool.test_viewers import ROOM
 from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
 from lidarpool import Cloud, LidarError
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.formats import Format, save_cloud
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.formats import Format, save_cloud
 from lidarpool.playback.sources import open_source
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import SweepPoses

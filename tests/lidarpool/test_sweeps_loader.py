@@ -23,9 +23,9 @@ from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps,
 
 import lidarpool
 from lidarpool import LidarError, Scene, Sweep
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS
 from lidarpool.datasets.dataset import INDEX_FILE
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.format_table import DATA_SETS, LAYOUTS
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -222,7 +222,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     index.unlink()
     told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
     written("parquet"), written("mcap")
-    monkeypatch.setattr("lidarpool.export.format_table.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     told(lambda: lidarpool.sweeps(written("parquet")), r'pip install "\.\[parquet\]"')
     told(lambda: lidarpool.sweeps(written("mcap")), r'pip install "\.\[ros\]"')
 
@@ -275,7 +275,7 @@ def test_threads_and_forks_read_beside_each_other(written, name):
 @pytest.mark.parametrize("url", [False, True])
 def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
     name = "kitti" if url else "webdataset"
-    reader = f"lidarpool.export.{name}.Reader.read"
+    reader = f"lidarpool.clouds.{name}.Reader.read"
     read = pydoc.locate(reader)
     threads: list[str] = []
 

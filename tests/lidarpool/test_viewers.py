@@ -34,8 +34,8 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.shown_sweeps import ShownSweep, Surroundings
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.shown_sweeps import ShownSweep, Surroundings
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarpool.playback.sources import open_source

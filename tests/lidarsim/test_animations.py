@@ -11,7 +11,7 @@ from tests.meshes import write
 from tests.shapes import made
 
 from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.export.boxes import Boxes
+from lidarpool.clouds.boxes import Boxes
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario

@@ -26,12 +26,12 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarpool.clouds.boxes import Boxes
+from lidarpool.clouds.images import Image
+from lidarpool.clouds.ros.bags import write_rosbag2
+from lidarpool.clouds.webdataset import Pieces
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.datasets.sweep_data import Sweep
-from lidarpool.export.boxes import Boxes
-from lidarpool.export.images import Image
-from lidarpool.export.ros.bags import write_rosbag2
-from lidarpool.export.webdataset import Pieces
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario

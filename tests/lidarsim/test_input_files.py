@@ -12,9 +12,9 @@ import pytest
 import trimesh
 
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
+from lidarpool.clouds.format_table import point_suffixes
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.point_files import SUFFIXES as CLOUDS
 from lidarpool.scenario.point_scene import scene_of_points, surfels
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
@@ -50,7 +50,7 @@ def copies(path):
 
 READERS = {
     **{f"mesh{suffix}": load_meshes for suffix in endings()},
-    **{f"points{suffix}": scene_of_points for suffix in CLOUDS},
+    **{f"points{suffix}": scene_of_points for suffix in point_suffixes()},
     **{f"recording{suffix}": lambda path: compare(path, path) for suffix in RECORDINGS},
     **{f"trajectory{suffix}": load_trajectory for suffix in TABLES},
     "times.txt": lambda path: load_trajectory(kitti_beside(path), times=path),
@@ -144,7 +144,7 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text("anything")
     assert f"a{suffix} is not read: " in refused(load_meshes, path)
-    if suffix not in CLOUDS:
+    if suffix not in point_suffixes():
         assert f"a{suffix} is not read: " in refused(scene_of_points, path)
 
 

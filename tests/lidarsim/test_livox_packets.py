@@ -26,7 +26,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.export.navigation_files import write_instruments
+from lidarpool.clouds.navigation_files import write_instruments
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model

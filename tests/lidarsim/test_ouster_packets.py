@@ -29,7 +29,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.export.navigation_files import write_instruments
+from lidarpool.clouds.navigation_files import write_instruments
 from lidarpool.recordings.recordings import open_recording
 from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN

@@ -34,9 +34,9 @@ from lidarpool import (
     sweeps,
 )
 from lidarpool.base.sealed import sealed, unsealed
+from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
-from lidarpool.export.format_table import DATA_SETS
 from lidarpool.report.campaign_output import verify
 from lidarpool.run.progress import Progress
 from lidarsim.base.errors import explained

@@ -41,9 +41,8 @@ import poolpart
 import raybeam
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
+from lidarpool.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
 from lidarpool.datasets.dataset import DATA_SETS
-from lidarpool.export.format_table import EXPORTS, LAYOUTS
-from lidarpool.scenario import point_files as points
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
@@ -659,7 +658,7 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
             endings(),
         ),
         (("how-to/terrain",), endings(lambda row: row.raster)),
-        (("how-to/point-clouds",), points.SUFFIXES),
+        (("how-to/point-clouds",), point_suffixes()),
     ],
 )
 def test_files_that_can_be_read_are_on_their_pages(pages, suffixes):

@@ -10,9 +10,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
-from lidarpool.export import pieces
-from lidarpool.export.folder import result_folder
-from lidarpool.export.formats import Format
+from lidarpool.clouds import pieces
+from lidarpool.clouds.folder import result_folder
+from lidarpool.clouds.formats import Format
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarpool.export.folder import result_folder
+from lidarpool.clouds.folder import result_folder
 from lidarpool.report.output import FILES
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")

@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
+    from .clouds.formats import save_cloud
+    from .clouds.open3d_cloud import to_open3d
+    from .clouds.ply import read_cloud
     from .compare.comparison import Comparison, compare
     from .compare.fit import Fit, fit
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
-    from .export.formats import save_cloud
-    from .export.open3d_cloud import to_open3d
-    from .export.ply import read_cloud
     from .live.scanner_page import show
     from .plan import Plan, Planning
     from .playback.live import play
@@ -129,9 +129,9 @@ _MODULES = {
     ".api.simulation": ("Campaign", "simulate"),
     ".datasets.loader": ("sweeps",),
     ".datasets.sweep_data": ("Sweep",),
-    ".export.formats": ("save_cloud",),
-    ".export.open3d_cloud": ("to_open3d",),
-    ".export.ply": ("read_cloud",),
+    ".clouds.formats": ("save_cloud",),
+    ".clouds.open3d_cloud": ("to_open3d",),
+    ".clouds.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),
     ".live.scanner_page": ("show",),
     ".plan": ("Plan", "Planning"),

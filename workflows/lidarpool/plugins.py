@@ -1,9 +1,20 @@
-"""What plug-ins that write clouds import; docs/how-to/plugins.md has an example."""
+"""What plug-ins that write and read clouds import; docs/how-to/plugins.md has an example."""
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .export.format_table import FormatRow
-from .export.pieces import Pieces
+from .clouds.file_points import FilePoints
+from .clouds.format_table import FormatRow
+from .clouds.pieces import Pieces
+from .clouds.recording import Recording, RecordingSource
 
-__all__ = ["Cloud", "CloudLike", "FormatRow", "Pieces", "Sweeps"]
+__all__ = [
+    "Cloud",
+    "CloudLike",
+    "FilePoints",
+    "FormatRow",
+    "Pieces",
+    "Recording",
+    "RecordingSource",
+    "Sweeps",
+]

@@ -1,10 +1,10 @@
-"""Writes a cloud as a folder of NumPy files, one for each sweep."""
+"""Writes and reads a cloud as a folder of NumPy files, one for each sweep."""
 
 import io
 
 import numpy as np
 
-from lidarpool.plugins import Cloud, FormatRow, Pieces
+from lidarpool.plugins import Cloud, FormatRow, Pieces, Recording, RecordingSource
 
 ROW = FormatRow(
     "npy",  # folder in a result
@@ -14,6 +14,7 @@ ROW = FormatRow(
     needs=("scan",),
     holds=(),
     inside=r"\d+\.npy",
+    folders=("[0-9]*.npy",),  # that open_folder reads
 )
 
 
@@ -25,3 +26,9 @@ class SweepFiles(Pieces):
         file = io.BytesIO()
         np.save(file, points.positions.astype(np.float32))
         return {f"{number:06}.npy": file.getvalue()}, None
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the files of a folder as sweeps, whose positions are in the world."""
+    files = sorted(source.path.glob("[0-9]*.npy"))
+    return source.recording(len(files), lambda number: (np.load(files[number]), {}, np.eye(4)))

@@ -18,7 +18,7 @@ from lidarsim.sensor import Survey
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base.shard import Shard
-from ..export.folder import output_place
+from ..clouds.folder import output_place
 from ..live import page_of
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput

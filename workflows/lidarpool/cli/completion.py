@@ -15,7 +15,7 @@ from click.shell_completion import CompletionItem
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
 
-from ..export.format_table import EXPORTS, GROUP
+from ..clouds.format_table import EXPORTS, GROUP
 from ..playback.bridge_table import BRIDGES
 from ..viewers.table import PAGE, VIEWERS
 

@@ -13,7 +13,7 @@ import click
 
 from lidarsim.base.storage import Storage
 
-from ..export.format_table import LAYOUTS
+from ..clouds.format_table import LAYOUTS
 from . import completion
 from . import shared_options as options
 from .first_step import begin

@@ -15,7 +15,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
-from ..export.format_table import EXPORTS, LAYOUTS, row_of
+from ..clouds.format_table import EXPORTS, LAYOUTS, row_of
 from . import completion
 from . import shared_options as options
 
@@ -79,7 +79,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..base.fork_server import keep_freed_memory
-    from ..export.folder import local_folder, local_result, send
+    from ..clouds.folder import local_folder, local_result, send
     from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
@@ -151,8 +151,8 @@ def export(
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-    from ..export.folder import local_result, result_folder, send
-    from ..export.formats import Format
+    from ..clouds.folder import local_result, result_folder, send
+    from ..clouds.formats import Format
 
     # The report of a result is moved into place last.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -258,7 +258,7 @@ def view(
     from lidarview.picture_file import PICTURE_FILE
     from lidarview.viewer.view import CLOUD, show_view
 
-    from ..export.folder import local_result
+    from ..clouds.folder import local_result
     from ..live.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:

@@ -19,9 +19,9 @@ from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base import timeline
 from ..base.shard import Shard, shard_in_words
+from ..clouds.folder import local_result, output_place, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
-from ..export.folder import local_result, output_place, result_folder
 from ..live import page_of
 from ..report.campaign_output import CAMPAIGN_FILE, DataSetOutput, check_same, failures, verify
 from ..report.output import CLOUD, SurveyOutput

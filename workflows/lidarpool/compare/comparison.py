@@ -26,10 +26,11 @@ from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
 from ..base.neighbours import nearest
+from ..clouds.folder import result_folder, staging
+from ..clouds.recording import RecordedPoints, Recording
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
-from ..export.folder import result_folder, staging
-from ..recordings.recordings import RecordedPoints, Recording, open_recording
+from ..recordings.recordings import open_recording
 from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
 

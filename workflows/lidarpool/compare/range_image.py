@@ -17,7 +17,7 @@ from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import plural
 
-from ..recordings.recordings import RecordedPoints
+from ..clouds.recording import RecordedPoints
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings close to each other
 _STEP_TOLERANCE = 0.15  # by how much single steps may differ from their mean

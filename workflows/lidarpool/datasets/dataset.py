@@ -26,13 +26,13 @@ from lidarsim.columns.cloud import CloudLike
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import SealedWriter
-from ..export.boxes import Boxes
-from ..export.folder import local_folder
-from ..export.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
-from ..export.formats import Format
-from ..export.kitti import NAMES_FILE, labels_file
-from ..export.nuscenes import merge
-from ..export.pieces import Entry, Pieces, pieces_of
+from ..clouds.boxes import Boxes
+from ..clouds.folder import local_folder
+from ..clouds.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
+from ..clouds.formats import Format
+from ..clouds.kitti import NAMES_FILE, labels_file
+from ..clouds.nuscenes import merge
+from ..clouds.pieces import Entry, Pieces, pieces_of
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")

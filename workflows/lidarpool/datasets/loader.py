@@ -29,12 +29,12 @@ from lidarsim.base.words import did_you_mean
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
-from ..export.boxes import Boxes
-from ..export.folder import refuse_missing
-from ..export.format_table import DATA_SETS
-from ..export.formats import Format
-from ..export.pieces import Entry
-from ..export.reading import Reader
+from ..clouds.boxes import Boxes
+from ..clouds.folder import refuse_missing
+from ..clouds.format_table import DATA_SETS
+from ..clouds.formats import Format
+from ..clouds.pieces import Entry
+from ..clouds.sweep_reader import Reader
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import Sweep

@@ -16,8 +16,8 @@ from lidarsim.base.signatures import ReadableSignature
 from lidarsim.sensor import Fault
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..export.boxes import Boxes, SweepBoxes
-from ..export.reading import PointColumns
+from ..clouds.boxes import Boxes, SweepBoxes
+from ..clouds.sweep_reader import PointColumns
 from .job_table import JobRow, Value
 
 

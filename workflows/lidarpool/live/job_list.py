@@ -21,11 +21,11 @@ from lidarview.viewer.point_selection import OrderedPoints
 from lidarview.viewer.server import Answer, Arguments, announced, page_server
 from lidarview.viewer.view import View, wait_for_interrupt
 
+from ..clouds.format_table import data_set_title
 from ..datasets.dataset import job_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import JobRow, Value, read_table
 from ..datasets.loader import read_index, sweeps
-from ..export.format_table import data_set_title
 from .downloads import downloads
 from .recorded import Pieces
 

@@ -19,7 +19,7 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
 from lidarview.viewer.view import Downloads, View
 
-from ..recordings.recordings import Recording
+from ..clouds.recording import Recording
 
 MAX_POINTS = 20_000_000  # of a recording, in memory
 LARGE_POINTS = 2_000_000  # of a cloud, of which a sample is shown while it is read

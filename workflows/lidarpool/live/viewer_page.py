@@ -22,10 +22,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarview.viewer.view import wait_for_interrupt
 
-from ..columns.parts import read_part
-from ..datasets.job_table import JobRow
-from ..export.frames import WORLD
-from ..export.shown_sweeps import (
+from ..clouds.frames import WORLD
+from ..clouds.shown_sweeps import (
     ShownSweep,
     Surface,
     Surroundings,
@@ -34,6 +32,8 @@ from ..export.shown_sweeps import (
     path_in_world,
     sendable,
 )
+from ..columns.parts import read_part
+from ..datasets.job_table import JobRow
 from ..plan import best
 from ..run.pipeline.messages import Receipt, ScanFrame
 from ..run.progress import Progress

@@ -24,7 +24,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.ports import port_number
 from lidarsim.base.words import shortened
 
-from ..export.ros.messages import LATCHED_TOPICS, RosMessage, message_store
+from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
 LOOPBACK = "127.0.0.1"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"

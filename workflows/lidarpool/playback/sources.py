@@ -23,9 +23,9 @@ from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-from ..export.folder import local_result
-from ..export.formats import Format
-from ..export.navigation_files import write_instruments
+from ..clouds.folder import local_result
+from ..clouds.formats import Format
+from ..clouds.navigation_files import write_instruments
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec

@@ -10,7 +10,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
-from ..export.shown_sweeps import Surroundings, SweepSequence
+from ..clouds.shown_sweeps import Surroundings, SweepSequence
 from ..viewers.viewer import Viewer, check_installed, open_viewer
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule

@@ -20,13 +20,13 @@ from ..base.job_errors import lines_of_errors
 from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
+from ..clouds.folder import LAST_FILE, refuse_missing, result_folder
+from ..clouds.format_table import DATA_SETS
+from ..clouds.formats import Format
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
-from ..export.folder import LAST_FILE, refuse_missing, result_folder
-from ..export.format_table import DATA_SETS
-from ..export.formats import Format
 from ..run.run_result import CampaignRun
 from ..run.runner import Output, Run
 from ..run.store.database import FILE

@@ -13,10 +13,10 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarview.render.picture_page import Page
 
+from ..clouds.folder import LAST_FILE
 from ..datasets.figures import Figures
 from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
-from ..export.folder import LAST_FILE
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_times, draw_varied
 from .page.rendering import rendered

@@ -15,8 +15,8 @@ from lidarsim.columns.part_columns import positions_of
 from lidarsim.columns.ply_format import PlyLayout, layout
 from lidarsim.columns.table import AXES, Column
 
+from ..clouds.pieces import THREADS
 from ..columns.parts import StoredCloud
-from ..export.pieces import THREADS
 
 _CELLS = 64  # along an axis of the grid in which points are counted, a power of two
 _BLOCK_ROWS = 1 << 15  # rows whose positions are counted at a time, which fit into a cache

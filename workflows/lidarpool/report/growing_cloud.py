@@ -20,8 +20,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
+from ..clouds.ply import GrowingPly, real_type
 from ..columns.parts import StoredCloud, read_part
-from ..export.ply import GrowingPly, real_type
 from ..run.pipeline.messages import Receipt
 from ..run.store.job_under_way import JobUnderWay
 from .cloud_counts import CloudCounts

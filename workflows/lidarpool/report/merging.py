@@ -23,11 +23,11 @@ from ..base.field_words import differences
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..base.software import software
+from ..clouds.folder import LAST_FILE, output_place, refuse_missing, result_folder
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_seconds import known_seconds, read_seconds
 from ..datasets.job_table import JobRow
-from ..export.folder import LAST_FILE, output_place, refuse_missing, result_folder
 from ..plan import Trial
 from ..run.job_source import OneJob
 from ..run.options import RunOptions

@@ -24,11 +24,11 @@ from lidarview.picture_file import PICTURE_FILE
 from ..base import timeline
 from ..base.field_words import differences
 from ..base.open3d_module import load_open3d
+from ..clouds.folder import LAST_FILE, result_folder, staging
+from ..clouds.format_table import FORMATS, FormatRow, plugin_rows
+from ..clouds.formats import Format, refuse_strangers
+from ..clouds.navigation_files import write_instruments
 from ..columns.parts import StoredCloud
-from ..export.folder import LAST_FILE, result_folder, staging
-from ..export.format_table import FORMATS, FormatRow, plugin_rows
-from ..export.formats import Format, refuse_strangers
-from ..export.navigation_files import write_instruments
 from ..run.pipeline.messages import Receipt
 from ..run.run_result import RunResult
 from ..run.runner import Output, Run

@@ -37,7 +37,7 @@ from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..export.navigation_files import instrument_bytes
+from ..clouds.navigation_files import instrument_bytes
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from .cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed

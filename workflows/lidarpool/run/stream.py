@@ -32,10 +32,10 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
+from ..clouds.boxes import Boxes
+from ..clouds.kitti import intensity_of
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
-from ..export.boxes import Boxes
-from ..export.kitti import intensity_of
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.empty_cloud import empty_cloud_reason

@@ -20,11 +20,11 @@ from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
 from ..base.software import plugin_versions
+from ..clouds.pieces import PieceRange, RangeWriter
+from ..clouds.pieces import WrittenRange as Range
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
-from ..export.pieces import PieceRange, RangeWriter
-from ..export.pieces import WrittenRange as Range
 from .cluster.cluster import Cluster
 from .cluster.tasks import Tasks
 from .pipeline.casting_workers import share

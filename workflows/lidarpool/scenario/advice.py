@@ -17,7 +17,7 @@ from lidarsim.sensor.materials import MaterialTable
 from lidarsim.sensor.survey import START_FROM
 from lidarsim.sensor.trajectory import presence_ns
 
-from ..export.laser_scan import has_planar_sensors
+from ..clouds.laser_scan import has_planar_sensors
 from .build import Built
 from .scenario import Scenario
 

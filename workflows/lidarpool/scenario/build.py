@@ -36,10 +36,10 @@ from lidarsim.simulator.casting.surfaces import warn_of_grey
 from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..export.format_table import check_whole
-from ..export.formats import Format
-from ..export.laser_scan import with_laser_scans
-from ..export.packets import with_packet_columns
+from ..clouds.format_table import check_whole
+from ..clouds.formats import Format
+from ..clouds.laser_scan import with_laser_scans
+from ..clouds.packets import with_packet_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import (

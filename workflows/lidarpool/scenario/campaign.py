@@ -25,8 +25,8 @@ from lidarsim.base.yamlfile import read_yaml
 from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
+from ..clouds.laser_scan import with_laser_scans
 from ..datasets.job_table import Value
-from ..export.laser_scan import with_laser_scans
 from .build import Job
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
 from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits

@@ -27,8 +27,8 @@ from lidarsim.scene.files.mesh_formats import plugin_of
 from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.software import plugin_versions
+from ..clouds.format_table import check_whole
 from ..datasets.job_table import Value
-from ..export.format_table import check_whole
 from .build import Job, build
 from .campaign_sections import (
     MAX_JOBS,

@@ -52,9 +52,9 @@ from lidarsim.base.validation import checked_fields, sentences
 from lidarsim.base.words import did_you_mean_each, in_yaml, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
+from ..clouds.format_table import DATA_SETS, LAYOUTS
+from ..clouds.formats import Format
 from ..datasets.job_table import Value
-from ..export.format_table import DATA_SETS, LAYOUTS
-from ..export.formats import Format
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion

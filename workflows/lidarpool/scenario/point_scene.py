@@ -27,7 +27,8 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..base.open3d_module import load_open3d
-from .point_files import MIN_POINTS, POINT_BYTES, ScannedPoints, read_points
+from ..clouds.file_points import MIN_POINTS, POINT_BYTES
+from .point_files import ScannedPoints, read_points
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.

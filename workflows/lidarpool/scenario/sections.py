@@ -58,7 +58,7 @@ from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 from lidarsim.sensor.survey import EpsgCode
 
-from ..export.formats import Format
+from ..clouds.formats import Format
 from ..plan.planning import Search
 
 MAX_COPIES = 1_000_000  # of an entry

@@ -14,8 +14,8 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Records
 from lidarsim.base.errors import LidarError
 
-from ..export.frames import WORLD
-from ..export.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform
+from ..clouds.frames import WORLD
+from ..clouds.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform
 from .viewer import LOOPBACK, Address, Viewer
 
 PORT = 8765  # Foxglove's own default

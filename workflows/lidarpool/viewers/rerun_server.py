@@ -10,8 +10,8 @@ import rerun as rr
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 
-from ..export.rrd import APPLICATION, RerunLog
-from ..export.shown_sweeps import ShownSweep, Surroundings
+from ..clouds.rrd import APPLICATION, RerunLog
+from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from . import attached_child
 from .viewer import Address, Viewer
 

@@ -20,15 +20,8 @@ from lidarsim.sensor.trajectory import pose_of, presence_ns, quaternions_of
 from lidarsim.simulator import Scanner
 from lidarsim.sweeps.sweeps import type_of
 
-from ..export.frames import CARRIER, WORLD, frame_names, points_topic
-from ..export.shown_sweeps import (
-    ActorBoxes,
-    ShownSweep,
-    Surface,
-    Surroundings,
-    Transform,
-    sendable,
-)
+from ..clouds.frames import CARRIER, WORLD, frame_names, points_topic
+from ..clouds.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform, sendable
 from .viewer import Viewer, open_viewer
 
 

@@ -19,7 +19,7 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.ports import port_number
 from lidarsim.base.words import shortened
 
-from ..export.shown_sweeps import ShownSweep, Surroundings
+from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from .table import VIEWERS
 
 LOOPBACK = "127.0.0.1"

@@ -7,14 +7,14 @@ to.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from .errors import LidarError
-from .words import printable
+from .words import did_you_mean, printable
 
 T = TypeVar("T")
 
@@ -108,6 +108,53 @@ def find_plugin(group: str, name: str) -> Plugin | None:
         providers = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in candidates)
         raise LidarError(f"{providers} each provide {name!r} for {group}: uninstall all but one.")
     return candidates[0] if candidates else None
+
+
+class PluginTable(Generic[T]):
+    """A table by names, to which plug-ins of a group add.
+
+    Parameters
+    ----------
+    group
+        The group of entry points, whose names are names of the table.
+    noun
+        What the table has, for errors: «a format of clouds».
+    built_in
+        The entries of this package, {name: entry}.
+    load
+        Returns the entry of a plug-in; LidarError if the plug-in cannot be used.
+    """
+
+    def __init__(
+        self, group: str, noun: str, built_in: Mapping[str, T], load: Callable[[Plugin], T]
+    ) -> None:
+        self.group = group
+        self._noun = noun
+        self._built_in = built_in
+        self._load = cache(load)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the table, then those of plug-ins."""
+        return [*self._built_in, *plugins_of(self.group)]
+
+    def __getitem__(self, name: str) -> T:
+        """Return the entry of a name.
+
+        Raises
+        ------
+        LidarError
+            If there is no entry of that name, or its plug-in cannot be used.
+        """
+        if name in self._built_in:
+            return self._built_in[name]
+        plugin = find_plugin(self.group, name)
+        if plugin is None:
+            raise LidarError(
+                f"{name!r} is not {self._noun}.{did_you_mean(name, self.names)} There are "
+                f"{', '.join(self.names)}."
+            )
+        return self._load(plugin)
 
 
 def _a(noun: str) -> str:

@@ -1,18 +1,19 @@
-"""Encoders of packets: a class for each maker, in the table or from plug-ins."""
+"""Encoders and decoders of packets: classes for each maker, in the tables or from plug-ins."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ..base.arrays import Bools, Bytes, Floats, Ints
+from ..base.arrays import AnyArray, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarError
-from ..base.plugins import find_plugin, plugins_of
+from ..base.plugins import Plugin, PluginTable
 from ..base.words import did_you_mean
 from ..sensor import Sensor
 from ..sensor.packet_settings import Identifier, PacketSettings
@@ -175,6 +176,53 @@ class PacketEncoder(ABC):
         return float(value)
 
 
+class PacketDecoder(ABC):
+    """Reads the sweeps of a maker's packets from a file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    name
+        Name of the file in messages.
+
+    Raises
+    ------
+    LidarError
+        If the packets are not read, or a package that reads them is not installed.
+    """
+
+    intensity: ClassVar[str] = ""  # column that is `WHITE` for a white surface, at any range
+    refusal: ClassVar[str] = ""  # what the file has and why it is not read, if it is not
+    sensors: Sequence[str] = ("",)  # names of the sensors in the file; "" for an only one
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.path = path
+        self.name = name
+
+    @staticmethod
+    @abstractmethod
+    def reads(path: Path, frame: bytes) -> bool:
+        """Return whether a file is of this maker.
+
+        `frame` begins with the size of its first Ethernet frame, 4 bytes, and the original size.
+        """
+
+    @abstractmethod
+    def sweeps(self, sensor: int) -> Iterable[Any]:
+        """Return the sweeps of a sensor, an object of the maker's software each, from the first."""
+
+    @abstractmethod
+    def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
+        """Return the columns (n,) of a sweep's points, with x, y and z in metres."""
+
+    @abstractmethod
+    def time_ns(self, sweep: Any) -> float:
+        """Return the start of a sweep, nanoseconds."""
+
+
+WHITE = 100.0  # intensity that Velodyne and Ouster report of a white surface at any range
+
 # {format of packets: module and class of its encoder}
 ENCODERS = {
     "hesai": "lidarsim.packets.hesai:HesaiEncoder",
@@ -185,6 +233,46 @@ ENCODERS = {
 }
 
 
+# Classes of decoders, in the order in which they are asked: packets of Ouster have no mark.
+_DECODERS = (
+    "lidarsim.packets.velodyne:VelodyneDecoder",
+    "lidarsim.packets.hesai:HesaiDecoder",
+    "lidarsim.packets.ouster:OusterDecoder",
+)
+
+
+def decoder_of(path: Path, name: str, frame: bytes) -> PacketDecoder:
+    """Return the decoder of a file by its first frame; `name` is the file's in messages.
+
+    Raises
+    ------
+    LidarError
+        If the packets of the file are not read, or a package that reads them is not installed.
+    """
+    classes: Iterator[type[PacketDecoder]] = map(_imported, _DECODERS)
+    decoder = next(decoder for decoder in classes if decoder.reads(path, frame))
+    if decoder.refusal:
+        raise LidarError(f"{name} has {decoder.refusal}.")
+    return decoder(path, name)
+
+
+def _imported(value: str) -> Any:
+    """Return the class of «module:class»."""
+    module, _, attribute = value.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
+    """Return the encoder of a plug-in; LidarError for another class."""
+    encoder = plugin.load(type)
+    if not issubclass(encoder, PacketEncoder):
+        raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
+    return encoder
+
+
+_TABLE: PluginTable[Any] = PluginTable(GROUP, "a format of packets", ENCODERS, _encoder_of_plugin)
+
+
 def encoder_class(name: str) -> type[PacketEncoder]:
     """Return the encoder of a format of packets, of the table or of a plug-in.
 
@@ -193,20 +281,8 @@ def encoder_class(name: str) -> type[PacketEncoder]:
     LidarError
         If there is no format of that name, or its plug-in cannot be used.
     """
-    if name in ENCODERS:
-        module, _, attribute = ENCODERS[name].partition(":")
-        encoder: type[PacketEncoder] = getattr(import_module(module), attribute)
-        return encoder
-    plugin = find_plugin(GROUP, name)
-    if plugin is None:
-        names = [*ENCODERS, *plugins_of(GROUP)]
-        raise LidarError(
-            f"{name!r} is not a format of packets.{did_you_mean(name, names)} There are "
-            f"{', '.join(names)}."
-        )
-    encoder = plugin.load(type)
-    if not issubclass(encoder, PacketEncoder):
-        raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
+    entry = _TABLE[name]
+    encoder: type[PacketEncoder] = _imported(entry) if isinstance(entry, str) else entry
     return encoder
 
 

@@ -6,6 +6,7 @@ Sources: see hesai_layouts.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..base.arrays import AnyArray, Bytes, Ints, Records
 from ..base.errors import LidarError
 from ..base.words import did_you_mean
 from ..sensor.beams import Mirror, Spin
-from .encoders import Datagrams, PacketEncoder, PacketSource
+from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
 from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, Layout
 from .hesai_ptc import PtcDevice, PtcService
@@ -217,3 +218,16 @@ def _fill_checksums(packets: Records) -> None:
         sums = np.zeros(len(packets), np.uint32)
         hesai_loops.checksums(payloads[:, covered], table, sums)
         records[field] = sums
+
+
+class HesaiDecoder(PacketDecoder):
+    """Refuses packets of Hesai, which no package of the index reads as sweeps."""
+
+    refusal = (
+        "packets of a Hesai, which are not read: write points of them as .pcd with Hesai's SDK"
+    )
+
+    @staticmethod
+    def reads(path: Path, frame: bytes) -> bool:
+        """Return whether the datagram has Hesai's mark."""
+        return frame[50:52] in (b"\xee\xff", b"\xff\xee")

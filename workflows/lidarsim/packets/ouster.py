@@ -7,22 +7,28 @@ parsing.cpp, packet.cpp, xyzlut.cpp and metadata.cpp; recordings that come with 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
+from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.elementary import sin_cos
+from ..base.errors import LidarError
+from ..base.extras import reading
+from ..base.input_files import input_size
 from ..base.vectors import applied, inverse, matmul
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from ..sensor.trajectory import matrices
-from .encoders import Datagrams, PacketEncoder, PacketSource
+from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
 from .service import Destination, Service
@@ -466,3 +472,55 @@ class OusterEncoder(PacketEncoder):
 def _rounded(values: Floats) -> list[float]:
     """Return values without the last digits, in which radians are not exact, as a list."""
     return [float(value) for value in np.round(values, 9).ravel() + 0.0]
+
+
+class OusterDecoder(PacketDecoder):
+    """Reads the scans of ouster-sdk; a .json beside a .pcap has the metadata."""
+
+    intensity = "reflectivity"
+
+    def __init__(self, path: Path, name: str) -> None:
+        super().__init__(path, name)
+        if find_spec("ouster") is None:
+            # ouster-sdk requires old versions of packages that it can do without.
+            raise LidarError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
+        with reading(name):
+            input_size(path)
+            if (metadata := path.with_suffix(".json")).exists():
+                input_size(metadata)
+            self._infos = self._open().sensor_info
+            self._tables: dict[int, Any] = {}
+            self.sensors = [f"{info.prod_line} {info.sn}".strip() for info in self._infos]
+
+    @staticmethod
+    def reads(path: Path, frame: bytes) -> bool:
+        """Return True: the packets have no mark, so ouster-sdk reads whatever no other maker's."""
+        return True
+
+    def sweeps(self, sensor: int) -> Iterable[Any]:
+        """Return the scans of a sensor."""
+        return (scans[sensor] for scans in self._open() if scans[sensor] is not None)
+
+    def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
+        """Return positions, ring, and the fields of reflectivity, signal and near infrared."""
+        ring, column = np.nonzero(sweep.field("RANGE"))
+        x, y, z = self._positions(sensor)(sweep)[ring, column].T
+        columns = {"x": x, "y": y, "z": z, "ring": ring}
+        for field_name in {"REFLECTIVITY", "SIGNAL", "NEAR_IR"}.intersection(sweep.fields):
+            columns[field_name.lower()] = sweep.field(field_name)[ring, column]
+        return columns
+
+    def time_ns(self, sweep: Any) -> float:
+        """Return the time of the first column."""
+        stamps = sweep.timestamp[sweep.timestamp > 0]
+        return float(stamps.min()) if len(stamps) else 0.0
+
+    def _open(self) -> Any:
+        return import_module("ouster.sdk").open_source(str(self.path))
+
+    def _positions(self, sensor: int) -> Any:
+        """Return the function from a scan to positions (rings, columns, 3) in metres."""
+        if sensor not in self._tables:
+            core = import_module("ouster.sdk.core")
+            self._tables[sensor] = core.XYZLut(self._infos[sensor], False)
+        return self._tables[sensor]

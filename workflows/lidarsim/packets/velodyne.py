@@ -6,13 +6,19 @@ timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..base.arrays import AnyArray, Ints
-from .encoders import Datagrams, PacketEncoder, PacketSource
+from ..base.errors import LidarError
+from ..base.extras import need, reading
+from ..base.input_files import open_input
+from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .service import Destination, Service
 from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
@@ -27,6 +33,7 @@ _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _AZIMUTHS = 36_000  # in a revolution
 _MAX_UNITS = 65_535
 _HOUR_US = 3_600_000_000
+_FRAME_BYTES = (1248, 554)  # of Ethernet frames with points, and with a position
 # Laser of the VLS-128 whose time is the packet's: the first of the fourth group of eight.
 _STAMPED_LASER_OF_128 = 24
 
@@ -143,3 +150,42 @@ class VelodyneEncoder(PacketEncoder):
         firing = np.arange(used) // self._planes * _BLOCK_LASERS // channels
         blocks["azimuth"][:, :used] = by_firing[:, firing]
         blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers take the last block's
+
+
+class VelodyneDecoder(PacketDecoder):
+    """Reads the packets of a Velodyne, which name the model of the sensor, by velodyne_decoder."""
+
+    intensity = "intensity"
+
+    def __init__(self, path: Path, name: str) -> None:
+        super().__init__(path, name)
+        need("velodyne_decoder", "fit", f"{name} is read")
+        with reading(name), open_input(path) as file:
+            file.seek(24)
+            headers = iter(partial(file.read, 16), b"")
+            frames = (file.read(int.from_bytes(header[8:12], "little")) for header in headers)
+            packets = (frame for frame in frames if len(frame) == _FRAME_BYTES[0])
+            units = {(*packet[26:30], int.from_bytes(packet[36:38])) for packet in packets}
+        if len(units) > 1:
+            a, b, c, d, port = min(units)
+            command = f"tcpdump -r {name} -w one.pcap src {a}.{b}.{c}.{d} and dst port {port}"
+            raise LidarError(f"{name} is of {len(units)} units: keep one, {command}.")
+
+    @staticmethod
+    def reads(path: Path, frame: bytes) -> bool:
+        """Return whether a packet has the size of a Velodyne's."""
+        return int.from_bytes(frame[:4], "little") in _FRAME_BYTES
+
+    def sweeps(self, sensor: int) -> Iterable[Any]:
+        """Return the sweeps, as velodyne_decoder gives them."""
+        decoder: Any = import_module("velodyne_decoder")
+        sweeps: Iterable[Any] = decoder.read_pcap(str(self.path), as_pcl_structs=True)
+        return sweeps
+
+    def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
+        """Return the fields of the points."""
+        return {name: sweep.points[name] for name in sweep.points.dtype.names}
+
+    def time_ns(self, sweep: Any) -> float:
+        """Return the time at which the receiver has got the sweep."""
+        return float(1e9 * sweep.stamp.host)

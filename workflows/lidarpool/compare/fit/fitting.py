@@ -27,8 +27,9 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Pose
 from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
 
+from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
-from ...recordings.recordings import Recording, open_recording
+from ...recordings.recordings import open_recording
 from ...report.page.rendering import rendered
 from .charts import draw_charts
 from .estimates import Estimate

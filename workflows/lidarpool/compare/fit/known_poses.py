@@ -19,7 +19,7 @@ from lidarsim.sensor import Pose
 from lidarsim.sensor.trajectory import check_rotations, pose_of
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
-from ...recordings.recordings import FiredPoints, Recording
+from ...clouds.recording import FiredPoints, Recording
 from .motion import Speed, sweep_period_ns
 
 _MAX_SWEEPS = 64  # whose poses are read

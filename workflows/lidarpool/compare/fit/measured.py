@@ -14,7 +14,7 @@ from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
 
-from ...recordings.recordings import Recording
+from ...clouds.recording import Recording
 from .estimates import MIN_RAYS, Estimate
 from .known_poses import KnownPoses
 from .motion import read_static

@@ -10,7 +10,7 @@ from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.sampling import even_indices
 
-from ...recordings.recordings import Recording
+from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
 from .search import MIN_SHIFT_M, MIN_YAW_RAD, motion_between
 from .sight import RigidMotion

@@ -21,8 +21,7 @@ from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.simulator import Scanner
 
-from ...recordings.recordings import FiredPoints, Recording, rings_of
-from ...recordings.sweep_files import Read
+from ...clouds.recording import FiredPoints, Read, Recording, rings_of
 from .stack import MAX_KINK_M, SweepStack
 from .surfaces import (
     ASSUMED_DIRECTION_NOISE_RAD,

@@ -18,7 +18,7 @@ from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.sampling import even_indices
 
-from ...recordings.recordings import RecordedPoints, Recording
+from ...clouds.recording import RecordedPoints, Recording
 from ..range_image import RangeImages, range_images
 
 MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly

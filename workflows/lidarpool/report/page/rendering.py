@@ -29,7 +29,7 @@ from lidarsim.sensor import Noise, Returns
 from lidarsim.sensor.weather import Weather
 from lidarview.render.stage import nice_step
 
-from ...export.format_table import data_set_title
+from ...clouds.format_table import data_set_title
 from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.run_result import RunResult

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -12,6 +14,8 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, AnyFloats
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import read_input
 from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
@@ -19,13 +23,19 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
+from lidarsim.scene.files.cloud_scan import with_usual_names
+from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
+from lidarsim.scene.files.stated_system import StatedSystem, stated_metres
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
-from . import reading
+from . import sweep_reader
+from .file_points import FilePoints, from_columns
+from .recording import NoiseFilter, Read, Recording, RecordingSource, open_cloud, positions_of
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
+FILE = "cloud.ply"  # of a result
 FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long for a point
 _BLOCK_BYTES = 1 << 23  # moved at a time
 
@@ -244,7 +254,7 @@ def _comment(name: str) -> str:
     return printable(name).encode("ascii", "backslashreplace").decode()
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: all columns of each point."""
 
     def files(self, sweep: int) -> list[str]:
@@ -255,7 +265,7 @@ class Reader(reading.Reader):
     def _cloud(self) -> CloudFile:
         return CloudFile(self.local(self.files(0)[0]))
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep."""
         first, stop = (self._cloud.row_of(scan) for scan in self.sweeps.scans[sweep : sweep + 2])
         cloud = next(self._cloud.chunks(max(1, stop - first), first), None)
@@ -314,3 +324,74 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
             "Make room, or write to another folder."
         ) from error
     return start, row
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open a .ply, with the file of sweeps beside the .ply of a result."""
+    try:
+        cloud = CloudFile(source.path)
+    except LidarError:  # text, or of another program
+        return _open_foreign(source)
+    return replace(_open_own(source, cloud), metres=source.chosen_metres())
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the cloud of a result."""
+    path = source.path / FILE
+    return open_file(replace(source, path=path))
+
+
+def _open_foreign(source: RecordingSource) -> Recording:
+    """Open a .ply of another program, or of text, in the units of the system that it states."""
+
+    def read(_: int) -> Read:
+        columns = with_usual_names(read_ply_columns(read_input(source.path)))
+        return positions_of(columns), columns, None
+
+    system = None
+    with reading(source.name):
+        data = read_input(source.path)
+        system = StatedSystem.of_comments(ply_comments(data))
+        positions = (
+            np.zeros((0, 3))
+            if system is None
+            else positions_of(with_usual_names(read_ply_columns(data)))
+        )
+        metres, notes = stated_metres(system, positions, source.unit)
+    return source.recording(
+        1,
+        read,
+        is_cloud=True,
+        notes=source.named(notes),
+        metres=metres,
+        epsg=source.epsg_in_metres(system, metres),
+        noise_filter=NoiseFilter(),
+    )
+
+
+def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
+    """Open a .ply of lidarpool, with the file of sweeps beside the .ply of a result."""
+    if not (sweeps_path := source.path.with_name(SWEEPS_FILE)).exists():
+        return open_cloud(source.name, cloud, None, source.sensor, source.intensity)
+    try:
+        report = json.loads(read_input(source.path.with_name("report.json")))
+        keep_every = int(report["parameters"]["keep_every"])
+    except (OSError, ValueError, TypeError, LookupError, LidarError):
+        keep_every = 1
+    note = (
+        f"{source.name} keeps one of {keep_every} hits, so its gaps are no lost returns: run it "
+        "with keep_every 1 to compare these"
+    )
+    fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
+    load = partial(Sweeps.load, sweeps_path)
+    return open_cloud(source.name, cloud, load, source.sensor, source.intensity, **fields)
+
+
+def read_points(path: Path) -> FilePoints:
+    """Read the vertices of a .ply."""
+    data = read_input(path)
+    content = from_columns(with_usual_names(read_ply_columns(data)))
+    return replace(content, system=StatedSystem.of_comments(ply_comments(data)))

@@ -5,20 +5,30 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import yaml
 
 from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import read_input, read_input_text
+from lidarsim.base.time_units import seconds_of
+from lidarsim.base.words import natural
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns, read_float_rows
+from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from . import pieces, reading
+from . import pieces, sweep_reader
 from .boxes import Boxes
+from .file_points import FilePoints, of_scans
 from .pieces import Data, Entry, as_data
+from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
 
+_MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]  # of KITTI
 MAX_INSTANCES = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
@@ -100,7 +110,7 @@ def intensity_of(points: Cloud) -> Floats32:
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: intensity (reflectivity, 0 to 1), class and object of points."""
 
     def files(self, sweep: int) -> list[str]:
@@ -109,7 +119,7 @@ class Reader(reading.Reader):
         number = f"{self.sweeps.numbers[sweep]:06}"
         return [f"{folder}/velodyne/{number}.bin", f"{folder}/labels/{number}.label"]
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep."""
         file, labels_file = self.files(sweep)
         rows = self.rows(file, np.dtype("<f4")).reshape(-1, 4)
@@ -191,3 +201,105 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
         numbers = " ".join(f"{value:.4f}" for value in values)
         lines.append(f"{sweeps.actor_types[actor]} 0.00 3 {numbers}\n")
     return "".join(lines)
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open a .bin of KITTI or nuScenes, a sweep, with its labels."""
+    labels = source.path.parent.parent / "labels" / f"{source.path.stem}.label"
+    return source.of_sensors({"": SweepFiles(1, lambda _: _read_sweep(source.path, labels, None))})
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open a sequence of KITTI odometry or SemanticKITTI."""
+    with reading(source.name):
+        sequences = _sequences(source.path)
+    return source.of_sensors(sequences)
+
+
+def read_points(path: Path) -> FilePoints:
+    """Read the points of a .bin, seen from zero."""
+    return of_scans(read_float_rows(path))
+
+
+def _sequences(folder: Path) -> dict[str, SweepFiles]:
+    """Open the sequences of KITTI odometry or SemanticKITTI, a sequence, or its .bin files."""
+    sequences = sorted(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
+    if sequences:
+        return {
+            sequence.name: _sequence(sequence, "velodyne")._replace(sequence=sequence.name)
+            for sequence in sequences
+        }
+    for inner in ("velodyne", "velodyne_points/data", "."):
+        if any((folder / inner).glob("*.bin")):
+            return {"": _sequence(folder, inner)}
+    return {}
+
+
+def _sequence(folder: Path, inner: str) -> SweepFiles:
+    """Open the sweeps of a folder, with its labels, poses and times if it has these."""
+    files = sorted((folder / inner).glob("*.bin"), key=lambda file: natural(file.name))
+    poses: Floats | None = None
+    if (folder / "poses.txt").exists():
+        rows = _matrices(folder / "poses.txt")
+        camera = _calibration(folder / "calib.txt")
+        poses = np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
+    times_ns: Floats | None = None
+    if (folder / "times.txt").exists():
+        seconds = np.loadtxt(folder / "times.txt", ndmin=1)
+        times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds into times.txt")
+    for kind, rows_of_kind in (("poses", poses), ("times", times_ns)):
+        if rows_of_kind is not None and len(rows_of_kind) < len(files):
+            raise ValueError(
+                f"{kind}.txt has {len(rows_of_kind)} rows for {len(files)} files of points"
+            )
+
+    def read(number: int) -> Read:
+        file = files[number]
+        pose = None if poses is None else poses[number]
+        return _read_sweep(file, folder / "labels" / f"{file.stem}.label", pose)
+
+    return SweepFiles(len(files), read, None if times_ns is None else times_ns[: len(files)])
+
+
+def _matrices(path: Path) -> Floats:
+    """Return the matrices (n, 3, 4) of a file, one in each line; ValueError names a wrong line."""
+    reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
+    try:
+        return reader.read(read_input_text(path).splitlines(), 1).reshape(-1, 3, 4)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
+def _calibration(path: Path) -> Floats:
+    """Return the matrix (4, 4) from the lidar to the camera; the identity without a file."""
+    if path.exists():
+        for number, line in enumerate(read_input_text(path).splitlines(), 1):
+            key, _, values = line.partition(":")
+            if key == "Tr":
+                reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
+                try:
+                    return _square(reader.read([values], number).reshape(3, 4))
+                except ValueError as error:
+                    raise ValueError(f"{path.name}: {error}") from error
+    return np.eye(4)
+
+
+def _square(rows: Floats) -> Floats:
+    """Return a matrix (3, 4) as (4, 4)."""
+    return np.vstack([rows, [0, 0, 0, 1]])
+
+
+def _read_sweep(path: Path, labels: Path, pose: Floats | None) -> Read:
+    """Read a sweep, with its classes and objects if there is a file of labels."""
+    columns = read_float_columns(path, columns_by_name(path))
+    positions = take_positions(columns)
+    if labels.exists():
+        numbers = np.frombuffer(read_input(labels), "<u4")
+        if len(numbers) != len(positions):
+            raise ValueError(f"{labels.name} has {len(numbers)} labels for {len(positions)} points")
+        columns["class"] = (numbers & 0xFFFF).astype(np.uint16)
+        columns["object"] = (numbers >> 16).astype(np.int32) - 1
+    return positions, columns, pose

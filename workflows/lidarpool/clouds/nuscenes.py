@@ -8,21 +8,28 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from hashlib import md5
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import Bools, Ints
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import read_input
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
+from lidarsim.scene.transform import affine
+from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names
 
 from ..base.fingerprint import fingerprint
-from . import pieces, reading
+from . import pieces, sweep_reader
 from .boxes import Boxes
 from .format_table import FORMATS
 from .pieces import Data, Entry, as_data
+from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
 
 VERSION = "v1.0-lidarpool"
 FIRST_SENSOR = FORMATS["nuscenes"].first_sensor
@@ -113,7 +120,7 @@ class Pieces(pieces.Pieces):
         return tables.rows
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: intensity, channel and, with names, class of each point."""
 
     @cached_property
@@ -125,7 +132,7 @@ class Reader(reading.Reader):
         file = self._names[sweep]
         return [file, _LABELS + file.replace("/", "-")] if self.sweeps.classes else [file]
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep."""
         file, *labels = self.files(sweep)
         rows = self.rows(file, np.dtype("<f4")).reshape(-1, 5)
@@ -337,3 +344,64 @@ class _Tables:
                     num_radar_pts=0,
                     **beside,
                 )
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open a lidar of a nuScenes data set."""
+    tables = min(source.path.glob("v1.0-*/sample_data.json")).parent
+    with reading(source.name):
+        lidars = _lidars(source.path, tables)
+    return source.of_sensors(lidars)
+
+
+def _lidars(folder: Path, tables: Path) -> dict[str, SweepFiles]:
+    """Open the lidars of a nuScenes data set, {channel: sweeps in order of time}.
+
+    The names of channels begin with the name of their scene if there are several scenes.
+    """
+
+    def table(name: str) -> dict[str, dict[str, Any]]:
+        return {row["token"]: row for row in json.loads(read_input(tables / f"{name}.json"))}
+
+    sensors = table("sensor")
+    calibrated = table("calibrated_sensor")
+    poses = table("ego_pose")
+    labels: dict[str, str] = {}  # {token of a sweep: file of its classes}
+    if (tables / "lidarseg.json").exists():
+        labels = {row["sample_data_token"]: row["filename"] for row in table("lidarseg").values()}
+    scenes = table("scene")
+    scene_of_sample = {token: row["scene_token"] for token, row in table("sample").items()}
+    rows_of_channel: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in table("sample_data").values():
+        sensor = sensors[calibrated[row["calibrated_sensor_token"]]["sensor_token"]]
+        if sensor["modality"] == "lidar":
+            scene = scenes[scene_of_sample[row["sample_token"]]]["name"]
+            rows_of_channel.setdefault((scene, sensor["channel"]), []).append(row)
+
+    def pose_of(row: Mapping[str, Any]) -> Floats:
+        w, x, y, z = row["rotation"]
+        return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))
+
+    def sweeps_of(rows: list[dict[str, Any]]) -> SweepFiles:
+        rows.sort(key=lambda row: row["timestamp"])
+
+        def read(number: int) -> Read:
+            row = rows[number]
+            columns = read_float_columns(folder / row["filename"], NUSCENES)
+            positions = take_positions(columns)
+            if row["token"] in labels:
+                columns["class"] = np.frombuffer(read_input(folder / labels[row["token"]]), "u1")
+            calibration = pose_of(calibrated[row["calibrated_sensor_token"]])
+            return positions, columns, pose_of(poses[row["ego_pose_token"]]) @ calibration
+
+        return SweepFiles(len(rows), read, 1e3 * np.array([row["timestamp"] for row in rows]))
+
+    if len(scenes) == 1:
+        return {channel: sweeps_of(rows) for (_, channel), rows in sorted(rows_of_channel.items())}
+    return {
+        f"{scene} {channel}": sweeps_of(rows)._replace(sequence=scene)
+        for (scene, channel), rows in sorted(rows_of_channel.items())
+    }

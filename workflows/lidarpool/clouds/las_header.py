@@ -11,12 +11,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ...base.allowance import Allowance
-from ...base.errors import CutShortError, LidarError
-from ...base.extras import install_command
-from ...base.input_files import open_input
-from .noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
-from .stated_system import StatedSystem
+from lidarsim.base.allowance import Allowance
+from lidarsim.base.errors import CutShortError, LidarError
+from lidarsim.base.extras import install_command
+from lidarsim.base.input_files import open_input
+from lidarsim.scene.files.noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
+from lidarsim.scene.files.stated_system import StatedSystem
 
 # Offsets within the header, by ASPRS LAS 1.4 R15, table 3.
 _HEADER_BYTES = 375  # of LAS 1.4; 1.2 has 227

@@ -18,16 +18,27 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import CutShortError, LidarError
+from lidarsim.base.extras import reading
 from lidarsim.base.interrupts import deferred_interrupts
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.scene.files.stated_system import stated_metres
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
+from .file_points import FilePoints, check_count
 from .flight_lines import FlightLines
+from .las_header import las_system, noise_classes, open_las
+from .recording import NoiseFilter, Read, Recording, RecordingSource
 from .well_known_text import wkt
 
+# A sample consists of this many runs of points, which begin where chunks of a .laz begin: 50,000
+# points each, unless a program chooses otherwise.
+_SAMPLE_RUNS = 40
+_LAZ_CHUNK = 50_000
+_SYSTEM_POINTS = 5  # whose places say where a file is
 ANGLE_DEG = 0.006  # step of the format's scan angle
 FULL_INTENSITY = 65_535  # the format's intensity for 1 and above
 _FORMAT_FIELDS = ("return_number", "returns")  # columns stored only in fields of the format
@@ -255,3 +266,77 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
 def _name(name: str) -> str:
     """Return the name in the extra bytes of a column that has a name in files."""
     return _NAMES.get(name, name[:32])
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open the points of a .las or .laz, in parts; a sample is read evenly in the file."""
+    path = source.path
+    with reading(source.name):
+        system = las_system(path)
+        with open_las(path) as reader:
+            count = reader.header.point_count
+            classes = noise_classes(reader.header)
+            places = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
+        metres, notes = stated_metres(system, places, source.unit)
+
+    def read_run(reader: laspy.LasReader, start: int, length: int) -> Read:
+        reader.seek(start)
+        points = reader.read_points(length)
+        if len(points) != length:
+            raise CutShortError(f"{count:,} points announced, and there are fewer")
+        columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
+        return np.stack([points.x, points.y, points.z], axis=1), columns, None
+
+    def read(number: int) -> Read:
+        start = number * CHUNK_POINTS
+        with open_las(path) as reader:
+            return read_run(reader, start, min(CHUNK_POINTS, count - start))
+
+    def sample(max_points: int) -> Read:
+        length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
+        starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
+        with open_las(path) as reader:
+            runs = [read_run(reader, int(start), length) for start in starts]
+        columns = {name: np.concatenate([run[1][name] for run in runs]) for name in runs[0][1]}
+        return np.concatenate([run[0] for run in runs]), columns, None
+
+    parts = -(-count // CHUNK_POINTS)
+    return source.recording(
+        parts,
+        read,
+        is_cloud=True,
+        point_count=count,
+        notes=source.named(notes),
+        metres=metres,
+        epsg=source.epsg_in_metres(system, metres),
+        sample=sample,
+        noise_filter=NoiseFilter(classes),
+    )
+
+
+def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
+    """Return the positions (k, 3) of a few points, evenly in a file."""
+    positions = []
+    for number in np.unique(np.linspace(0, count - 1, _SYSTEM_POINTS).astype(int)).tolist():
+        if 0 <= number < count:
+            reader.seek(number)
+            point = reader.read_points(1)
+            positions.append([point.x[0], point.y[0], point.z[0]])
+    return np.reshape(np.array(positions, np.float64), (-1, 3))
+
+
+def read_points(path: Path) -> FilePoints:
+    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
+    system = las_system(path)
+    with open_las(path) as reader:
+        check_count(reader.header.point_count)
+        points = reader.read_points(-1)
+        classes = noise_classes(reader.header)
+    names = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    positions = np.stack([points.x, points.y, points.z], axis=1)
+    columns = {name: np.asarray(points[name]) for name in names}
+    columns = {name: values for name, values in columns.items() if values.ndim == 1}
+    return FilePoints(positions, columns, system=system, noise_classes=classes)

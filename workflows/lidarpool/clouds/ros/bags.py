@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +21,24 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from lidarsim.base.arrays import AnyArray, Floats32
-from lidarsim.columns.bags import message_types
+from lidarsim.base.arrays import AnyArray, Floats, Floats32
+from lidarsim.columns.bags import (
+    LIVOX_CLOUDS,
+    POINT_CLOUD,
+    livox_columns,
+    message_types,
+    open_bag,
+    point_columns,
+)
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
-from .. import reading
+from .. import sweep_reader
 from ..frames import survey_start_ns
-from .layouts import (
-    EXTRA_FIELDS,
-    LAYOUTS,
-    LaidOut,
-    message_stamp_ns,
-    sensor_traits,
-)
-from .messages import (
-    LATCHED_TOPICS,
-    message_store,
-    survey_messages,
-    sweep_topic,
-)
+from ..recording import Read, Recording, RecordingSource, positions_of
+from .bag_poses import sweep_poses
+from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
+from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topic
 
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
 _LATCHED = Qos(
@@ -123,7 +122,7 @@ def write_mcap(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: intensity, limited by the layout, channel and named class."""
 
     def files(self, sweep: int) -> list[str]:
@@ -137,7 +136,7 @@ class Reader(reading.Reader):
         bag.open()
         return bag
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep."""
         layout = LAYOUTS[self.layout]
         message = self._point_cloud(sweep)
@@ -187,3 +186,48 @@ class Reader(reading.Reader):
         if "_bag" in self.__dict__:
             self._bag.close()
         super().close()
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open a topic of PointCloud2: each message is a sweep in the frame of the message.
+
+    CustomMsg of Livox is read where a bag has no PointCloud2, or its topic is chosen.
+    """
+    bag = open_bag(source.path, source.name)
+    clouds = {
+        connection.topic: connection
+        for connection in bag.connections
+        if connection.msgtype == POINT_CLOUD
+    }
+    livox_clouds = {
+        connection.topic: connection
+        for connection in bag.connections
+        if connection.msgtype in LIVOX_CLOUDS
+    }
+    topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
+    connection = topics[source.choose("topics of PointCloud2", topics)]
+    messages = partial(bag.messages, [connection])
+    columns_of = livox_columns if topics is livox_clouds else point_columns
+
+    def points(message: Any) -> Read:
+        columns = columns_of(message[2])
+        return positions_of(columns), columns, None
+
+    def times() -> Iterator[float]:
+        return (time for _, time, _ in messages())
+
+    def frame_poses() -> Floats | None:
+        return sweep_poses(source.path, (data for _, _, data in messages()))
+
+    return source.stream(
+        messages,
+        points,
+        connection.msgcount,
+        times=times,
+        frame_poses=frame_poses,
+    )
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the folder of a bag of ROS 2."""
+    return open_file(source)

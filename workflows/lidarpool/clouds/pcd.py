@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from pathlib import Path
+
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray
+from lidarsim.base.extras import reading
+from lidarsim.base.words import natural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLOURS, NORMAL
 from lidarsim.scene.colours import as_float
-from lidarsim.scene.files.pcd import pcd_bytes
+from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED
 
 from . import pieces
+from .file_points import FilePoints, of_scans
+from .recording import NoiseFilter, Read, Recording, RecordingSource
 
 
 class Pieces(pieces.Pieces):
@@ -55,3 +62,31 @@ class Pieces(pieces.Pieces):
             name = column.name if column.name in NORMAL else column.in_files
             fields.append((name, values))
         return fields
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open a file as a sweep; VIEWPOINT has the pose of the sensor."""
+    return _open_files(source, [source.path])
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the .pcd files of a folder, a sweep each."""
+    files = [file for file in source.path.iterdir() if file.suffix.lower() == ".pcd"]
+    return _open_files(source, sorted(files, key=lambda file: natural(file.name)))
+
+
+def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
+    def read(number: int) -> Read:
+        path = files[number]
+        with reading(path.name) if len(files) > 1 else nullcontext():
+            (scan,) = read_pcd(path)
+        return scan.positions, scan.columns, scan.pose
+
+    return source.recording(
+        len(files), read, metres=source.chosen_metres(), noise_filter=NoiseFilter()
+    )
+
+
+def read_points(path: Path) -> FilePoints:
+    """Read the points of a file, seen from its VIEWPOINT."""
+    return of_scans(read_pcd(path))

@@ -8,19 +8,23 @@ import tarfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 
 from lidarsim.base.archives import open_archive, packed, read_npy
 from lidarsim.base.arrays import AnyArray, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import input_size
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
 
-from . import pieces, reading
+from . import pieces, sweep_reader
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
+from .recording import Read, Recording, RecordingSource, SweepFiles
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _RESERVED = ("points", "pose", "boxes")  # arrays that are no columns
@@ -124,7 +128,7 @@ class Pieces(pieces.Pieces):
             yield head.tobuf() + data + bytes(-len(data) % tarfile.BLOCKSIZE)
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: all columns of each point."""
 
     @cached_property
@@ -137,7 +141,7 @@ class Reader(reading.Reader):
         """Return the name of the tar file."""
         return [_shard(self.entry, int(self._offsets[sweep, 0]))]
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep; only the bytes of the sweep are read."""
         _, first, stop = self._offsets[sweep].tolist()
         sample = self.storage.read(self.files(sweep)[0], first, stop)
@@ -165,3 +169,78 @@ def _shard(entry: Entry | None, start: int) -> str:
     if entry is None:
         return f"shards/{start:06}.tar"
     return "/".join(filter(None, ("shards", entry.split, f"{entry.name}-{start:06}.tar")))
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open the samples of a tar file."""
+    return _open_files(source, [source.path])
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the samples of the tar files in a folder."""
+    files = sorted(source.path.rglob("*.tar"))
+    return _open_files(source, files)
+
+
+def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
+    with reading(source.name):
+        sensors = _sensors(files)
+    return source.of_sensors(sensors)
+
+
+def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
+    """Open the samples of tar files, {sensor: sweeps}: ``KEY.points.npy``, ``KEY.json``, ….
+
+    LidarError if no sample has points.
+    """
+    keys_of_sensor: dict[str, list[tuple[float, Path, dict[str, tuple[int, int]]]]] = {}
+    for path in files:
+        for members in _samples(path).values():
+            if "points.npy" not in members:
+                continue
+            description = json.loads(_slice(path, *members["json"])) if "json" in members else {}
+            sample = (float(description.get("time_ns", 0)), path, members)
+            keys_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
+    if not keys_of_sensor:
+        raise LidarError(
+            f"{files[0].name} has no samples of points: a WebDataset of sweeps has files "
+            "KEY.points.npy."
+        )
+
+    def sweeps_of(samples: list[tuple[float, Path, dict[str, tuple[int, int]]]]) -> SweepFiles:
+        def read(number: int) -> Read:
+            _, path, members = samples[number]
+            arrays = {
+                name.removesuffix(".npy"): read_npy(_slice(path, *span), name)
+                for name, span in members.items()
+                if name.endswith(".npy") and name != "boxes.npy"
+            }
+            pose = arrays.pop("pose", None)
+            return arrays.pop("points"), arrays, pose
+
+        times = np.array([time for time, _, _ in samples])
+        return SweepFiles(len(samples), read, times)
+
+    return {sensor: sweeps_of(samples) for sensor, samples in keys_of_sensor.items()}
+
+
+def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
+    """Return the members of a tar file by sample, {key: {ending: (offset, bytes)}}."""
+    input_size(path)
+    samples: dict[str, dict[str, tuple[int, int]]] = {}
+    with tarfile.open(path, "r:") as tar:
+        for member in tar:
+            folder, _, file = member.name.rpartition("/")
+            key, _, ending = file.partition(".")
+            samples.setdefault(f"{folder}/{key}", {})[ending] = (member.offset_data, member.size)
+    return samples
+
+
+def _slice(path: Path, offset: int, size: int) -> bytes:
+    """Read some bytes of a file."""
+    with path.open("rb") as file:
+        file.seek(offset)
+        return file.read(size)

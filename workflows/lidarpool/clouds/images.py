@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,17 @@ import numpy as np
 from lidarsim.base.archives import open_archive, packed
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import read_input
+from lidarsim.base.words import natural
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.ray_image import Image, fired_of
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
 
-from . import pieces, reading
+from . import pieces, sweep_reader
 from .boxes import Boxes
 from .pieces import Entry
+from .recording import Read, Recording, RecordingSource, SweepFiles
 
 _NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are no images
 
@@ -62,21 +67,21 @@ class Pieces(pieces.Pieces):
         return {_file(sweeps, self.folders, number): packed(arrays)}, boxes
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: all columns of each point, with time and angles of its ray."""
 
     def files(self, sweep: int) -> list[str]:
         """Return the name of the file of the images."""
         return [_file(self.sweeps, _folders(self.sweeps, self.entry), sweep)]
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep, in the order of their rays."""
         file = self.files(sweep)[0]
         with open_archive(self.storage.path(file), partial(self.storage.read, file)) as images:
             return points_of_images(images)
 
 
-def points_of_images(images: dict[str, AnyArray]) -> reading.PointColumns:
+def points_of_images(images: dict[str, AnyArray]) -> sweep_reader.PointColumns:
     """Return the points of the images of a sweep, in the order of their rays."""
     images = {name: image for name, image in images.items() if name not in _NO_IMAGES}
     planes = next(n for n in count(1) if _key("range", n) not in images)
@@ -106,3 +111,30 @@ def _folders(sweeps: Sweeps, entry: Entry | None) -> list[str]:
 
 def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
     return f"{folders[sweeps.sensor[sweep]]}/{sweeps.numbers[sweep]:06}.npz"
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open the range images of a folder, whose folders are sensors."""
+    with reading(source.name):
+        sensors = _sensors(source.path)
+    return source.of_sensors(sensors)
+
+
+def _sensors(folder: Path) -> dict[str, SweepFiles]:
+    """Open range images, {sensor: sweeps} of folders of .npz files."""
+    files_of_sensor = {
+        inner.name: sorted(inner.glob("*.npz"), key=lambda file: natural(file.name))
+        for inner in sorted(folder.iterdir())
+        if inner.is_dir()
+    }
+
+    def sweeps_of(files: list[Path]) -> SweepFiles:
+        def read(number: int) -> Read:
+            with open_archive(files[number], partial(read_input, files[number])) as images:
+                pose = images["pose"]
+                points, columns = points_of_images(images)
+            return points, columns, pose
+
+        return SweepFiles(len(files), read)
+
+    return {sensor: sweeps_of(files) for sensor, files in files_of_sensor.items() if files}

@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Collection
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import open_input
 from lidarsim.columns.cloud import CloudLike
-from lidarsim.packets.encoders import PacketSource, encoder_of
+from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.sensor import Survey
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
+from .recording import Read, Recording, RecordingSource, positions_of
+
 _FORMAT = "pcap"
+_HEADER_BYTES = 24  # of a file, and 8 of the stamp of its first packet
 
 
 def with_packet_columns(survey: Survey, formats: Collection[str]) -> Survey:
@@ -63,3 +70,20 @@ def write_pcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     for name, encoder in zip(names, encoders, strict=True):
         for suffix, content in encoder.files().items():
             (path / f"{name}{suffix}").write_bytes(content)
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open the packets of a sensor by the decoder of its maker."""
+    with reading(source.name), open_input(source.path) as file:
+        file.seek(_HEADER_BYTES + 8)
+        frame = file.read(60)
+    decoder = decoder_of(source.path, source.name, frame)
+    sensor = [*decoder.sensors].index(source.choose("sensors", decoder.sensors))
+
+    def points(sweep: Any) -> Read:
+        columns = decoder.columns(sensor, sweep)
+        return positions_of(columns), columns, None
+
+    sweeps = partial(decoder.sweeps, sensor)
+    white = WHITE if source.intensity in (None, decoder.intensity) else None
+    return source.stream(sweeps, points, white=white, times=lambda: map(decoder.time_ns, sweeps()))

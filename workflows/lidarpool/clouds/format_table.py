@@ -6,19 +6,21 @@ of the group `GROUP`, whose names are the names of the formats.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.plugins import Plugin, find_plugin, plugins_of
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.extras import need
+from lidarsim.base.plugins import Plugin, PluginTable, plugins_of
 
 GROUP = "lidarpool.clouds"
+Reading = Literal["sweeps", "points"]
 
 
 @dataclass(frozen=True)
@@ -30,18 +32,27 @@ class FormatRow:
     file
         File or folder in the folder of a result; an ending chooses the format.
     module
-        Dotted name of the module that writes it. A class `Reader` there (`export/reading.py`) reads
+        Dotted name of the module that writes it. A class `Reader` there (`clouds/reading.py`) reads
         single sweeps of data sets.
     title
         Proper name in sentences, such as KITTI; by default the name of the format.
     write
         Name of the function of the module that writes it, `write(path, cloud, sweeps)`, or with
-        `in_pieces` of a subclass of `Pieces` (`export/pieces.py`), which defines the content of
+        `in_pieces` of a subclass of `Pieces` (`clouds/pieces.py`), which defines the content of
         each file.
+    suffixes
+        Endings of the files that are read, in lower case with their dots.
+    reads
+        What the module reads of such files: "sweeps" by `open_file(source)`, which returns a
+        `Recording` of a `RecordingSource` (`recording.py`); "points" by `read_points(path)`, for
+        scenes (`FilePoints` of `file_points.py`), which raises ValueError for a broken file.
+    folders
+        Patterns of names in the folders that are read, by `open_folder(source)` as by `open_file`.
     in_pieces
         Whether it has many files, which workers can write.
     packages
-        Import packages that write it, and `extra`, the extra of lidarpool that installs them.
+        Import packages that write and read it, and `extra`, the extra of lidarpool that installs
+        them.
     needs
         Columns that a cloud must have; formats that need `scan` store single sweeps.
     holds
@@ -84,8 +95,11 @@ class FormatRow:
 
     file: str
     module: str
-    write: str
+    write: str = ""
     title: str = ""
+    suffixes: tuple[str, ...] = ()
+    reads: tuple[Reading, ...] = ()
+    folders: tuple[str, ...] = ()
     in_pieces: bool = False
     packages: tuple[str, ...] = ()
     extra: str = ""
@@ -137,6 +151,15 @@ class FormatRow:
             raise self.plugin.lacks(f"{self.module}.{name}")
         return getattr(module, name)
 
+    def reader(self, function: str, name: str) -> Any:
+        """Return a function of the module that reads; LidarError without a package it needs.
+
+        `name` is that of the file or folder in the message.
+        """
+        for package in self.packages:
+            need(package, self.extra, f"{name} is read")
+        return self.provides(function)
+
 
 _ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
 LAYOUTS = {
@@ -173,19 +196,21 @@ _NUSCENES_FILES = (
 def _las(name: str) -> FormatRow:
     return FormatRow(
         f"cloud.{name}",
-        "lidarpool.export.las",
+        "lidarpool.clouds.las",
         f"write_{name}",
         name.upper(),
         packages=("laspy", "lazrs"),
         extra="las",
         one_system=True,
+        suffixes=(f".{name}",),
+        reads=("sweeps", "points"),
     )
 
 
 def _osi(name: str, file: str, title: str) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.osi",
+        "lidarpool.clouds.osi",
         f"write_{name}",
         title,
         packages=("betterosi",),
@@ -200,7 +225,7 @@ def _osi(name: str, file: str, title: str) -> FormatRow:
 def _bag(name: str, file: str, **fields: Any) -> FormatRow:
     return FormatRow(
         file,
-        "lidarpool.export.ros.bags",
+        "lidarpool.clouds.ros.bags",
         f"write_{name}",
         packages=("rosbags",),
         extra="ros",
@@ -219,17 +244,20 @@ def _bag(name: str, file: str, **fields: Any) -> FormatRow:
 FORMATS = {
     "ply": FormatRow(
         "cloud.ply",
-        "lidarpool.export.ply",
+        "lidarpool.clouds.ply",
         "write_ply",
         "PLY",
         data_set="folder",
         of_job="jobs/{name}/cloud.ply",
+        suffixes=(".ply",),
+        reads=("sweeps", "points"),
+        folders=("cloud.ply",),
     ),
     "las": _las("las"),
     "laz": _las("laz"),
     "parquet": FormatRow(
         "cloud.parquet",
-        "lidarpool.export.parquet",
+        "lidarpool.clouds.parquet",
         "Pieces",
         "Parquet",
         in_pieces=True,
@@ -238,32 +266,26 @@ FORMATS = {
         inside=r"part-\d+\.parquet",
         data_set="parquet",
         of_job="points/job={number}",
+        suffixes=(".parquet",),
+        reads=("sweeps",),
+        folders=("**/*.parquet",),
     ),
     "pcd": FormatRow(
         "pcd",
-        "lidarpool.export.pcd",
+        "lidarpool.clouds.pcd",
         "Pieces",
         "PCD",
         in_pieces=True,
         needs=("scan",),
         raw_or_compensated=True,
         inside=r"\d+\.pcd",
-    ),
-    "images": FormatRow(
-        "images",
-        "lidarpool.export.images",
-        "Pieces",
-        "range images",
-        in_pieces=True,
-        needs=("scan", *_ALL_RAYS),
-        inside=r"[^/]+/\d+\.npz",
-        data_set="images",
-        of_job="images/{name}",
-        boxes=True,
+        suffixes=(".pcd",),
+        reads=("sweeps", "points"),
+        folders=("*.[pP][cC][dD]",),
     ),
     "e57": FormatRow(
         "cloud.e57",
-        "lidarpool.export.e57",
+        "lidarpool.clouds.e57",
         "write_e57",
         "E57",
         packages=("pye57",),
@@ -271,10 +293,12 @@ FORMATS = {
         needs=("scan",),
         holds=_E57,
         compensates=True,
+        suffixes=(".e57",),
+        reads=("sweeps", "points"),
     ),
     "kitti": FormatRow(
         "kitti",
-        "lidarpool.export.kitti",
+        "lidarpool.clouds.kitti",
         "Pieces",
         "KITTI",
         in_pieces=True,
@@ -286,10 +310,13 @@ FORMATS = {
         boxes=True,
         actor_boxes=True,
         raw=True,
+        suffixes=(".bin",),
+        reads=("sweeps", "points"),
+        folders=("sequences/*/velodyne", "velodyne/*.bin", "velodyne_points/data/*.bin", "*.bin"),
     ),
     "nuscenes": FormatRow(
         "nuscenes",
-        "lidarpool.export.nuscenes",
+        "lidarpool.clouds.nuscenes",
         "Pieces",
         "nuScenes",
         in_pieces=True,
@@ -303,10 +330,11 @@ FORMATS = {
         boxes=True,
         actor_boxes=True,
         raw=True,
+        folders=("v1.0-*/sample_data.json",),
     ),
     "webdataset": FormatRow(
         "webdataset",
-        "lidarpool.export.webdataset",
+        "lidarpool.clouds.webdataset",
         "Pieces",
         "WebDataset",
         in_pieces=True,
@@ -315,19 +343,37 @@ FORMATS = {
         data_set="webdataset",
         boxes=True,
         actor_boxes=True,
+        suffixes=(".tar",),
+        reads=("sweeps",),
+        folders=("**/*.tar",),
+    ),
+    "images": FormatRow(
+        "images",
+        "lidarpool.clouds.images",
+        "Pieces",
+        "range images",
+        in_pieces=True,
+        needs=("scan", *_ALL_RAYS),
+        inside=r"[^/]+/\d+\.npz",
+        data_set="images",
+        of_job="images/{name}",
+        boxes=True,
+        folders=("*/*.npz",),
     ),
     "pcap": FormatRow(
         "packets",
-        "lidarpool.export.packets",
+        "lidarpool.clouds.packets",
         "write_pcap",
         "PCAP",
         needs=("scan", *_ALL_RAYS),
         holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
+        suffixes=(".pcap", ".osf"),
+        reads=("sweeps",),
     ),
     "rrd": FormatRow(
         "cloud.rrd",
-        "lidarpool.export.rrd",
+        "lidarpool.clouds.rrd",
         "write_rrd",
         "RRD",
         packages=("rerun",),
@@ -340,8 +386,27 @@ FORMATS = {
     # Readers take the type of messages from the part «sd» of the file's name.
     "osi": _osi("osi", "cloud_sd.osi", "OSI"),
     "osi_mcap": _osi("osi_mcap", "cloud_osi.mcap", "OSI in MCAP"),
-    "mcap": _bag("mcap", "cloud.mcap", title="MCAP", data_set="mcap", of_job="bags/{name}.mcap"),
-    "rosbag2": _bag("rosbag2", "rosbag2", inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
+    "mcap": _bag(
+        "mcap",
+        "cloud.mcap",
+        title="MCAP",
+        suffixes=(".mcap",),
+        reads=("sweeps",),
+        data_set="mcap",
+        of_job="bags/{name}.mcap",
+    ),
+    "rosbag2": _bag(
+        "rosbag2", "rosbag2", folders=("metadata.yaml",), inside=r"metadata\.yaml|rosbag2\w*\.mcap"
+    ),
+}
+# Formats that are only read.
+_READ_ONLY = {
+    "text": FormatRow(
+        "",
+        "lidarpool.clouds.scans",
+        suffixes=(".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".npy"),
+        reads=("sweeps", "points"),
+    ),
 }
 DATA_SETS = {row.data_set: name for name, row in FORMATS.items() if row.data_set}  # {its: of jobs}
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
@@ -352,38 +417,91 @@ def data_set_title(data_set: str) -> str:
     return FORMATS[DATA_SETS[data_set]].title if data_set in DATA_SETS else data_set
 
 
-def row_of(name: str) -> FormatRow:
-    """Return the row of a format, of the table or of a plug-in.
-
-    Raises
-    ------
-    LidarError
-        If there is no format of that name, or its plug-in cannot be used.
-    """
-    return FORMATS[name] if name in FORMATS else _row_of_plugin(name)
-
-
-@cache
-def _row_of_plugin(name: str) -> FormatRow:
-    plugin = find_plugin(GROUP, name)
-    if plugin is None:
-        names = [*FORMATS, *plugins_of(GROUP)]
-        raise LidarError(
-            f"{name!r} is not a format of clouds.{did_you_mean(name, names)} There are "
-            f"{', '.join(names)}."
-        )
+def _row_of_plugin(plugin: Plugin) -> FormatRow:
+    """Return the row of a plug-in; LidarError for a plug-in that cannot be used."""
     row = plugin.load(FormatRow)
     if row.data_set:
         raise LidarError(
             f"{plugin} has data sets, {row.data_set!r}, which plug-ins cannot have: leave out "
             "data_set."
         )
-    if "/" in row.file or row.file in [built_in.file for built_in in FORMATS.values()]:
+    if "/" in row.file or (row.write and row.file in _FILES):
         raise LidarError(
             f"{plugin} writes {row.file!r}: name a file or folder that no other format has, and no "
             "folder above it."
         )
     return replace(row, plugin=plugin)
+
+
+_FILES = [row.file for row in FORMATS.values()]
+_TABLE = PluginTable(GROUP, "a format of clouds", FORMATS, _row_of_plugin)
+
+
+def row_of(name: str) -> FormatRow:
+    """Return the row of a format that is written, of the table or of a plug-in.
+
+    Raises
+    ------
+    LidarError
+        If there is no format of that name, it is only read, or its plug-in cannot be used.
+    """
+    row = _TABLE[name]
+    if not row.write:
+        raise LidarError(f"{name!r} is only read: write another format, such as ply.")
+    return row
+
+
+def _rows_of_all() -> Iterator[FormatRow]:
+    """Yield the rows of the table, then those of plug-ins that can be used."""
+    yield from (*FORMATS.values(), *_READ_ONLY.values())
+    for name in plugins_of(GROUP):
+        with suppress(LidarError):
+            yield _TABLE[name]
+
+
+def _row_that_reads(kind: Reading, path: Path) -> FormatRow | None:
+    """Return the row that reads a kind of the file's suffix, or None."""
+    suffix = path.suffix.lower()
+    rows = (row for row in _rows_of_all() if kind in row.reads and suffix in row.suffixes)
+    return next(rows, None)
+
+
+def reader_of(path: Path, name: str) -> Callable[[Any], Any] | None:
+    """Return the function that opens a file or folder as a recording, or None if there is none.
+
+    Raises
+    ------
+    LidarError
+        If a package that reads it is not installed; `name` is that of the file in messages.
+    """
+    if path.is_dir():
+        rows = (row for row in _rows_of_all() if any(map(partial(_contains, path), row.folders)))
+        row = next(rows, None)
+        return None if row is None else row.reader("open_folder", name)
+    row = _row_that_reads("sweeps", path)
+    return None if row is None else row.reader("open_file", name)
+
+
+def _contains(folder: Path, pattern: str) -> bool:
+    return next(folder.glob(pattern), None) is not None
+
+
+def points_reader(path: Path) -> Callable[[Path], Any] | None:
+    """Return the function that reads the points of a file, or None for an unknown suffix.
+
+    Raises
+    ------
+    LidarError
+        If a package that reads it is not installed.
+    """
+    row = _row_that_reads("points", path)
+    return None if row is None else row.reader("read_points", str(path))
+
+
+def point_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of files whose points are read."""
+    rows = [row for row in _rows_of_all() if "points" in row.reads]
+    return tuple(suffix for row in rows for suffix in row.suffixes)
 
 
 def plugin_rows(files: Collection[str]) -> list[FormatRow]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import islice
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -15,13 +16,16 @@ import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from lidarsim.base.allowance import Allowance
+from lidarsim.base.extras import reading
+from lidarsim.base.input_files import input_size
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.table import AXES, TABLE
 from lidarsim.sweeps.sweeps import Sweeps
 
-from . import pieces, reading
-from .parquet_groups import group_allowance, number_columns, read_group
+from . import pieces, sweep_reader
+from .parquet_groups import check_groups, group_allowance, number_columns, read_group
 from .pieces import Entry
+from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
 
 _GROUP_ROWS = 65_536
 
@@ -78,7 +82,7 @@ class Pieces(pieces.Pieces):
         return {"/".join([*self.folders, name]): memory.getvalue()}
 
 
-class Reader(reading.Reader):
+class Reader(sweep_reader.Reader):
     """Reads sweeps of a data set: all columns of each point, by their names in clouds."""
 
     _held: Mapping[tuple[str, int], Any] = MappingProxyType({})  # {(file, group): rows}
@@ -110,7 +114,7 @@ class Reader(reading.Reader):
             self._held = dict([*self._held.items()][-1:]) | {key: rows}
         return self._held[key]
 
-    def read(self, sweep: int) -> reading.PointColumns:
+    def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep; only groups of rows with its scans are read."""
         first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")
@@ -129,3 +133,52 @@ class Reader(reading.Reader):
         columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         return self.inside(sweep, Cloud(positions, columns))
+
+
+def open_file(source: RecordingSource) -> Recording:
+    """Open a .parquet file in its groups of rows."""
+    with reading(source.name):
+        points = _points(source.path)
+    return source.of_sensors({"": points})
+
+
+def open_folder(source: RecordingSource) -> Recording:
+    """Open a folder of .parquet files in their groups of rows."""
+    return open_file(source)
+
+
+def _points(path: Path) -> SweepFiles:
+    """Return the parts of a file or folder.
+
+    Only columns of numbers are read: the memory of others is not known before.
+    """
+    if path.is_file():
+        input_size(path)
+    dataset = pa.dataset.dataset(str(path), format="parquet")
+    groups = []
+    files = []  # of each group: names of columns of numbers, and size in bytes
+    unread = set[str]()  # names of columns
+    for file in dataset.get_fragments():
+        columns = number_columns(file.physical_schema)
+        unread |= set(file.physical_schema.names) - set(columns)
+        size = input_size(file.path)
+        of_file = file.split_by_row_group()
+        check_groups(of_file, columns, size)
+        groups += of_file
+        files += len(of_file) * [(columns, size)]
+    if axes := sorted(unread.intersection("xyz")):
+        raise ValueError(f"its {', '.join(axes)} are no numbers")
+    names = {column.in_files: column.name for column in TABLE.values()}
+
+    def read(number: int) -> Read:
+        number_names, size = files[number]
+        rows = read_group(groups[number], number_names, group_allowance(size))
+        columns = {
+            names.get(column, column): rows[column].to_numpy() for column in rows.column_names
+        }
+        return take_positions(columns), columns, None
+
+    notes = []
+    if unread:
+        notes.append(f"has columns that are no numbers: {', '.join(sorted(unread))}")
+    return SweepFiles(len(groups), read, point_count=dataset.count_rows(), notes=tuple(notes))

@@ -1,0 +1,1 @@
+"""Formats of clouds: a module writes and reads each."""

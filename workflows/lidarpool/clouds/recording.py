@@ -1,0 +1,408 @@
+"""Recordings: sweeps of a sensor, or parts of a cloud, which formats open and read one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
+from lidarsim.base.words import did_you_mean
+from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
+from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
+from lidarsim.scene.files.stated_system import Metres, StatedSystem, stated_metres
+from lidarsim.sweeps.sweep_motion import FiringPoses
+from lidarsim.sweeps.sweeps import Sweeps
+
+from ..base.fingerprint import fingerprint
+
+Columns = Mapping[str, AnyArray]
+# Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
+Read = tuple[AnyArray, Columns, Floats | None]
+
+# Names of the columns of rings and of intensities in other programs; the first column present is
+# read.
+_RING_COLUMNS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
+_INTENSITY_COLUMNS = ("intensity", "reflectivity", "i")
+METRES: Metres = (1.0, 1.0, 1.0)
+
+
+class SweepFiles(NamedTuple):
+    """Sweeps of a sensor, or parts of a cloud."""
+
+    sweeps: int  # or parts
+    read: Callable[[int], Read]
+    times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
+    point_count: int | None = None  # of a cloud in parts; None of sweeps
+    sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
+
+
+class SeveralSensorsError(LidarError):
+    """The recording has several sensors or topics, and none is chosen."""
+
+    def __init__(self, message: str, names: Sequence[str]) -> None:
+        super().__init__(message)
+        self.names = names
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPoints:
+    """Points of a sweep, or of a part of a cloud."""
+
+    points: Floats  # (n, 3): metres
+    rings: Ints | None = None  # (n,)
+    intensities: Floats | None = None  # (n,): of any scale
+    rays: Ints | None = None  # (n,): keys of ray and return; None for parts of a cloud
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def part(self, rows: Indices) -> RecordedPoints:
+        """Select points, without the keys of their rays."""
+        return RecordedPoints(
+            self.points[rows],
+            None if self.rings is None else self.rings[rows],
+            None if self.intensities is None else self.intensities[rows],
+        )
+
+    @classmethod
+    def joined(cls, parts: list[RecordedPoints]) -> RecordedPoints:
+        """Concatenate parts of the same recording, which have the same columns."""
+        if not parts:
+            return cls(np.empty((0, 3)))
+        rings = [part.rings for part in parts if part.rings is not None]
+        intensities = [part.intensities for part in parts if part.intensities is not None]
+        return cls(
+            np.concatenate([part.points for part in parts]),
+            np.concatenate(rings) if rings else None,
+            np.concatenate(intensities) if intensities else None,
+        )
+
+
+@dataclass(eq=False)
+class NoiseFilter:
+    """Leaves out points that a file withholds or classifies as noise, and counts them."""
+
+    noise_classes: tuple[int, ...] = NOISE_CLASSES
+    counts: dict[int, LeftOut] = field(default_factory=dict)  # {number of a sweep or part: counts}
+
+    def usable(self, number: int, read: Read) -> Read:
+        """Return a sweep or part without these points."""
+        points, columns, pose = read
+        usable, self.counts[number] = usable_points(columns, self.noise_classes)
+        if usable is None:
+            return read
+        kept = {name: np.asarray(values)[usable] for name, values in columns.items()}
+        return points[usable], kept, pose
+
+    def note(self) -> str:
+        """Return a sentence on the points that were left out of what was read; empty for none."""
+        totals = np.sum([(0, 0), *self.counts.values()], axis=0).tolist()
+        return LeftOut(*totals).note()
+
+
+class FiredPoints(NamedTuple):
+    """Points of a sweep as they were fired."""
+
+    points: Floats  # (n, 3): in the sensor frame at the firing of each, metres
+    columns: Columns  # (n,) each
+    poses: FiringPoses  # of the sensor in the world
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording of sweeps; or a cloud without sweeps (`is_cloud`), in parts instead."""
+
+    name: str
+    count: int  # of sweeps, or of parts
+    read: Callable[[int], Read]
+    intensity_column: str | None = None  # if not one of `_INTENSITY_COLUMNS`
+    is_cloud: bool = False
+    point_count: int | None = None  # if known before the points are read
+    times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
+    notes: tuple[str, ...] = ()
+    thinned: bool = False  # whether hits were left out: gaps are no lost returns
+    white: float | None = None  # intensity of a white surface, if it is the same at all ranges
+    energies: bool = False  # whether intensities are energies, as in results
+    firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
+    metres: Metres = METRES  # of the units of x, y and z
+    epsg: int | None = None  # of the system that the file states, if that is in metres
+    sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
+    # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
+    # None if they are unknown; None if the recording has no frames.
+    frame_poses: Callable[[], Floats | None] | None = None
+    sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    noise_filter: NoiseFilter | None = None  # that `read` applies; None if it leaves out nothing
+    # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
+    fired: Callable[[int], FiredPoints] | None = None
+
+    @property
+    def left_out_notes(self) -> list[str]:
+        """Notes on points that were left out of what has been read."""
+        note = "" if self.noise_filter is None else self.noise_filter.note()
+        return [f"{self.name}: {note}"] if note else []
+
+    def poses(self, numbers: Iterable[int]) -> Floats | None:
+        """Return the poses (n, 4, 4) of sweeps in the world; None if one of these is unknown.
+
+        LidarError if the recording cannot be read.
+        """
+        with reading(self.name):
+            if self.frame_poses is not None and (frame_poses := self.frame_poses()) is not None:
+                return np.asarray(frame_poses[list(numbers)])
+            poses = []
+            for number in numbers:
+                _, _, pose = self.read(number)
+                if pose is None:
+                    return None
+                poses.append(pose)
+        matrices = np.array(poses, np.float64).reshape(-1, 4, 4)
+        matrices[:, :3, 3] *= self.metres
+        return matrices
+
+    def without_noise(self, noise_filter: NoiseFilter) -> Recording:
+        """Return the recording without points that it withholds or classifies as noise."""
+        read = self.read
+        sample = self.sample
+
+        def usable_sample(max_points: int) -> Read:
+            assert sample is not None
+            return NoiseFilter(noise_filter.noise_classes).usable(0, sample(max_points))
+
+        return replace(
+            self,
+            read=lambda number: noise_filter.usable(number, read(number)),
+            sample=None if sample is None else usable_sample,
+            noise_filter=noise_filter,
+        )
+
+    def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
+        """Read a sweep, or part of a cloud, in the sensor frame or in the world frame.
+
+        LidarError if the recording cannot be read.
+        """
+        with reading(self.name):
+            points, columns, pose = self.read(number)
+            self._check_intensity(columns)
+        positions = np.asarray(points, np.float64)
+        # Drivers write NaN or zeros for pulses without a return.
+        valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
+        positions = positions[valid] * self.metres
+        if in_world and not self.is_cloud:
+            if pose is None:
+                raise LidarError(
+                    f"{self.name} is in the axes of its sensor, and does not say where that was: "
+                    "compare it with a recording of sweeps."
+                )
+            positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.metres
+        names = _INTENSITY_COLUMNS if self.intensity_column is None else (self.intensity_column,)
+        rings = rings_of(columns)
+        intensities = _first_column(columns, names)
+        return RecordedPoints(
+            positions,
+            None if rings is None else rings[valid].astype(np.int64),
+            None if intensities is None else intensities[valid].astype(np.float64),
+            _ray_keys(columns)[valid] if self.firing_key and not in_world else None,
+        )
+
+    def _check_intensity(self, columns: Columns) -> None:
+        """Raise LidarError if the recording lacks the column that was chosen as intensity."""
+        name = self.intensity_column
+        if name is not None and name not in columns:
+            raise LidarError(
+                f"it has no column {name!r} to compare as intensity."
+                + (did_you_mean(name, columns) or f" It has {', '.join(columns)}.")
+            )
+
+
+@dataclass(frozen=True)
+class RecordingSource:
+    """A file or folder to open, and what the user chose of it."""
+
+    path: Path
+    name: str  # in messages
+    sensor: str | None = None  # or topic
+    intensity: str | None = None  # column, if not one of the usual names
+    unit: str | None = None  # of positions, in place of the unit that the file states
+
+    def recording(self, count: int, read: Callable[[int], Read], **fields: Any) -> Recording:
+        """Return a recording of `count` sweeps or parts; `fields` are those of `Recording`."""
+        return Recording(self.name, count, read, self.intensity, **fields)
+
+    def choose(self, kind: str, names: Iterable[str]) -> str:
+        """Return the chosen sensor or topic, or the only one; `kind` is the plural, as "sensors".
+
+        LidarError without a choice among several, or for a name that is not there.
+        """
+        return choose(self.name, kind, names, self.sensor)
+
+    def of_sensors(self, sensors: Mapping[str, SweepFiles]) -> Recording:
+        """Return the sweeps of one of several sensors, {name: sweeps}; "" for the only one."""
+        files = sensors[self.choose("sensors", sensors)]
+        return self.recording(
+            files.sweeps,
+            files.read,
+            is_cloud=files.point_count is not None,
+            point_count=files.point_count,
+            times=None if files.times_ns is None else files.times_ns.tolist,
+            notes=self.named(files.notes),
+            sequence=files.sequence,
+        )
+
+    def named(self, clauses: Iterable[str]) -> tuple[str, ...]:
+        """Return notes: the name of the recording before each clause."""
+        return tuple(f"{self.name} {clause}" for clause in clauses)
+
+    def chosen_metres(self) -> Metres:
+        """Return the metres of the chosen unit, of a format that states none."""
+        return stated_metres(None, np.zeros((0, 3)), self.unit)[0]
+
+    def epsg_in_metres(self, system: StatedSystem | None, metres: Metres) -> int | None:
+        """Return the code of a stated system; None if a unit was chosen instead, or in feet."""
+        if system is None or self.unit is not None or metres != METRES:
+            return None
+        return system.epsg
+
+    def stream(
+        self,
+        sweeps: Callable[[], Iterable[Any]],
+        points: Callable[[Any], Read],
+        count: int | None = None,
+        **fields: Any,
+    ) -> Recording:
+        """Return a recording whose `sweeps()` can be iterated from the first sweep only.
+
+        `points` converts a sweep; `count` is the number of sweeps, which are counted if it is None;
+        `fields` are those of `Recording`.
+        """
+        if count is None:
+            with reading(self.name):
+                count = sum(1 for _ in sweeps())
+        next_number = 0
+        remaining: Iterator[Any] = iter(())  # sweeps from `next_number`
+
+        def read(number: int) -> Read:
+            nonlocal next_number, remaining
+            if not 0 < next_number <= number:
+                next_number = 0
+                remaining = iter(sweeps())
+            sweep = next(islice(remaining, number - next_number, None))
+            next_number = number + 1
+            return points(sweep)
+
+        return self.recording(count, read, **fields)
+
+
+def rings_of(columns: Columns) -> AnyArray | None:
+    """Return the rings (n,) of points, or None without a column of rings."""
+    return _first_column(columns, _RING_COLUMNS)
+
+
+def _first_column(columns: Columns, names: Iterable[str]) -> AnyArray | None:
+    """Return the first column (n,) that is present, or None."""
+    return next((np.asarray(columns[name]) for name in names if name in columns), None)
+
+
+def open_cloud(
+    name: str,
+    cloud: CloudLike,
+    load_sweeps: Callable[[], Sweeps] | None,
+    sensor: str | None,
+    intensity: str | None,
+    **fields: Any,
+) -> Recording:
+    """Open a cloud of lidarpool, in parts or as the sweeps of a sensor.
+
+    `load_sweeps` is None for a cloud without sweeps; `fields` are those of `Recording`.
+    """
+    if load_sweeps is None:
+
+        def read_part(number: int) -> Read:
+            chunk = next(cloud.chunks(CHUNK_POINTS, number * CHUNK_POINTS))
+            return chunk.positions, chunk.columns, None
+
+        parts = -(-len(cloud) // CHUNK_POINTS)
+        return Recording(name, parts, read_part, intensity, True, len(cloud), **fields)
+    saved = load_sweeps()
+    sensor_index = saved.sensors.index(choose(name, "sensors", saved.sensors, sensor))
+    indices = np.flatnonzero(saved.sensor == sensor_index).tolist()
+
+    def read_sweep(number: int) -> Read:
+        index = indices[number]
+        points = next(saved.points(cloud, index, index + 1))
+        return saved.in_sensor(index, points.positions), points.columns, saved.pose.matrix(index)
+
+    def read_fired(number: int) -> FiredPoints:
+        index = indices[number]
+        points = next(saved.points(cloud, index, index + 1))
+        positions = saved.as_fired(index, points)
+        return FiredPoints(positions, points.columns, saved.firing_poses(index, points))
+
+    def frame_poses() -> Floats:
+        return np.array([saved.pose.matrix(index) for index in indices])
+
+    times = saved.begins_ns[indices] + (saved.start_ns or 0)
+    fields["energies"] = intensity in (None, "intensity")
+    columns = {column.name for column in cloud.table}
+    if ray_columns := columns & {"time", "ray"}:
+        poses = saved.pose.positions[indices], saved.pose.quaternions[indices]
+        key = max(ray_columns), "return_number" in columns  # time rather than ray: `_ray_keys`
+        fields["firing_key"] = fingerprint(
+            key, saved.scans[indices], saved.begins_ns[indices], poses
+        )
+    fields |= {"times": lambda: times, "frame_poses": frame_poses, "fired": read_fired}
+    return Recording(name, len(indices), read_sweep, intensity, **fields)
+
+
+def _ray_keys(columns: Columns) -> Ints:
+    """Return keys (n,) that differ for all rays of a sweep, and for all returns of a ray."""
+    if "time" in columns:
+        rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
+    else:
+        rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
+    _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
+    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    return rays << 8 | columns.get("return_number", order)
+
+
+def positions_of(columns: Columns) -> Floats:
+    """Return the positions (n, 3) in columns x, y and z; ValueError without these."""
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its points have no {', '.join(missing)}")
+    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+
+
+def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
+    """Return the chosen sensor or topic, or the only sensor or topic; else raise LidarError.
+
+    `kind` is the plural, such as "sensors"; `name` is that of the recording.
+    """
+    available = list(names)
+    if chosen is None and len(available) == 1:
+        return available[0]
+    if chosen is not None and chosen in available:
+        return chosen
+    listed = f"has the {kind} {', '.join(available)}" if available else f"has no {kind}"
+    if available == [""]:
+        listed = f"has no names of {kind}: give none"
+    if chosen is None and available:
+        advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)"
+        raise SeveralSensorsError(f"{name} {listed}: {advice}.", available)
+    if chosen is None:
+        raise LidarError(f"{name} {listed}: record one.")
+    hint = did_you_mean(chosen, available)
+    raise LidarError(f"{name} does not have {chosen!r}.{hint} It {listed}.")
+
+
+def take_positions(columns: dict[str, AnyArray]) -> Floats:
+    """Take columns x, y and z out, and return positions (n, 3); ValueError without these."""
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its points have no {', '.join(missing)}")
+    return np.stack([np.asarray(columns.pop(axis), np.float64) for axis in "xyz"], axis=1)

@@ -1,1 +1,0 @@
-"""Clouds in file formats."""
