@@ -426,6 +426,7 @@ def _open_sweep_files(
         times=times,
         notes=tuple(f"{name} {note}" for note in files.notes),
         sequence=files.sequence,
+        epsg=files.epsg,
     )
 
 

@@ -58,6 +58,7 @@ class SweepFiles(NamedTuple):
     point_count: int | None = None  # of a cloud in parts; None of sweeps
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
+    epsg: int | None = None  # of the system that the file states, if that is in metres
 
 
 def open_e57(path: Path, name: str) -> SweepFiles:
@@ -93,7 +94,9 @@ def open_e57(path: Path, name: str) -> SweepFiles:
         return SweepFiles(file.scan_count, read)
     points, _, pose = read(0)
     positions = points @ pose[:3, :3].T + pose[:3, 3]
-    return SweepFiles(file.scan_count, read, notes=tuple(check_metric_format(system, positions)))
+    notes = tuple(check_metric_format(system, positions))
+    epsg = system.epsg if system.horizontal_m == 1.0 else None  # else points are in no such system
+    return SweepFiles(file.scan_count, read, notes=notes, epsg=epsg)
 
 
 def _bytes_of_scan(header: Any) -> int:
