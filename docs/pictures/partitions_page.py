@@ -23,7 +23,7 @@ from distributed import Client, LocalCluster
 from poolpart import Partition, Pipe, PipeFailed, Pool, n_workers, rest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-SIZE = (760, 720)  # pixels
+SIZE = (800, 820)  # pixels
 CLUSTER = {
     "n_workers": 5,
     "threads_per_worker": 1,

@@ -101,12 +101,13 @@ def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indice
     corners
         (k, 3, 3): local corners of all triangles.
     """
-    x, y, z = _sheared_corners(rays, ray, corners, triangle)
-    a = x[2] * y[1] - y[2] * x[1]
-    b = x[0] * y[2] - y[0] * x[2]
-    c = x[1] * y[0] - y[1] * x[0]
-    det = (a + b) + c
-    with np.errstate(divide="ignore", invalid="ignore"):
+    # Areas of rays that are farther than 1e154 m overflow to infinity or NaN, and are never hits.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        x, y, z = _sheared_corners(rays, ray, corners, triangle)
+        a = x[2] * y[1] - y[2] * x[1]
+        b = x[0] * y[2] - y[0] * x[2]
+        c = x[1] * y[0] - y[1] * x[0]
+        det = (a + b) + c
         t = (((a * z[0] + b * z[1]) + c * z[2]) / det) * rays.sz[ray]
     return PlaneHits(a, b, c, det, t)
 

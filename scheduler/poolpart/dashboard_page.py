@@ -17,14 +17,23 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
 from tornado.template import Template
 
-from .errors import PipeClosed, PoolError
+from .errors import PoolError
 from .fence import fences_of
+from .html_table import WORDS, shown_seconds
 from .internals.names import PAGE, require
 from .internals.scheduler import serve, serve_no_longer
 from .other_sites import names_of_machine, refusal
 from .pipe_states import pipes_of
+from .stats import (
+    COUNTS,
+    StageStats,
+    forget_statistics,
+    running_on,
+    slots_of,
+    statistics_of,
+    stats_of,
+)
 from .stats import NAME as STATISTICS
-from .stats import StageStats, forget_statistics, running_on, slots_of, statistics_of, stats_of
 from .steward import NAME as STEWARD
 from .workers import check_client, on_scheduler
 
@@ -45,20 +54,39 @@ _PAGE = Template("""<!doctype html>
 body { max-width: 70rem; margin: 1.5rem auto; padding: 0 1rem; font: 14px/1.5 system-ui, sans-serif;
   color: #1c1e21; background: #fff; }
 @media (prefers-color-scheme: dark) { body { color: #e3e5e8; background: #16181c; } }
-div { overflow-x: auto; margin-bottom: 2rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; white-space: nowrap; }
+h1 { margin: 0; font-size: 1.6rem; }
+h1 + p { margin: 0 0 1.5rem; color: #667; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin-bottom: 2rem; }
 caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
 th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
+td { overflow-wrap: anywhere; }
+th { font-weight: 400; color: #667; }
+.words { text-align: left; }
+/* On narrow windows each row is a paragraph: its name, then the names and values of its cells. */
+@media (max-width: 760px) {
+  table, caption, tbody { display: block; }
+  tr { display: flex; flex-wrap: wrap; gap: 0 1rem; padding: .4rem 0;
+    border-bottom: 1px solid #8885; }
+  tr:first-of-type { display: none; }
+  td { padding: 0; border: 0; }
+  td:first-child { flex-basis: 100%; font-weight: 600; }
+  td:not(:first-child)::before { content: attr(data-name) " "; color: #667; }
+}
+@media (prefers-color-scheme: dark) { h1 + p, th, td::before { color: #9aa !important; } }
 </style>
-{% for title, head, rows in tables %}{% if rows %}<div tabindex="0"><table>
+<h1>Partitions of a cluster</h1>
+<p>{{ address }}: {{ counts }}</p>
+{% for title, head, rows in tables %}{% if rows %}<table>
 <caption>{{ title }}</caption>
-<tr>{% for cell in ["", *head] %}<th>{{ cell }}</th>{% end %}</tr>
-{% for row in rows %}<tr>{% for cell in row %}<td>{{ str(cell)[:200] }}</td>{% end %}</tr>
-{% end %}</table></div>
+<tr>{% for name in head %}\
+<th{% if name in words %} class="words"{% end %}>{{ name }}</th>{% end %}</tr>
+{% for row in rows %}<tr>{% for name, cell in zip(head, row) %}\
+<td data-name="{{ name }}"{% if name in words %} class="words"{% end %}>{{ str(cell)[:200] }}</td>\
+{% end %}</tr>
+{% end %}</table>
 {% end %}{% end %}""")
-_COUNTS = ("waiting", "queued", "running", "done", "failed", "seconds")
-_OF_A_WORKER = ("partition", "slots", "busy", "tasks given", "status", "address")
+_FIGURES = (*COUNTS, "seconds")
+_OF_A_WORKER = ("worker", "partition", "slots", "busy", "tasks given", "status", "address")
 
 
 def page_of(scheduler: Any) -> bytes:
@@ -73,19 +101,17 @@ def page_of(scheduler: Any) -> bytes:
         title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+    rows_of_workers = sorted((_worker(worker) for worker in workers), key=_by_partition_and_name)
     for name, pipe in pipes_of(scheduler).items():
-        end = pipe.why_no_put()
-        state = (
-            "open" if end is None else "closed" if isinstance(end, PipeClosed) else f"failed: {end}"
-        )
-        pipes.append([name, pipe.queue.qsize(), pipe.queue.capacity, state])
+        pipes.append([name, *pipe.figures])
     tables = [
-        ("Partitions", ["workers", "slots", "busy", *_COUNTS], partitions),
-        ("Stages", ["partition", *_COUNTS], stages),
-        ("Workers", _OF_A_WORKER, [_worker(worker) for worker in workers]),
-        ("Pipes", ["depth", "capacity", "state"], pipes),
+        ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
+        ("Stages", ["stage", "partition", *_FIGURES], stages),
+        ("Workers", _OF_A_WORKER, rows_of_workers),
+        ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
     ]
-    return _PAGE.generate(tables=tables)
+    counts = f"workers {len(workers)}, partitions {len(partitions) - 1}, pipes {len(pipes)}"
+    return _PAGE.generate(tables=tables, counts=counts, words=WORDS, address=scheduler.address)
 
 
 def _shown(partition: str) -> str:
@@ -93,7 +119,7 @@ def _shown(partition: str) -> str:
 
 
 def _counts(stats: StageStats) -> list[object]:
-    return [*(getattr(stats, count) for count in _COUNTS[:-1]), f"{stats.seconds:.1f}"]
+    return [*(getattr(stats, count) for count in COUNTS), shown_seconds(stats.seconds)]
 
 
 def _worker(worker: Any) -> list[object]:
@@ -107,6 +133,13 @@ def _worker(worker: Any) -> list[object]:
         worker.status.name,
         "" if worker.name == worker.address else worker.address,
     ]
+
+
+def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
+    """Return the key that sorts rows of workers, with the remainder last, and 10 behind 9."""
+    name = str(row[0])
+    partition = str(row[1])
+    return partition == _shown(""), partition, len(name), name
 
 
 class _Handler(web.RequestHandler):

@@ -1,8 +1,8 @@
-"""Pools and partitions as notebooks show them: a table, and a link to the page of partitions."""
+"""Pools, partitions and pipes as notebooks show them: tables, and a link to the page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from distributed import Client
@@ -11,56 +11,100 @@ from tornado.template import Template
 from .adapting import adaptive_names
 from .dashboard_page import is_open, page_link
 from .errors import PoolError
-from .stats import PartitionStats, stats_of
+from .html_table import html_paragraph, html_table
+from .membership import has_rule
+from .pipe_states import pipes_of
+from .stats import COUNTS, PartitionStats, stats_of
 from .workers import on_scheduler
 
-# tornado escapes all that is written into a template: names come from users.
-_TABLE = Template("""<table>
-<caption style="text-align: left">{{ title }}</caption>
-<thead><tr>{% for name in head %}<th style="text-align: left">{{ name }}</th>{% end %}</tr></thead>
-<tbody>{% for row in rows %}
-<tr><td style="text-align: left">{{ row[0] }}</td>\
-{% for number in row[1:] %}<td style="text-align: right">{{ number }}</td>{% end %}</tr>{% end %}
-</tbody>
-</table>
+_LINK = Template("""\
 {% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Page of partitions</a></p>\
-{% else %}<p>Page of partitions: <code>pool.page()</code> opens it.</p>{% end %}""")
+{% else %}<p>Page of partitions: <code>{{ opener }}</code> opens it.</p>{% end %}""")
 _PLAIN = Template("<pre>{{ text }}</pre>")
-_HEAD = ("partition", "workers", "slots", "busy", "waiting", "queued", "running", "done", "failed")
+_HEAD = ("partition", "workers", "slots", "busy", *COUNTS)
+_HEAD_OF_A_PIPE = ("pipe", "depth", "capacity", "state")
+# Whoever has a partition or a pipe alone has no variable `pool`.
+_OPENER = "Pool.from_client(client).page()"
 
 
-def table_of_partitions(client: Client, title: str, names: Sequence[str] | None = None) -> str:
-    """Return the HTML of a table of partitions, and the link to the page if the page is open.
+def table_of_partitions(client: Client, title: str) -> str:
+    """Return the HTML of a table of the partitions that workers declare, and of the remainder.
 
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    title
-        What stands above the table, and alone where the scheduler does not answer.
-    names
-        Partitions of the rows; by default all that workers declare, then the remainder.
+    The link to the page follows if the page is open. Only `title` is shown where the scheduler does
+    not answer.
     """
     try:
-        stats, has_page = on_scheduler(client, _figures, names=names)
-        link = page_link(client) if has_page else None
+        rows, link = _ask(client, _all_partitions)
     except (PoolError, OSError):  # the client was closed, or the scheduler lacks this package
-        return _PLAIN.generate(text=title).decode()
-    rows = [[part.name or "remainder", *_numbers(part)] for part in stats]
-    return _TABLE.generate(title=title, head=_HEAD, rows=rows, link=link).decode()
+        return _plain(title)
+    return html_table(title, _HEAD, rows) + _link(link, "pool.page()")
 
 
-def _numbers(part: PartitionStats) -> list[int]:
+def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
+    """Return the HTML of the figures of a partition; of a dissolved partition, a sentence."""
+    try:
+        row, link = _ask(get_client(), _one_partition, name=name)
+    except (PoolError, OSError, ValueError):  # ValueError: this process has no client
+        return _plain(title)
+    if row is None:
+        return _plain(title) + html_paragraph(
+            "The partition was dissolved, or its workers have left: no worker declares it."
+        )
+    return html_table(title, _HEAD, [row]) + _link(link, _OPENER)
+
+
+def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
+    """Return the HTML of the state of a pipe; of a deleted pipe, a sentence."""
+    try:
+        row, link = _ask(get_client(), _one_pipe, name=name)
+    except (PoolError, OSError, ValueError):  # ValueError: this process has no client
+        return _plain(title)
+    if row is None:
+        return _plain(title) + html_paragraph("The pipe was deleted, or never created.")
+    return html_table(title, _HEAD_OF_A_PIPE, [row]) + _link(link, _OPENER)
+
+
+def _plain(text: str) -> str:
+    return _PLAIN.generate(text=text).decode()
+
+
+def _link(link: str | None, opener: str) -> str:
+    """Return the link to the page, or the call that opens the page."""
+    return _LINK.generate(link=link, opener=opener).decode()
+
+
+def _ask(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
+    """Return what a function finds on the scheduler, and the URL of the page if it is open."""
+    found, has_page = on_scheduler(client, look, **arguments)
+    return found, page_link(client) if has_page else None
+
+
+def _row(stats: PartitionStats) -> list[object]:
     """Return the figures of a partition in the order of the columns."""
-    return [getattr(part, column) for column in _HEAD[1:]]
+    return [stats.name or "remainder", *(getattr(stats, column) for column in _HEAD[1:])]
 
 
-def _figures(
-    names: Sequence[str] | None, dask_scheduler: Any = None
-) -> tuple[list[PartitionStats], bool]:
-    """Return the statistics of partitions, and whether the page is open; runs on the scheduler."""
-    if names is None:
-        workers = dask_scheduler.workers.values()
-        declared = {name for worker in workers for name, n in worker.resources.items() if n}
-        names = [*sorted(declared | adaptive_names(dask_scheduler)), ""]
-    return stats_of(names, dask_scheduler), is_open(dask_scheduler)
+def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]], bool]:
+    """Return the rows of all partitions, and whether the page is open; runs on the scheduler."""
+    workers = dask_scheduler.workers.values()
+    declared = {name for worker in workers for name, n in worker.resources.items() if n}
+    names = [*sorted(declared | adaptive_names(dask_scheduler)), ""]
+    return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_open(dask_scheduler)
+
+
+def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
+    """Return the row of a partition, None if it does not exist; runs on the scheduler.
+
+    A partition of a division, and an adaptive partition, exist without workers, too.
+    """
+    [stats] = stats_of([name], dask_scheduler)
+    is_expected = has_rule(dask_scheduler, name) or name in adaptive_names(dask_scheduler)
+    exists = bool(stats.workers) or is_expected
+    return _row(stats) if exists else None, is_open(dask_scheduler)
+
+
+def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
+    """Return the row of a pipe, None if it does not exist; runs on the scheduler."""
+    pipe = pipes_of(dask_scheduler).get(name)
+    row = None if pipe is None else [name, *pipe.figures]
+    return row, is_open(dask_scheduler)

@@ -22,7 +22,7 @@ from .for_each import ItemTasks
 from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
-from .notebook import table_of_partitions
+from .notebook import table_of_partition
 from .pipe import Pipe
 from .rules import check_count
 from .stats import PartitionStats, stats_of
@@ -100,7 +100,7 @@ class Partition:
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
-        return table_of_partitions(self.client, repr(self), [self.name])
+        return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
         """Return the load and the finished tasks of the partition, of all clients.

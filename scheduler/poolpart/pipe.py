@@ -36,6 +36,7 @@ from .internals.names import PIPES, require
 from .internals.queues import Packed, unpack
 from .internals.worker import task_of_thread
 from .listening import Listener
+from .notebook import table_of_pipe
 from .pipe_states import (
     CHANGE,
     PUT,
@@ -140,6 +141,10 @@ class Pipe:
 
     def __repr__(self) -> str:
         return f"<Pipe {self.name!r} capacity {self.capacity}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table that notebooks show: depth, capacity and state."""
+        return table_of_pipe(lambda: self.client, repr(self), self.name)
 
     @property
     def client(self) -> Client:

@@ -105,6 +105,13 @@ class PipeState:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
+    @property
+    def figures(self) -> tuple[int, int, str]:
+        """Number of queued items, capacity, and the state in words."""
+        end = self.why_no_put()
+        words = "closed" if isinstance(end, PipeClosed) else f"failed: {end}" if end else "open"
+        return self.queue.qsize(), self.queue.capacity, words
+
     def change(self, **changes: Any) -> None:
         """Change fields of the Variable."""
         self._dask.set({**self.value, **changes})

@@ -18,9 +18,13 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import fences_of
+from .html_table import html_table, shown_seconds
 from .metrics import PartitionCollector, publish, withdraw
 
 NAME = "poolpart-stats"
+COUNTS = ("waiting", "queued", "running", "done", "failed")  # of tasks, in the order of tables
+_HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
+_HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
 # {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
@@ -151,6 +155,15 @@ class StageStats:
     seconds: float = 0.0
     queued_seconds: float = 0.0
 
+    def _repr_html_(self) -> str:
+        """Return the table that notebooks show."""
+        return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])
+
+    @property
+    def _figures(self) -> list[object]:
+        """Cells of a row of a table: the counts, and the running time in seconds."""
+        return [*(getattr(self, count) for count in COUNTS), shown_seconds(self.seconds)]
+
 
 @dataclass(frozen=True)
 class PartitionStats(StageStats):
@@ -179,6 +192,16 @@ class PartitionStats(StageStats):
     busy: int = 0
     exclusive: bool = False
     stages: Mapping[str, StageStats] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Return the tables that notebooks show: the partition, and its stages."""
+        name = self.name or "remainder"
+        row = [name, self.workers, self.slots, self.busy, *self._figures]
+        tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])
+        if self.stages:
+            stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
+            tables += html_table("Stages", _HEAD_OF_STAGES, stages)
+        return tables
 
 
 def statistics_of(scheduler: Any) -> Statistics:

@@ -145,7 +145,7 @@ def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write):
     assert "default-src 'none'" in page.xpath("//meta[@http-equiv]/@content")[0]
     assert not page.xpath("//@src")
     assert page.xpath("//figure/svg/@id") == PICTURES
-    assert page.xpath("//figure[not(@hidden)]/@data-picture") == ["above", *PICTURES]
+    assert page.xpath("//figure[not(@hidden)]/@data-picture") == [*PICTURES, "above"]
 
 
 def test_pictures_come_into_the_page_when_they_are_drawn(write, tmp_path):
@@ -172,6 +172,30 @@ def test_the_points_are_shown_from_above(write):
     assert shade.shape == (26, 51)  # the north is up
     assert (shade[25, 0], shade[25, 50], shade[0, 0]) == (255, 127, 127)
     assert np.count_nonzero(shade) == 3
+
+
+def test_sensors_within_the_points_are_marked_from_above(write):
+    corners = np.array([(-1, -1, 0), (9, -1, 0), (-1, 4, 0.0)])  # the sensors stand at x of 0 and 1
+    columns = {name: np.zeros(3, np.int32) for name in ("scan", "channel", "object")}
+    page = html.fromstring(write(cloud=Cloud(corners, columns))[0])
+    marks = [(float(c.get("cx")), float(c.get("cy"))) for c in page.xpath("//circle")]
+    pixels = 5.0  # per metre
+    rows = 26
+    assert marks == [(pixels, rows - pixels), (2 * pixels, rows - pixels)]
+    assert "the positions of sensors in red" in page.text_content()
+
+
+def test_the_title_has_the_scenario_where_no_sensor_has_a_model(write):
+    assert "<h1>hall, from 2 positions</h1>" in write()[0]
+    assert "<h1>Sensor with 16 channels from 2 positions</h1>" in write(scenario=None)[0]
+    assert "<dd>2</dd><dt>positions of the sensor</dt>" in write()[0]
+
+
+def test_cells_of_wide_tables_have_the_names_of_their_columns(write):
+    page = html.fromstring(write()[0])
+    row = page.xpath("//table[@class='wide']//tr[@data-column='scan']/td")
+    names = ["unit", "minimum", "maximum", "meaning"]
+    assert [cell.get("data-name") for cell in row] == names
 
 
 @pytest.mark.extended

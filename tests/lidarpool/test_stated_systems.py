@@ -276,6 +276,7 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     assert "was brought from EPSG:3857" in notes[0]
     true_one = e57_with(monkeypatch, tmp_path / "b.e57", "EPSG:32632", ground("EPSG:32632"))
     assert bounds_of(true_one)[1] == [] and open_recording(true_one).notes == ()
+    assert open_view(true_one).epsg == 32632
     definition = "+proj=merc +datum=WGS84"
     by_proj = e57_with(monkeypatch, tmp_path / "d.e57", definition, ground("EPSG:3395"))
     with pytest.raises(LidarError, match=r"whose metre is 0\.67.*--epsg 32632"):

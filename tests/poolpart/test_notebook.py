@@ -7,14 +7,14 @@ import pytest
 from distributed import Client
 from tests.clusters import cluster_of
 
-from poolpart import Pool
+from poolpart import Partition, Pipe, Pool
 
 NASTY = "<script>alert('x')</script>&\"'"
 
 
 def rows_of(text):
     """Cells of each row of a table below its head, by the first."""
-    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in text.split("<tr>")[2:]]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in text.split("<tr>") if "<td" in row]
     return {unescape(first): others for first, *others in rows}
 
 
@@ -41,7 +41,42 @@ def test_a_table_of_partitions_and_a_link_to_the_open_page(pool):
     assert "href" not in text
     url = pool.page()
     assert f'<a href="{url}"' in rest._repr_html_()
+    assert "pool.page()" not in cpu._repr_html_()
     assert rows_of(cpu._repr_html_()) == {"CPU": ["2", "3", "0", "0", "0", "0", "3", "0"]}
+
+
+def test_a_partition_says_how_the_page_opens_and_that_it_was_dissolved(pool):
+    part, _ = pool.partition("CPU", workers=["b"])
+    assert "<code>Pool.from_client(client).page()</code> opens it" in part._repr_html_()
+    part.dissolve()
+    text = part._repr_html_()
+    assert "<table>" not in text
+    assert "The partition was dissolved, or its workers have left" in text
+    assert "no worker declares it" in Partition("never", pool.client)._repr_html_()
+
+
+def test_a_pipe_shows_its_depth_capacity_and_state(pool):
+    pipe = Pipe("<numbers>", 3, pool.client)
+    assert "The pipe was deleted, or never created." in pipe._repr_html_()
+    with pipe:
+        pipe.put_many([1, 2])
+        assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "open"]}
+        pipe.close()
+        assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "closed"]}
+        pipe.fail("no <disk>")
+        assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "failed: no &lt;disk&gt;"]}
+    assert "The pipe was deleted" in pipe._repr_html_()
+
+
+def test_statistics_are_tables_of_a_partition_and_of_its_stages(pool):
+    part, _ = pool.partition("CPU", workers=["b"])
+    assert rows_of(part.stats()._repr_html_()) == {"CPU": ["1", "2", *"000000", "–"]}
+    pool.client.gather([part.submit(pow, 2, n) for n in range(3)])
+    stats = part.stats()
+    rows = rows_of(stats._repr_html_())
+    assert rows["CPU"][:-1] == ["1", "2", "0", "0", "0", "0", "3", "0"]
+    assert rows["pow"][:-1] == ["0", "0", "0", "3", "0"]
+    assert "<td" in stats.stages["pow"]._repr_html_()
 
 
 def test_a_closed_client_leaves_the_text(pool):

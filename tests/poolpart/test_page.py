@@ -30,8 +30,8 @@ def get(url, headers=None):
 def rows_of(url):
     """Cells of each row of the page, below its first."""
     text = get(url)[2]
-    rows = re.findall(r"<tr>(<td>.*?)</tr>", text)
-    cells = [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+    rows = re.findall(r"<tr>(<td.*?)</tr>", text)
+    cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in rows]
     return {unescape(first): others for first, *others in cells}
 
 
@@ -95,8 +95,19 @@ def test_what_it_tells(client, wait_until):
     assert "<script>" not in get(url)[2]  # names of users stay text
     assert rows["plain"][:3] == ["P", "2", "0"]
     assert "P (exclusive)" in rows
+    assert rows["P (exclusive)"][-1] == "–"  # no task of P has run
+    assert f"<p>{client.scheduler.address}: workers 2, partitions 2, pipes 0</p>" in get(url)[2]
     assert "frames-12345678" not in rows_of(url)
     pool.dissolve()
+
+
+def test_workers_are_in_the_order_of_partitions_and_names():
+    workers = {"w10": {"A": 1}, "free": {}, "w9": {"A": 1}, "w11": {"B": 1}}
+    specs = {name: {"resources": resources} for name, resources in workers.items()}
+    with cluster_of(specs, {}, host="127.0.0.1") as cluster, Client(cluster) as client:
+        assert len(client.scheduler_info(n_workers=-1)["workers"]) == len(workers)
+        rows = rows_of(Pool.from_client(client).page())
+    assert [name for name in rows if name in workers] == ["w9", "w10", "w11", "free"]
 
 
 def test_it_goes_with_the_last_client_that_wanted_it(client, wait_until):

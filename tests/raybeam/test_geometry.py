@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from raybeam import RayCaster
+from raybeam.triangle import inside, intersect, shear
 
 pytest.importorskip("hypothesis")
 from hypothesis import HealthCheck, given, settings
@@ -65,3 +66,12 @@ def test_integer_triangles(exact_backend, corners, origins, data):
         elif total[k] > 0:
             assert weight[k] >= 0
             assert hits.distance[i] == pytest.approx(distance[k], abs=1e-9)
+
+
+@pytest.mark.parametrize("far", [1e155, 1e200, 1e300])
+def test_rays_whose_areas_overflow_hit_nothing_and_warn_of_nothing(far):
+    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
+    origins = np.array([[far, -far, 5], [far, far, far], [-far, 0, -far]])
+    rays = shear(origins, np.tile([0.0, 0.0, -1.0], (3, 1)))
+    plane = intersect(rays, np.arange(3), corners, np.zeros(3, int))
+    assert not inside(plane.a, plane.b, plane.c, plane.det).any()

@@ -32,17 +32,23 @@ SUMMARY = "summary printed"
 EXIT = "exit"
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>Timeline of a run</title><style>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Timeline of a run</title><style>
 body {{ font: 15px/1.4 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
   color: #1c2733; background: #fff }}
 table {{ border-collapse: collapse; width: 100% }}
 td, th {{ padding: .2rem .6rem; text-align: right; white-space: nowrap }}
 td:first-child, th:first-child {{ text-align: left }}
 td:last-child {{ width: 60% }}
+code {{ overflow-wrap: anywhere }}
 svg {{ display: block; width: 100%; height: 1rem }}
 rect {{ fill: #2a6fb0 }}
 @media (prefers-color-scheme: dark) {{ body {{ color: #dde5ee; background: #10161d }}
   rect {{ fill: #6fb0ee }} }}
+@media (max-width: 600px) {{ thead, tbody {{ display: block }}
+  tr {{ display: grid; grid-template-columns: 1fr 5rem 6rem }}
+  td, th {{ padding: .2rem 0 }} td:last-child {{ grid-column: 1 / -1; width: auto }} }}
 </style></head><body><h1>Timeline of a run</h1><p><code>{command}</code>, begun {begun}</p>
 <table><thead><tr><th>step</th><th>takes, s</th><th>ends at, s</th><th></th></tr></thead><tbody>
 {rows}

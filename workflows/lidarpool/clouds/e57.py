@@ -182,12 +182,15 @@ def open_file(source: RecordingSource) -> Recording:
             return scan.positions, columns, np.eye(4) if scan.pose is None else scan.pose
 
         notes: tuple[str, ...] = ()
+        epsg = None
         system = _system(file)
         if system is not None and file.scan_count:
             points, _, pose = read(0)
             assert pose is not None  # of every scan
             notes = tuple(check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3]))
-        sweeps = SweepFiles(file.scan_count, read, notes=notes)
+            # Else the points are in no such system.
+            epsg = system.epsg if system.horizontal_m == 1.0 else None
+        sweeps = SweepFiles(file.scan_count, read, notes=notes, epsg=epsg)
     return source.of_sensors({"": sweeps})
 
 

@@ -42,6 +42,7 @@ class SweepFiles(NamedTuple):
     point_count: int | None = None  # of a cloud in parts; None of sweeps
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
+    epsg: int | None = None  # of the system that the file states, if that is in metres
 
 
 class SeveralSensorsError(LidarError):
@@ -254,6 +255,7 @@ class RecordingSource:
             times=None if files.times_ns is None else files.times_ns.tolist,
             notes=self.named(files.notes),
             sequence=files.sequence,
+            epsg=files.epsg,
         )
 
     def named(self, clauses: Iterable[str]) -> tuple[str, ...]:

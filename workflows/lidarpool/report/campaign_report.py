@@ -92,7 +92,7 @@ def write_card(
         on_page["times"] = draw_times(figures)
         page = rendered(
             "campaign.html",
-            captions=_PAGE_CAPTIONS,
+            captions=_PAGE_CAPTIONS,  # for readers of screens
             pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
             slowest=figures.slowest,
             description=campaign["description"],

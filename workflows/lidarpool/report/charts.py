@@ -297,21 +297,50 @@ def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
 def _draw_percentiles(
     axes: Axes, scale: Varied, x: Floats, points: Floats, done_jobs: Indices, line_width: float
 ) -> None:
-    """Draw the percentiles of points (jobs,) of jobs with the same label, or similar x (jobs,)."""
-    if scale.labels:  # a bar for each label
+    """Draw the percentiles of points (jobs,) of jobs with the same label, or similar x (jobs,).
+
+    Each group of jobs has a bar. A line from group to group would show the other quantities of
+    these jobs as ups and downs.
+    """
+    if scale.labels:
         bins = np.unique(scale.values[done_jobs])
         groups = [done_jobs[scale.values[done_jobs] == number] for number in bins]
-        middles = (bins[:, None] + [-0.35, 0.35, np.nan]).ravel()
+        bars = bins[:, None] + [-0.35, 0.35, np.nan]
     else:
-        count = min(_MAX_GROUPS, len(done_jobs) // _MIN_GROUP)
-        ordered = done_jobs[np.argsort(x[done_jobs], kind="stable")]
-        groups = np.array_split(ordered, count) if count > 1 else []
-        middles = np.array([np.median(x[group]) for group in groups])
+        groups = _groups_of_near(x, done_jobs)
+        bars = _adjoining_bars([x[group] for group in groups])
     if groups:
         percentiles = [np.percentile(points[group], PERCENTILES) for group in groups]
-        lower, median, upper = np.repeat(percentiles, len(middles) // len(groups), axis=0).T
-        axes.fill_between(middles, lower, upper, color=theme.MUTED, alpha=0.18, lw=0)
-        axes.plot(middles, median, color=theme.INK, lw=line_width, solid_joinstyle="round")
+        lower, median, upper = np.repeat(percentiles, 3, axis=0).T
+        axes.fill_between(bars.ravel(), lower, upper, color=theme.MUTED, alpha=0.18, lw=0)
+        axes.plot(bars.ravel(), median, color=theme.INK, lw=line_width, solid_capstyle="butt")
+
+
+def _groups_of_near(x: Floats, jobs: Indices) -> list[Indices]:
+    """Return groups of jobs with near values x (jobs,), in their order; none of too few jobs.
+
+    Jobs with equal values are in one group.
+    """
+    count = min(_MAX_GROUPS, len(jobs) // _MIN_GROUP)
+    if count < 2:
+        return []
+    limits = np.quantile(x[jobs], np.arange(1, count) / count, method="higher")
+    number = np.searchsorted(np.unique(limits), x[jobs], side="right")
+    groups = [jobs[number == k] for k in range(count)]
+    return [group for group in groups if len(group)]
+
+
+def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
+    """Return the left and right ends of bars of groups of values, and NaN: (groups, 3).
+
+    Bars of neighbouring groups meet halfway between the groups.
+    """
+    lowest = np.array([values.min() for values in groups])
+    highest = np.array([values.max() for values in groups])
+    middles = (highest[:-1] + lowest[1:]) / 2
+    left = np.concatenate([lowest[:1], middles])
+    right = np.concatenate([middles, highest[-1:]])
+    return np.stack([left, right, np.full(len(groups), np.nan)], axis=1)
 
 
 def _limits(points: Floats) -> tuple[float, float]:

@@ -107,6 +107,11 @@ class CloudCounts:
         return self._positions.above
 
     @property
+    def pixel_m(self) -> float:
+        """Side of a pixel of `above`, metres."""
+        return self._positions.pixel_m
+
+    @property
     def density(self) -> float | None:
         """Points per square metre."""
         return self._positions.density
@@ -132,8 +137,8 @@ class PositionCounts:
         self._cells = np.zeros(_CELLS**3, np.int64)
         # The more points, the finer.
         across = np.ptp(self.bounds[:, :2], axis=0)
-        self._pixel = float(across.max() / np.clip(count**0.5, 50, 800)) or 1.0
-        self.above = np.zeros((across[::-1] / self._pixel).astype(np.int64) + 1, np.int64)
+        self.pixel_m = float(across.max() / np.clip(count**0.5, 50, 800)) or 1.0
+        self.above = np.zeros((across[::-1] / self.pixel_m).astype(np.int64) + 1, np.int64)
 
     def cell_index(self, axis: int, positions: AnyFloats) -> Ints:
         """Return the part of an axis in the indices of cells of the grid, of coordinates (n,)."""
@@ -143,7 +148,7 @@ class PositionCounts:
     def pixel_index(self, axis: int, positions: AnyFloats) -> Ints:
         """Return the part of x or y in the indices of pixels, of coordinates (n,)."""
         rows, columns = self.above.shape
-        pixels = ((positions - self.bounds[0, axis]) / self._pixel).astype(np.int64)
+        pixels = ((positions - self.bounds[0, axis]) / self.pixel_m).astype(np.int64)
         return pixels.clip(0, columns - 1) if axis == 0 else pixels.clip(0, rows - 1) * columns
 
     def add_cells(self, cells: Ints) -> None:

@@ -207,6 +207,12 @@ class Scenario(Section):
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
 
+    @property
+    def title(self) -> str:
+        """Name of the survey, for titles: the name of the file without its ending."""
+        path = Path(self._source)
+        return path.stem if path.suffix in (".yaml", ".yml") else self._source
+
     @classmethod
     def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
         """Read a scenario file (YAML), or make the scenario of a mesh file by `mesh_data`.

@@ -34,6 +34,9 @@ DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are small dots
 MAX_PATH_POINTS = 200  # of the drawn trajectory of a sensor
+# areas of numbered marks, square points of a picture 1600 wide: of 1 to 9, and of more
+_MARK = 62
+_MARK_OF_TWO_DIGITS = 92
 MAX_NAMES = 12  # of actors, beside them
 # pixels of a picture 1600 wide
 NAME_ABOVE = 26.0
@@ -219,6 +222,7 @@ class Page:
     def numbers(self, axes: Axes, shot: SurfaceView) -> None:
         """Write numbers from 1 on the sensors' markers; hidden sensors have white markers."""
         pixels, is_visible = shot.visible(shot.sensors)
+        area = _MARK if len(pixels) < 10 else _MARK_OF_TWO_DIGITS
         for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # the front last
             x = float(pixels[k, 0])
             y = float(pixels[k, 1])
@@ -227,14 +231,14 @@ class Page:
             axes.scatter(
                 [x],
                 [y],
-                s=62 * self.unit**2,
+                s=area * self.unit**2,
                 facecolors=face,
                 edgecolors=ink,
                 linewidths=0.7 * self.unit,
                 zorder=above,
             )
             style = {"va": "center_baseline", "weight": "bold", "zorder": above}
-            self._text(axes, (x, y), str(k + 1), 5.6 if k < 99 else 4.4, ink, **style)
+            self._text(axes, (x, y), str(k + 1), 5.2 if k < 99 else 4.0, ink, **style)
 
     def lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float

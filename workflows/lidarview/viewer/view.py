@@ -200,7 +200,9 @@ class View:
         sweeps = self.sweeps
         if sweeps is None:
             return self.stated_epsg
-        return sweeps.epsg if sweeps.coordinates == "world" else None
+        if sweeps.coordinates != "world":
+            return None
+        return self.stated_epsg if sweeps.epsg is None else sweeps.epsg
 
     @property
     def actors(self) -> Sequence[Actor]:

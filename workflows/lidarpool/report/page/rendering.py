@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.base.arrays import Ints
+from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import explained
+from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import natural, plural, shortened, without_common_prefix
 from lidarsim.sensor import Noise, Returns
@@ -40,6 +41,7 @@ from ..report import STAGES, in_order
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 WIDTH = 1000  # units of the drawing, which the page scales
 ROW = 18  # height of a row
+MAX_MARKS = 200  # sensors' positions in the plan
 MAX_ROWS = 24  # rows of a partition; the busiest are drawn
 _THIN = 1.2  # smallest width of a bar, in units
 _GAP = 0.6  # bars closer than this are drawn as one
@@ -59,18 +61,23 @@ def write_page(
 ) -> None:
     """Write a report as a single HTML file, which needs no further files and no network.
 
-    Most numbers are those of `report`, from `make_report`. `put_picture` adds pictures.
+    Most numbers are those of `report`, from `make_report`. `put_picture` adds pictures. The title
+    has the models of the sensors, or the scenario's name if no sensor has a model.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
+    has_model = any(mounted.sensor.name for mounted in result.survey.carried)
+    marks = _sensor_pixels(result, cloud)
     text = rendered(
         "page.html",
         report=report,
         cloud=cloud,
-        pictures={"above": from_above(cloud.above)},
+        name="" if scenario is None or has_model else scenario.title,
+        pictures={"above": from_above(cloud.above, marks)},
+        has_marks=len(marks) > 0,
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_written(scenario) if scenario else "",
@@ -90,10 +97,27 @@ def put_picture(page: Path, name: str, svg: str) -> None:
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
-def from_above(counts: Ints) -> str:
+def _sensor_pixels(result: RunResult, cloud: CloudCounts) -> Floats:
+    """Return columns and rows, from the north, of the positions of standing sensors: (n, 2).
+
+    Positions outside the bounds of the points are left out.
+    """
+    survey = result.survey
+    if survey.coordinates != "world" or survey.path.moves or not len(result.points):
+        return np.empty((0, 2))
+    indices = even_indices(survey.path.stations, MAX_MARKS)
+    positions = np.array([survey.path.pose(int(k)).position for k in indices])
+    rows, columns = cloud.above.shape
+    pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.bounds[0, :2]) / cloud.pixel_m
+    is_within = ((pixels >= 0) & (pixels <= (columns, rows))).all(axis=1)
+    return np.stack([pixels[:, 0], rows - pixels[:, 1]], axis=1)[is_within]
+
+
+def from_above(counts: Ints, marks: Iterable[Sequence[float]] | Floats = ()) -> str:
     """Draw numbers of points (rows, columns), the first row in the south, as SVG.
 
-    The page inverts its lightness where the page is dark.
+    The page inverts the lightness of the points where the page is dark. `marks` (n, 2) are columns
+    and rows, from the north, of red dots.
     """
     rows, columns = counts.shape
     shade = np.log1p(counts[::-1])
@@ -104,7 +128,10 @@ def from_above(counts: Ints) -> str:
     Image.fromarray(pixels).save(data, "PNG")
     source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
     size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
-    return f'<svg viewBox="0 0 {columns} {rows}"><image {size} href="{source}"/></svg>'
+    radius = max(rows, columns) / 130
+    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y in marks)
+    image = f'<image {size} href="{source}"/>'
+    return f'<svg viewBox="0 0 {columns} {rows}">{image}<g fill="#d62f3d">{dots}</g></svg>'
 
 
 def rendered(
@@ -155,12 +182,22 @@ def _template(name: str) -> Template:
         plural,
     ):
         environment.filters[filter_.__name__] = filter_
+    environment.filters["with_names"] = _with_names
     environment.filters["shortened"] = lambda name, length=60: shortened(name, length)
     environment.filters["one_line"] = lambda text: type(text)(re.sub("[ \n]+", " ", text).strip())
     environment.filters["labels"] = lambda names: dict(
         zip(names, without_common_prefix([*names]), strict=True)
     )
     return environment.get_template(name)
+
+
+def _with_names(row: str, head: Sequence[str]) -> Markup:
+    """Give the cells (td) of a row of a table the names of their columns, as the style shows.
+
+    The first column has the name of the row (th).
+    """
+    names = iter(head[1:])
+    return Markup(re.sub("<td", lambda _: f'<td data-name="{escape(next(names, ""))}"', row))
 
 
 def _written(scenario: Scenario) -> str:
