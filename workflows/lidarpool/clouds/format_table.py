@@ -253,15 +253,6 @@ FORMATS = {
         reads=("sweeps", "points"),
         folders=("cloud.ply",),
     ),
-    "toy": FormatRow(
-        "cloud.toy",
-        "lidarpool.clouds.toy",
-        "write_toy",
-        needs=("intensity",),
-        holds=("intensity",),
-        suffixes=(".toy",),
-        reads=("sweeps", "points"),
-    ),
     "las": _las("las"),
     "laz": _las("laz"),
     "parquet": FormatRow(
