@@ -230,14 +230,12 @@ ENCODERS = {
     "ouster": "lidarsim.packets.ouster:OusterEncoder",
     "robosense": "lidarsim.packets.robosense:RobosenseEncoder",
     "velodyne": "lidarsim.packets.velodyne:VelodyneEncoder",
-    "toy": "lidarsim.packets.toy:ToyEncoder",
 }
 
 
 # Classes of decoders, in the order in which they are asked: packets of Ouster have no mark.
 _DECODERS = (
     "lidarsim.packets.velodyne:VelodyneDecoder",
-    "lidarsim.packets.toy:ToyDecoder",
     "lidarsim.packets.hesai:HesaiDecoder",
     "lidarsim.packets.ouster:OusterDecoder",
 )
