@@ -21,6 +21,7 @@ from .separation import SelectionStep, SeparationStep
 from .spray import SprayStep
 from .step import PulseStep, Role, Setup
 from .stray_light import StrayLightStep
+from .toy import ToyStep
 from .waveform import WaveformStep
 
 # If no step applies, each ray has one return, its hit.
@@ -42,6 +43,7 @@ STEPS: list[type[PulseStep]] = [
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,
+    ToyStep,
 ]
 
 
