@@ -49,7 +49,6 @@ class Noise:
     angle_deg: Annotated[
         AngleSigma, about("standard deviation of beam directions, in both axes", 0.05)
     ] = 0.0
-    toy_m: Annotated[Metres, about("length by which ranges are longer, metres", 0.5)] = 0.0
     dropout: Annotated[
         UnitShare, about("share of returns that are lost, whatever their energy")
     ] = 0.0

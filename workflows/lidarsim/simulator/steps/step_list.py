@@ -21,7 +21,6 @@ from .separation import SelectionStep, SeparationStep
 from .spray import SprayStep
 from .step import PulseStep, Role, Setup
 from .stray_light import StrayLightStep
-from .toy import ToyStep
 from .waveform import WaveformStep
 
 # If no step applies, each ray has one return, its hit.
@@ -43,7 +42,6 @@ STEPS: list[type[PulseStep]] = [
     SelectionStep,
     RecordingStep,
     RangeNoiseStep,
-    ToyStep,
 ]
 
 
