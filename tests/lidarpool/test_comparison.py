@@ -13,9 +13,10 @@ from pypcd4 import PointCloud
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
-from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
+from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, save_cloud
+from lidarpool import comparing as compare
 from lidarpool.clouds.formats import Format
-from lidarpool.compare import comparison
+from lidarpool.comparing import comparison
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.recordings.recordings import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
@@ -496,7 +497,7 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     there = rng.uniform(size=RANGES.shape) > 0.1
     noisy = cloud(RANGES + rng.normal(0, 0.02, RANGES.shape), there=there, light=light)
     save_cloud(noisy, tmp_path / "<b>A & B.ply")
-    found = lidarpool.compare(tmp_path / "<b>A & B.ply", cloud(light=light))
+    found = lidarpool.comparing(tmp_path / "<b>A & B.ply", cloud(light=light))
     names = [path.name for path in found.save(tmp_path / "out")]
     assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
     assert {"compare.json", "compare.html", "compare-ranges.png", "compare-above.png"} <= {*names}

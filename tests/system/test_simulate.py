@@ -213,7 +213,7 @@ def raise_at(scan: int | str | None, scan_of=None):
     ("target", "stand_in", "message"),
     [
         (
-            "lidarsim.sensor.survey.Survey.scan",
+            "lidarsim.survey.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
             "stage generate failed: scan 0: FloatingPointError",
         ),

@@ -15,7 +15,7 @@ from raybeam import Pattern
 
 from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
 from .casting.surfaces import Surfaces, light_of

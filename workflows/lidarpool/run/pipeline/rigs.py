@@ -26,11 +26,11 @@ from distributed import get_worker
 from lidarsim.base.arrays import Floats32
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.batch_points import BatchPoints
 from lidarsim.simulator.points.device import DevicePoints
 from lidarsim.simulator.rig import Rig
+from lidarsim.survey.survey import Survey
 from poolpart import own_device, own_device_share
 from raybeam.registry import choose
 
