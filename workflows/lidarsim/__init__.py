@@ -71,8 +71,10 @@ _MODULES = {
     "base.errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
-    "follower": ("Follower",),
-    "mujoco": ("MujocoScanner",),
+    "media.materials": ("Material",),
+    "motion.navigation": ("Gnss", "Imu", "Navigation"),
+    "motion.trajectory": ("Pose", "Track"),
+    "motion.trajectory_files": ("load_trajectory",),
     "packets.sweep_packets": ("Packets",),
     "scene.actors": ("Actor",),
     "scene.scene": ("Scene",),
@@ -80,9 +82,11 @@ _MODULES = {
     "scene.scene_mesh": ("SceneMesh",),
     "sensor.export": ("export_sensor",),
     "sensor.models": ("load_sensor",),
-    "sensor.trajectory": ("Track",),
-    "sensor.trajectory_files": ("load_trajectory",),
     "simulator": ("Scanner",),
+    "survey.faults": ("Fault",),
+    "survey.survey": ("Mounted", "ScanSpec", "Survey"),
+    "worlds": ("MujocoScanner",),
+    "worlds.follower": ("Follower",),
 }
 
 
