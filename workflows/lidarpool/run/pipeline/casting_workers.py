@@ -211,7 +211,7 @@ class CastingWorkers:
 
     # -- casting ---------------------------------------------------------------------------
 
-    def cast(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
+    def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
         """Submit batches, each with its job, to a worker as a task; return the key of the task.
 
         The jobs must share a scene.

@@ -194,11 +194,11 @@ def intersect(
     results = []
     for work, plan in zip(works, plans, strict=True):
         rig = rig_of(work.handle, plan, scene)
-        results += [_cast(rig, work, first, stop) for first, stop in work.spans]
+        results += [_cast_batch(rig, work, first, stop) for first, stop in work.spans]
     return results
 
 
-def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
+def _cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     recorder = Recorder(INTERSECT, GPU)
     fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
