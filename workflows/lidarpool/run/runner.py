@@ -1,13 +1,13 @@
 """A run of one or many jobs, from its options to its result: for commands and for Python.
 
-The way through the driver: `Run.execute` locks the output, opens the `RunStore` and makes the first
-`Job`; for what is left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each job to
-the `Pipeline`, whose stage 1 sends ranges of scans; the `Dispatcher` makes batches of them, and
-`CastingWorkers.submit` gives batches to a worker as a task. There `intersect` casts each batch by a
-`Rig`, as `lidarsim/simulator/pulses.py` tells. A collector stores the columns as a part and sends a
-`Receipt`, which the loop commits; stage 3 sends a `ScanFrame`, which `on_frame` gets. The parts of a
-job whose scans are committed go to the `JobWriter`, or become the points of a `RunResult`.
-`Output.finish` writes the files.
+The way through the driver: `Run.execute` locks the output, opens the `RunStore` and makes the
+first `Job`; for what is left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each
+job to the `Pipeline`, whose stage 1 sends ranges of scans; the `Dispatcher` makes batches of them,
+and `CastingWorkers.submit` gives batches to a worker as a task. There `intersect` casts each batch
+by a `Rig`, as `lidarsim/simulator/pulses.py` tells. A collector stores the columns as a part and
+sends a `Receipt`, which the loop commits; stage 3 sends a `ScanFrame`, which `on_frame` gets. The
+parts of a job whose scans are committed go to the `JobWriter`, or become the points of a
+`RunResult`. `Output.finish` writes the files.
 """
 
 from __future__ import annotations
