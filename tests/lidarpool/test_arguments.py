@@ -44,6 +44,7 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    compare,
     fit,
     load_robot,
     load_sensor,
@@ -59,7 +60,6 @@ from lidarpool import (
     to_dask,
     to_open3d,
 )
-from lidarpool import comparing as compare
 from lidarpool.run.options import RunKeywords, RunOptions
 from lidarpool.scenario.sections import PoolSection
 

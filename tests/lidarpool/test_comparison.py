@@ -13,8 +13,7 @@ from pypcd4 import PointCloud
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
-from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, save_cloud
-from lidarpool import comparing as compare
+from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.clouds.formats import Format
 from lidarpool.comparing import comparison
 from lidarpool.datasets.figures import rank_correlation

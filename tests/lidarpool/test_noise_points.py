@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import comparing as compare
+from lidarpool import compare
 from lidarpool.cli.result_commands import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.comparing.comparison import Comparison

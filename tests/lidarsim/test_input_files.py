@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import comparing as compare
-from lidarpool import load_robot, load_sensor, load_trajectory, read_cloud
+from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
 from lidarpool.clouds.format_table import point_suffixes
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec

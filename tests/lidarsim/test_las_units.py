@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import comparing as compare
+from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarsim.base.errors import LidarError

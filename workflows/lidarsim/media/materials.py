@@ -72,7 +72,7 @@ class Measured(NamedTuple):
 @cache
 def reflectances() -> dict[str, Measured]:
     """Return the table of reflectances: {name of a material: measurement}."""
-    text = (files("lidarsim.sensor") / "reflectances.csv").read_text("utf-8")
+    text = (files("lidarsim.media") / "reflectances.csv").read_text("utf-8")
     return {
         row["name"]: Measured(
             (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
