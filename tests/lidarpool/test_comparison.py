@@ -496,7 +496,7 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     there = rng.uniform(size=RANGES.shape) > 0.1
     noisy = cloud(RANGES + rng.normal(0, 0.02, RANGES.shape), there=there, light=light)
     save_cloud(noisy, tmp_path / "<b>A & B.ply")
-    found = lidarpool.comparing(tmp_path / "<b>A & B.ply", cloud(light=light))
+    found = lidarpool.compare(tmp_path / "<b>A & B.ply", cloud(light=light))
     names = [path.name for path in found.save(tmp_path / "out")]
     assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
     assert {"compare.json", "compare.html", "compare-ranges.png", "compare-above.png"} <= {*names}
