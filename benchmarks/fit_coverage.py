@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarpool.clouds.recording import Recording
-from lidarpool.compare.fit import fit
+from lidarpool.comparing.fit import fit
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, place_instances
 from lidarsim.scene.scene_mesh import SceneMesh

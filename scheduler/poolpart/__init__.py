@@ -7,10 +7,10 @@ from .errors import PipeClosed, PipeFailed, PoolError
 from .listening import Listener
 from .mapping import Results
 from .partition import Partition
+from .partition_stats import PartitionStats, StageStats
 from .pipe import Pipe
 from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
-from .stats import PartitionStats, StageStats
 from .workers import WorkerInfo
 
 __all__ = [

@@ -23,17 +23,16 @@ from .html_table import WORDS, shown_seconds
 from .internals.names import PAGE, require
 from .internals.scheduler import serve, serve_no_longer
 from .other_sites import names_of_machine, refusal
+from .partition_stats import COUNTS, StageStats
 from .pipe_states import pipes_of
+from .stats import NAME as STATISTICS
 from .stats import (
-    COUNTS,
-    StageStats,
     forget_statistics,
     running_on,
     slots_of,
     statistics_of,
     stats_of,
 )
-from .stats import NAME as STATISTICS
 from .steward import NAME as STEWARD
 from .workers import check_client, on_scheduler
 

@@ -7,20 +7,31 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from dask.utils import funcname
-from distributed import Future, wait
+from distributed import Client, Future, wait
 
 from .errors import PipeFailed, PoolError
 from .membership import prospects
 from .pipe import Pipe
 from .worker_wait import WorkerWait, check_wait
 
-if TYPE_CHECKING:
-    from .partition import Partition
-
 LOOK_S = 5.0  # between looks at the number of slots
+
+
+class Submitter(Protocol):
+    """What the tasks need of a partition."""
+
+    name: str
+    by_rule: bool  # whether workers that join come by a rule
+
+    @property
+    def client(self) -> Client:
+        """The client."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        """Submit a task."""
 
 
 class _PipeItems:
@@ -83,7 +94,7 @@ class ItemTasks:
 
     def __init__(
         self,
-        partition: Partition,
+        partition: Submitter,
         source: Pipe | Iterable[Any],
         function: Callable[..., Any],
         window: int | None,

@@ -7,12 +7,11 @@ alerting can go by the demand of each partition, which Dask's figures of the who
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dask
 
-if TYPE_CHECKING:
-    from .stats import PartitionStats
+from .partition_stats import PartitionStats
 
 _LABELS = ["partition"]
 

@@ -13,8 +13,9 @@ from .dashboard_page import is_open, page_link
 from .errors import PoolError
 from .html_table import html_paragraph, html_table
 from .membership import has_rule
+from .partition_stats import COUNTS, PartitionStats
 from .pipe_states import pipes_of
-from .stats import COUNTS, PartitionStats, stats_of
+from .stats import stats_of
 from .workers import on_scheduler
 
 _LINK = Template("""\

@@ -23,9 +23,10 @@ from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .notebook import table_of_partition
+from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .rules import check_count
-from .stats import PartitionStats, stats_of
+from .stats import stats_of
 from .task_context import own_client
 from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, on_scheduler

@@ -10,21 +10,17 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from itertools import islice
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import fences_of
-from .html_table import html_table, shown_seconds
 from .metrics import PartitionCollector, publish, withdraw
+from .partition_stats import PartitionStats, StageStats
 
 NAME = "poolpart-stats"
-COUNTS = ("waiting", "queued", "running", "done", "failed")  # of tasks, in the order of tables
-_HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
-_HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
 # {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
@@ -121,87 +117,6 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
         held += takes
         stages[task.prefix.name] += 1
     return stages, held
-
-
-@dataclass(frozen=True)
-class StageStats:
-    """Tasks of a stage, that is, with a common key prefix.
-
-    Parameters
-    ----------
-    waiting
-        Tasks that wait for results of others.
-    queued
-        Tasks that wait for a worker, or for their turn on one.
-    running
-        Running tasks. The scheduler does not see when a task starts: of a worker's tasks, as many
-        count as running as the worker has slots.
-    done
-        Successful runs of tasks, including those whose result was lost and recomputed.
-    failed
-        Tasks that raised an error or were given up after too many dead workers. Their dependents,
-        which never ran, do not count.
-    seconds
-        Running time of tasks, including failed ones, without those lost with their worker.
-    queued_seconds
-        Time that these tasks waited for a worker or for a slot, after all their inputs were there.
-    """
-
-    waiting: int = 0
-    queued: int = 0
-    running: int = 0
-    done: int = 0
-    failed: int = 0
-    seconds: float = 0.0
-    queued_seconds: float = 0.0
-
-    def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
-        return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])
-
-    @property
-    def _figures(self) -> list[object]:
-        """Cells of a row of a table: the counts, and the running time in seconds."""
-        return [*(getattr(self, count) for count in COUNTS), shown_seconds(self.seconds)]
-
-
-@dataclass(frozen=True)
-class PartitionStats(StageStats):
-    """Current and finished tasks of a partition.
-
-    Counting of finished tasks begins when the cluster is divided, the first statistics are
-    requested, or the page is opened, whichever comes first.
-
-    Parameters
-    ----------
-    name
-        Name of the partition.
-    workers
-        Workers that it has now.
-    slots, busy
-        Slots of these workers, and how many are held by a task.
-    exclusive
-        Whether a fence keeps other tasks out.
-    stages
-        The same counts by stage.
-    """
-
-    name: str = ""
-    workers: int = 0
-    slots: int = 0
-    busy: int = 0
-    exclusive: bool = False
-    stages: Mapping[str, StageStats] = field(default_factory=dict)
-
-    def _repr_html_(self) -> str:
-        """Return the tables that notebooks show: the partition, and its stages."""
-        name = self.name or "remainder"
-        row = [name, self.workers, self.slots, self.busy, *self._figures]
-        tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])
-        if self.stages:
-            stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
-            tables += html_table("Stages", _HEAD_OF_STAGES, stages)
-        return tables
 
 
 def statistics_of(scheduler: Any) -> Statistics:

@@ -13,9 +13,9 @@ from tests.shapes import room
 
 from lidarpool import Mounted, Pose, Survey, Track, load_sensor
 from lidarpool.clouds.formats import Format
-from lidarpool.live import opened, recorded
-from lidarpool.live.job_list import JobList
-from lidarpool.live.opened import growing_view, is_data_set, open_view
+from lidarpool.showing.pages import opened, recorded
+from lidarpool.showing.pages.job_list import JobList
+from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view
 from lidarsim.base.errors import LidarError
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.picture_file import PICTURE_FILE, PictureContent

@@ -11,7 +11,7 @@ import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
 from lidarpool import Pose, Scene, Sensor, Survey, Track
-from lidarpool.live.downloads import downloads
+from lidarpool.showing.pages.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE

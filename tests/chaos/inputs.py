@@ -24,10 +24,10 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.playback.recording import Recording
 from lidarpool.recordings.recordings import open_sensors
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarpool.showing.playback.recording import Recording
 from raybeam.compiled import compiled
 
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}

@@ -12,9 +12,9 @@ from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_c
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.formats import Format
 from lidarsim.columns.cloud import Cloud
+from lidarsim.motion.trajectory import matrices
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
-from lidarsim.sensor.trajectory import matrices
 from lidarsim.sweeps.sweeps import Sweeps
 
 PERIOD_NS = 100_000_000  # of a sweep

@@ -16,8 +16,8 @@ from tests.clusters import import_jobqueue
 
 from lidarpool import LidarError
 from lidarpool.run.cluster.checks import gpu_note
-from lidarpool.run.cluster.cluster_file import ClusterFile
 from lidarpool.run.cluster.connection import default_workers, local_cluster
+from lidarpool.run.cluster_file import ClusterFile
 from poolpart import PoolError, WorkerInfo
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "clusters"
@@ -124,7 +124,7 @@ def test_a_file_leaves_interrupts_to_the_program():
     script = """
 import signal
 from pathlib import Path
-from lidarpool.run.cluster.cluster_file import ClusterFile
+from lidarpool.run.cluster_file import ClusterFile
 ClusterFile.load(Path("slurm.yaml"))
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 """

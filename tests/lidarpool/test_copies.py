@@ -12,9 +12,9 @@ from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor.materials import MaterialTable
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ class Workers:
     def want(self, slots):
         self.wanted.append(slots)
 
-    def cast(self, batches, worker):
+    def submit(self, batches, worker):
         assert worker in self.slots
         assert len({id(self.jobs[job]) for job, _ in batches}) == 1
         self.tried.update((job, *span) for job, span in batches)

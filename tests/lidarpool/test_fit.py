@@ -25,8 +25,8 @@ from lidarpool import (
 )
 from lidarpool.clouds.formats import Format
 from lidarpool.clouds.recording import Recording
-from lidarpool.compare.fit.estimates import Estimate
-from lidarpool.compare.fit.fitting import _with_performance
+from lidarpool.comparing.fit.estimates import Estimate
+from lidarpool.comparing.fit.fitting import _with_performance
 from lidarpool.recordings.recordings import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.sensor.models import read_model

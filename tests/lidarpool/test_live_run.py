@@ -19,15 +19,6 @@ from tests.shapes import box
 
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
-from lidarpool.live.live_page import (
-    MAX_ENDED,
-    MAX_FAILED,
-    MAX_UNDER_WAY,
-    LiveJob,
-    LivePage,
-    busy_slots,
-    live_page,
-)
 from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
@@ -36,6 +27,15 @@ from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.runner import Run, StoredOutput
 from lidarpool.run.store.job_under_way import JobUnderWay
 from lidarpool.run.store.run_store import RunStore
+from lidarpool.showing.pages.live_page import (
+    MAX_ENDED,
+    MAX_FAILED,
+    MAX_UNDER_WAY,
+    LiveJob,
+    LivePage,
+    busy_slots,
+    live_page,
+)
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
@@ -216,7 +216,7 @@ def test_a_run_brings_no_page_and_no_pictures_before_it_needs_them():
     """Matplotlib takes a second."""
     code = "import sys, lidarpool.cli.run_command; print(*sys.modules, sep='\\n')"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pages = {"lidarview.viewer.server", "matplotlib", "open3d", "lidarpool.live.live_page"}
+    pages = {"lidarview.viewer.server", "matplotlib", "open3d", "lidarpool.showing.pages.live_page"}
     assert pages.isdisjoint(told.stdout.split())
 
 

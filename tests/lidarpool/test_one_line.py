@@ -40,7 +40,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarsim.columns.table import TABLE
-from lidarsim.sensor.trajectory import Stations
+from lidarsim.motion.trajectory import Stations
 
 SENSOR = load_sensor("velodyne/vlp16")
 MESH = SceneMesh("hall", np.eye(300, 3), np.arange(300).reshape(100, 3))

@@ -23,10 +23,10 @@ from lidarpool import (
 from lidarpool.cli.result_commands import view as view_command
 from lidarpool.clouds.formats import Format
 from lidarpool.clouds.ros import bag_poses
-from lidarpool.live import recorded
-from lidarpool.live.job_list import JobList
-from lidarpool.live.opened import growing_view, is_data_set, open_view, open_views
 from lidarpool.recordings.recordings import open_recording
+from lidarpool.showing.pages import recorded
+from lidarpool.showing.pages.job_list import JobList
+from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view, open_views
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box

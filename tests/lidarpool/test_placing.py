@@ -28,9 +28,10 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import Transform
-from lidarsim.sensor import Mounted, Sensor, Survey
+from lidarsim.sensor import Sensor
 from lidarsim.sensor.models import load_sensor
 from lidarsim.simulator.rig import Rig
+from lidarsim.survey.survey import Mounted, Survey
 
 GRID = Mounted(Sensor.grid())
 

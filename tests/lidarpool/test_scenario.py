@@ -20,9 +20,10 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
+from lidarsim.media.materials import MaterialTable, SurfaceKinds
 from lidarsim.scene.actors import box
-from lidarsim.sensor import Noise, Returns, Sensor, Survey
-from lidarsim.sensor.materials import MaterialTable, SurfaceKinds
+from lidarsim.sensor import Noise, Returns, Sensor
+from lidarsim.survey.survey import Survey
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)

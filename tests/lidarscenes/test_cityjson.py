@@ -10,11 +10,11 @@ from tests.meshes import NESTED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.errors import LidarError
+from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import triangle_areas
-from lidarsim.sensor.materials import MaterialTable
 
 # A cube of 2 units, its rings running outward.
 CUBE = [[x, y, z] for z in (0, 2) for y in (0, 2) for x in (0, 2)]

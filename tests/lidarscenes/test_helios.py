@@ -15,7 +15,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import surfels
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import Imported, import_survey
-from lidarsim.sensor.materials import MaterialTable
+from lidarsim.media.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
 

@@ -17,10 +17,10 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.vectors import into_axes
+from lidarsim.motion.trajectory import presence_ns
 from lidarsim.scene.actors import box
-from lidarsim.sensor import Mounted
-from lidarsim.sensor.trajectory import presence_ns
 from lidarsim.simulator.rig import Rig
+from lidarsim.survey.survey import Mounted
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BOX = '<visual><geometry><box size="0.2 0.2 0.2"/></geometry></visual>'

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError, Pose, Track
-from lidarsim.sensor import Stations
+from lidarsim.motion.trajectory import Stations
 from lidarsim.simulator.casting.actor_trajectories import ActorTrajectories
 
 

@@ -25,10 +25,10 @@ from lidarpool import (
     Track,
 )
 from lidarsim.columns.table import CAUSES
+from lidarsim.media.materials import extinction
+from lidarsim.media.weather import EXIT_M, dust, rain, snow, spray
 from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor.materials import extinction
-from lidarsim.sensor.weather import EXIT_M, dust, rain, snow, spray
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.air import highest_probabilities
 

@@ -38,6 +38,7 @@ from lidarpool import (
 )
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import COLOURS
+from lidarsim.media.materials import DARKEST, reflectances
 from lidarsim.scene import masks
 from lidarsim.scene.colours import (
     GREY,
@@ -50,7 +51,6 @@ from lidarsim.scene.colours import (
     packed,
     unpacked,
 )
-from lidarsim.sensor.materials import DARKEST, reflectances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RNG = np.random.default_rng(7)

@@ -20,7 +20,7 @@ from lidarsim.scene.files.coordinate_systems import (
     transformed,
     zone_in_metres,
 )
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 
 needs_registry = pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 AXIS_M = 6378137.0

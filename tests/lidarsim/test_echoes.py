@@ -37,11 +37,11 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim.base.random_numbers import raw
+from lidarsim.media.materials import extinction, fresnel
 from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.sensor.materials import extinction, fresnel
-from lidarsim.sensor.random_numbers import raw
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.angle_noise import ACROSS

@@ -9,8 +9,8 @@ from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 
 from lidarpool import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.columns.table import CAUSES
+from lidarsim.media.materials import WATER_INDEX, below_water, fresnel
 from lidarsim.scene.colours import Colours
-from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
 
 COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")

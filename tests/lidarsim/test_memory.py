@@ -25,10 +25,10 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarsim.sensor.survey import OPTIONAL_NAMES
 from lidarsim.simulator.memory import HIT_COUNTER, cast_bytes, scans_that_fit
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
+from lidarsim.survey.survey import OPTIONAL_NAMES
 
 RAYS = 600_000
 

@@ -29,8 +29,8 @@ from lidarpool.clouds.navigation_files import instrument_bytes, write_instrument
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.sensor.navigation import fixes, geodetic, imu_samples
-from lidarsim.sensor.trajectory import Stations, matrices
+from lidarsim.motion.navigation import fixes, geodetic, imu_samples
+from lidarsim.motion.trajectory import Stations, matrices
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -10,7 +10,7 @@ import trimesh
 from tests.shapes import CPU, box, cast, level, solid
 
 from lidarpool import Beams, LidarError, Material, Optics, Pose, Returns, Scene, Sensor, Spin
-from lidarsim.sensor.materials import extinction, fresnel
+from lidarsim.media.materials import extinction, fresnel
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}
 SURFACE = level("Water", 0, 90)

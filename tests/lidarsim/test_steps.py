@@ -12,10 +12,9 @@ import pytest
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
+from lidarsim.base.random_numbers import Purpose
 from lidarsim.columns.table import CAUSES
-from lidarsim.sensor.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
-from lidarsim.sensor.random_numbers import Purpose
-from lidarsim.sensor.survey import OPTIONAL_NAMES
+from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
 from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, returns_without_surface
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.doppler import VELOCITY
@@ -29,6 +28,7 @@ from lidarsim.simulator.steps.step_list import (
     received_causes,
     remove_step,
 )
+from lidarsim.survey.survey import OPTIONAL_NAMES
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.

@@ -27,8 +27,8 @@ from lidarpool import (
     load_trajectory,
 )
 from lidarpool.base.fingerprint import fingerprint
-from lidarsim.sensor.survey import MAX_STEPS
-from lidarsim.sensor.trajectory import matrices, quaternions_of, rotations_of, velocities
+from lidarsim.motion.trajectory import matrices, quaternions_of, rotations_of, velocities
+from lidarsim.survey.survey import MAX_STEPS
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9

@@ -11,10 +11,10 @@ from tests.lidarsim.twin import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
+from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
+from lidarsim.media.weather import Air, spray
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
-from lidarsim.sensor.random_numbers import Purpose, named_seed, raw, starts
-from lidarsim.sensor.weather import Air, spray
 from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops

@@ -25,8 +25,8 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim.media.leaves import NAMES, brightness, density, projection
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor.leaves import NAMES, brightness, density, projection
 from lidarsim.simulator.rig import Rig
 
 GROUND = Material("*", 0.3)

@@ -18,9 +18,9 @@ import numpy as np
 
 from lidarpool import Noise
 from lidarsim.base.arrays import Floats
+from lidarsim.base.random_numbers import Purpose, quantiles
+from lidarsim.media.weather import Air, Particles
 from lidarsim.sensor.disc import Beam
-from lidarsim.sensor.random_numbers import Purpose, quantiles
-from lidarsim.sensor.weather import Air, Particles
 from lidarsim.simulator.steps.air import (
     FOG_CELL,
     FOG_PLACE,

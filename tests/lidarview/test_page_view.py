@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from lidarpool import LidarError, Pose, Scene, SceneInstance, SceneMesh, Sensor, Survey, Track
-from lidarpool.live.opened import open_views
+from lidarpool.showing.pages.opened import open_views
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type

@@ -100,7 +100,7 @@ def test_a_run_has_a_page_of_partitions_as_long_as_it_lasts(client, caplog):
 
     with caplog.at_level(logging.INFO, "lidarpool"):
         simulate(room(), Survey(SENSOR, [(0, 0, 0)]), client=client, on_progress=look)
-    assert all(f"<td>{name}</td>" in pages[-1] for name in ("GPU", "LIDAR", "OTHER", "intersect"))
+    assert all(f">{name}</td>" in pages[-1] for name in ("GPU", "LIDAR", "OTHER", "intersect"))
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(pages[0], timeout=120)
 
@@ -213,7 +213,7 @@ def raise_at(scan: int | str | None, scan_of=None):
     ("target", "stand_in", "message"),
     [
         (
-            "lidarsim.sensor.survey.Survey.scan",
+            "lidarsim.survey.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
             "stage generate failed: scan 0: FloatingPointError",
         ),

@@ -12,34 +12,22 @@ if TYPE_CHECKING:
     from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.table import Column
-    from lidarsim.follower import Follower
-    from lidarsim.mujoco import MujocoScanner
+    from lidarsim.media.materials import Material
+    from lidarsim.motion.navigation import Gnss, Imu, Navigation
+    from lidarsim.motion.trajectory import Pose, Track
+    from lidarsim.motion.trajectory_files import load_trajectory
     from lidarsim.packets.sweep_packets import Packets
     from lidarsim.scene.actors import Actor
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
     from lidarsim.scene.scene_mesh import SceneMesh
-    from lidarsim.sensor import (
-        Beams,
-        Fault,
-        Gnss,
-        Imu,
-        Material,
-        Mounted,
-        Navigation,
-        Noise,
-        Optics,
-        Pose,
-        Returns,
-        ScanSpec,
-        Sensor,
-        Spin,
-        Survey,
-    )
+    from lidarsim.sensor import Beams, Noise, Optics, Returns, Sensor, Spin
     from lidarsim.sensor.models import load_sensor
-    from lidarsim.sensor.trajectory import Track
-    from lidarsim.sensor.trajectory_files import load_trajectory
     from lidarsim.simulator import Scanner
+    from lidarsim.survey.faults import Fault
+    from lidarsim.survey.survey import Mounted, ScanSpec, Survey
+    from lidarsim.worlds import MujocoScanner
+    from lidarsim.worlds.follower import Follower
 
     from .api.dask_frames import to_dask
     from .api.result import Result
@@ -47,19 +35,19 @@ if TYPE_CHECKING:
     from .clouds.formats import save_cloud
     from .clouds.open3d_cloud import to_open3d
     from .clouds.ply import read_cloud
-    from .compare.comparison import Comparison, compare
-    from .compare.fit import Fit, fit
+    from .comparing.comparison import Comparison, compare
+    from .comparing.fit import Fit, fit
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
-    from .live.scanner_page import show
     from .plan import Plan, Planning
-    from .playback.live import play
     from .report.merging import merge
     from .run.pipeline.messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scenario.build import Job
-    from .viewers.scanner_view import Foxglove, Rerun
+    from .showing.pages.scanner_page import show
+    from .showing.playback.live import play
+    from .showing.viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [
     "Actor",
@@ -133,16 +121,16 @@ _MODULES = {
     ".clouds.open3d_cloud": ("to_open3d",),
     ".clouds.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),
-    ".live.scanner_page": ("show",),
+    ".showing.pages.scanner_page": ("show",),
     ".plan": ("Plan", "Planning"),
-    ".playback.live": ("play",),
+    ".showing.playback.live": ("play",),
     ".report.merging": ("merge",),
-    ".compare.comparison": ("Comparison", "compare"),
-    ".compare.fit": ("Fit", "fit"),
+    ".comparing.comparison": ("Comparison", "compare"),
+    ".comparing.fit": ("Fit", "fit"),
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),
-    ".viewers.scanner_view": ("Foxglove", "Rerun"),
+    ".showing.viewers.scanner_view": ("Foxglove", "Rerun"),
     "lidarscenes.robots.robot": ("Robot",),
     "lidarscenes.robots.urdf": ("load_robot",),
 }
@@ -153,10 +141,6 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = next((module for module, names in _MODULES.items() if name in names), "lidarsim")
     value = getattr(import_module(module, __name__), name)
-    # Importing a module of the folder compare puts the folder in the function's place.
-    if module.startswith(".compare."):
-        comparison = import_module(".compare.comparison", __name__)
-        globals()["compare"] = comparison.compare
     globals()[name] = value
     return value
 

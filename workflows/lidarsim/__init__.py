@@ -13,35 +13,23 @@ if TYPE_CHECKING:
     from .base.errors import LidarError
     from .columns.cloud import Cloud
     from .columns.table import Column
-    from .follower import Follower
-    from .mujoco import MujocoScanner
+    from .media.materials import Material
+    from .motion.navigation import Gnss, Imu, Navigation
+    from .motion.trajectory import Pose, Track
+    from .motion.trajectory_files import load_trajectory
     from .packets.sweep_packets import Packets
     from .scene.actors import Actor
     from .scene.scene import Scene
     from .scene.scene_instances import SceneInstance
     from .scene.scene_mesh import SceneMesh
-    from .sensor import (
-        Beams,
-        Fault,
-        Gnss,
-        Imu,
-        Material,
-        Mounted,
-        Navigation,
-        Noise,
-        Optics,
-        Pose,
-        Returns,
-        ScanSpec,
-        Sensor,
-        Spin,
-        Survey,
-    )
+    from .sensor import Beams, Noise, Optics, Returns, Sensor, Spin
     from .sensor.export import export_sensor
     from .sensor.models import load_sensor
-    from .sensor.trajectory import Track
-    from .sensor.trajectory_files import load_trajectory
     from .simulator import Scanner
+    from .survey.faults import Fault
+    from .survey.survey import Mounted, ScanSpec, Survey
+    from .worlds import MujocoScanner
+    from .worlds.follower import Follower
 
 __all__ = [
     "Actor",
@@ -83,8 +71,10 @@ _MODULES = {
     "base.errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
-    "follower": ("Follower",),
-    "mujoco": ("MujocoScanner",),
+    "media.materials": ("Material",),
+    "motion.navigation": ("Gnss", "Imu", "Navigation"),
+    "motion.trajectory": ("Pose", "Track"),
+    "motion.trajectory_files": ("load_trajectory",),
     "packets.sweep_packets": ("Packets",),
     "scene.actors": ("Actor",),
     "scene.scene": ("Scene",),
@@ -92,9 +82,11 @@ _MODULES = {
     "scene.scene_mesh": ("SceneMesh",),
     "sensor.export": ("export_sensor",),
     "sensor.models": ("load_sensor",),
-    "sensor.trajectory": ("Track",),
-    "sensor.trajectory_files": ("load_trajectory",),
     "simulator": ("Scanner",),
+    "survey.faults": ("Fault",),
+    "survey.survey": ("Mounted", "ScanSpec", "Survey"),
+    "worlds": ("MujocoScanner",),
+    "worlds.follower": ("Follower",),
 }
 
 

@@ -17,7 +17,8 @@ from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.table import Z
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
-from lidarsim.sensor import Sensor, Survey
+from lidarsim.sensor import Sensor
+from lidarsim.survey.survey import Survey
 
 from .picture_file import SensorPositions, sensor_positions
 from .render import theme

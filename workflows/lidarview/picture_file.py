@@ -14,15 +14,15 @@ from lidarsim.base.archives import open_archive, packed
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
 from lidarsim.base.words import plural
 from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
+from lidarsim.media.materials import MaterialTable
+from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.animation import Animation
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
-from lidarsim.sensor import Survey, Track
-from lidarsim.sensor.materials import MaterialTable
-from lidarsim.sensor.trajectory import ALWAYS, Beyond, presence_ns
+from lidarsim.survey.survey import Survey
 
 PICTURE_FILE = "pictures.npz"
 

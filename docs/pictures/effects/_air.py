@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lidarpool import Noise, Returns, Scene, SceneMesh, Survey
 from lidarscenes.procedural.city import city
+from lidarsim.media.weather import FAINTEST
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
-from lidarsim.sensor.weather import FAINTEST
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
 

@@ -10,8 +10,8 @@ from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, cloud
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarsim.media.materials import fresnel
 from lidarsim.scene.actors import box
-from lidarsim.sensor.materials import fresnel
 
 DRAWS = "effect-ghosts.png"
 PAINT = 0.04

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Gnss, Imu, Navigation, Survey
-from lidarsim.sensor.navigation import fixes, imu_samples
+from lidarsim.motion.navigation import fixes, imu_samples
 from lidarview.render import theme
 
 DRAWS = "effect-navigation.png"
@@ -76,7 +76,7 @@ def picture(path: Path) -> None:
     """Draw Allan deviations, and the errors of positions over the hours."""
     from matplotlib.figure import Figure
 
-    from lidarsim.sensor.trajectory import CENTRE, Stations
+    from lidarsim.motion.trajectory import CENTRE, Stations
 
     still = SimpleNamespace(
         navigation=Navigation(imu=IMU, gnss=GNSS, seed=2),

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lidarpool import Beams, Material, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.sensor.materials import fresnel
+from lidarsim.media.materials import fresnel
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarview.render.theme import SENSOR as RED

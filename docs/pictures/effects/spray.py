@@ -24,8 +24,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarsim.media.weather import spray
 from lidarsim.scene.actors import box
-from lidarsim.sensor.weather import spray
 
 DRAWS = "effect-spray.png"
 WEATHER = {"wet": 1.0, "spray_g_m3": 20.0}

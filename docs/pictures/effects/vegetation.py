@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.sensor.leaves import projection
+from lidarsim.media.leaves import projection
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 

@@ -10,7 +10,7 @@ from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud, points, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.sensor.materials import WATER_INDEX, below_water, fresnel
+from lidarsim.media.materials import WATER_INDEX, below_water, fresnel
 
 DRAWS = "effect-wet.png"
 ROAD = 0.2

@@ -135,7 +135,7 @@ class Result(RunResult):
         from lidarsim.columns.cloud_file import CloudFile
         from lidarview.viewer.view import View, result_page, wait_for_interrupt
 
-        from ..live.downloads import downloads
+        from ..showing.pages.downloads import downloads
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.extra_columns)

@@ -14,12 +14,11 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
 from lidarsim.simulator.casting.scene_caster import check_backend_here
+from lidarsim.survey.survey import Survey
 
 from ..base.shard import Shard
 from ..clouds.folder import output_place
-from ..live import page_of
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
 from ..run.job_source import OneJob
@@ -32,6 +31,7 @@ from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job
+from ..showing.pages import page_of
 from .result import Result
 
 # Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its

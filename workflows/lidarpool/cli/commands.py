@@ -31,7 +31,7 @@ from lidarsim.base.words import plural
 
 from ..base.logs import set_logs
 from ..base.shard import ALL
-from ..viewers.table import PAGE, VIEWERS
+from ..showing.viewers.table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
 from .first_step import begin
@@ -122,7 +122,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             start_fork_server()
         try:
             with deferred_interrupts():  # an interrupted import cannot be repeated
-                from ..run.cluster.cluster_file import ClusterFile
+                from ..run.cluster_file import ClusterFile
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal

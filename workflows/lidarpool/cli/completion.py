@@ -16,8 +16,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
 
 from ..clouds.format_table import EXPORTS, GROUP
-from ..playback.bridge_table import BRIDGES
-from ..viewers.table import PAGE, VIEWERS
+from ..showing.playback.bridge_table import BRIDGES
+from ..showing.viewers.table import PAGE, VIEWERS
 
 Items = list[CompletionItem]
 

@@ -94,10 +94,10 @@ def play(
     """  # noqa: D301 - click wants the character, not its name
     begin("reading the source")
     from ..base.fork_server import keep_freed_memory
-    from ..playback.bridge import BridgeOptions, bridge_class
-    from ..playback.player import play_sweeps
-    from ..playback.schedule import Schedule
-    from ..playback.sources import RECORDING, open_source
+    from ..showing.playback.bridge import BridgeOptions, bridge_class
+    from ..showing.playback.player import play_sweeps
+    from ..showing.playback.schedule import Schedule
+    from ..showing.playback.sources import RECORDING, open_source
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -134,8 +134,8 @@ def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
     """Play a recording of packets."""
-    from ..playback.recording import Recording, play_recording, recorded_streams
-    from ..playback.transmitter import Transmitter
+    from ..showing.playback.recording import Recording, play_recording, recorded_streams
+    from ..showing.playback.transmitter import Transmitter
     from .terminal import Terminal
 
     recording = Recording(path)

@@ -259,7 +259,7 @@ def view(
     from lidarview.viewer.view import CLOUD, show_view
 
     from ..clouds.folder import local_result
-    from ..live.opened import growing_view, is_data_set, open_views
+    from ..showing.pages.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
         raise LidarError("--film and --export take one result: give them one after the other.")
@@ -270,7 +270,7 @@ def view(
                 "--export."
             )
         options.refuse_mesh_options(of_mesh, data_sets[0])
-        from ..live.job_list import JobList, show_jobs
+        from ..showing.pages.job_list import JobList, show_jobs
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
@@ -356,7 +356,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
       lidarpool compare scan.laz model.ply --unit-b ft
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..compare.comparison import compare as compared
+    from ..comparing.comparison import compare as compared
 
     keep_freed_memory()
     comparison = compared(a, b, **settings)
@@ -395,7 +395,7 @@ def fit(
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..compare.fit import fit as fitted
+    from ..comparing.fit import fit as fitted
 
     keep_freed_memory()
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)

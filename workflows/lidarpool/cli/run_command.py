@@ -22,7 +22,6 @@ from ..base.shard import Shard, shard_in_words
 from ..clouds.folder import local_result, output_place, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
-from ..live import page_of
 from ..report.campaign_output import CAMPAIGN_FILE, DataSetOutput, check_same, failures, verify
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
@@ -36,6 +35,7 @@ from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.plausibility import implausibilities
 from ..scenario.scenario import Scenario
+from ..showing.pages import page_of
 from .shared_options import show
 from .terminal import Terminal
 

@@ -213,8 +213,8 @@ def check(
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - click wants the character, not its name
     begin("reading the scene", quiet=as_json)
-    from ..run.cluster.cluster_file import ClusterFile
     from ..run.cluster.connection import connected
+    from ..run.cluster_file import ClusterFile
     from ..run.options import RunOptions
     from .forecast import forecast_scenario
 

@@ -17,7 +17,7 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.columns.cloud import Cloud
-from lidarsim.sensor import Sensor, Survey
+from lidarsim.sensor import Sensor
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
 

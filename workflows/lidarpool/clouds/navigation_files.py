@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.base.arrays import Floats
-from lidarsim.sensor import Survey
-from lidarsim.sensor.navigation import fixes, geodetic, imu_samples
+from lidarsim.motion.navigation import fixes, geodetic, imu_samples
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 
 _IMU = (

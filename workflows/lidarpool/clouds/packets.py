@@ -15,7 +15,7 @@ from lidarsim.columns.cloud import CloudLike
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .recording import Read, Recording, RecordingSource, positions_of

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
 from lidarsim.base.signatures import ReadableSignature
-from lidarsim.sensor import Fault
+from lidarsim.survey.faults import Fault
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.boxes import Boxes, SweepBoxes

@@ -231,9 +231,9 @@ def survey_coverage(
     >>> from lidarpool import Sensor
     >>> from lidarsim.scene.actors import box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
-    >>> floor = np.mgrid[-4:4.1:0.1, -3:3.1:0.1, -1.5:-1.4].reshape(3, -1).T
+    >>> floor = np.mgrid[-4:4.1:0.1, -3:3.1:0.1, 0:1].reshape(3, -1).T
     >>> found = survey_coverage(
-    ...     room, Sensor.grid(vertical_fov_deg=180), np.zeros((1, 3)), [floor], slant_deg=90
+    ...     room, Sensor.grid(vertical_fov_deg=180), np.array([[0, 0, 1.5]]), [floor], slant_deg=90
     ... )
     >>> found.seen_m2.round().tolist(), bool(48 <= found.covered_m2[0] < 54)
     ([180.0], True)

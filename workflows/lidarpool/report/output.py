@@ -16,7 +16,7 @@ from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.vocabulary import PICTURES
 from lidarsim.base.writing_progress import WritingProgress
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE

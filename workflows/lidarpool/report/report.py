@@ -17,10 +17,10 @@ from lidarsim._version import __version__
 from lidarsim.base.declared import declared
 from lidarsim.base.storage import Storage
 from lidarsim.columns.table import NO_SURFACE
+from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Sensor, Survey
-from lidarsim.sensor.survey import CloudOptions
-from lidarsim.sensor.weather import Weather
+from lidarsim.sensor import Sensor
+from lidarsim.survey.survey import CloudOptions, Survey
 
 from ..plan.planning import Search
 from ..run.job_source import fields_of

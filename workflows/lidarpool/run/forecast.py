@@ -21,7 +21,6 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import CHUNK_POINTS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
-from lidarsim.sensor import Survey
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.simulator.memory import (
@@ -33,6 +32,7 @@ from lidarsim.simulator.memory import (
     scans_that_fit,
 )
 from lidarsim.simulator.sampling import sample_survey
+from lidarsim.survey.survey import Survey
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends

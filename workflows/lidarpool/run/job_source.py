@@ -15,10 +15,10 @@ import numpy as np
 
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError
+from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Mounted, Sensor, Survey
-from lidarsim.sensor.survey import CloudOptions
-from lidarsim.sensor.weather import Weather
+from lidarsim.sensor import Sensor
+from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
 from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint

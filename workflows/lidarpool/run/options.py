@@ -19,7 +19,7 @@ from lidarsim.base.words import did_you_mean
 
 from ..base.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
-from .cluster.cluster_file import ClusterFile
+from .cluster_file import ClusterFile
 
 # The page in the browser (also True), or a viewer; False for none.
 Live = bool | Literal["page", "foxglove", "rerun"]

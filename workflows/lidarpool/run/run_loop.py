@@ -185,11 +185,11 @@ class RunLoop:
         try:
             if self._writer is not None:  # the only job of a run was checked at the start
                 self._cluster.check(job)
-            self._cast(under_way)
+            self._add_to_pipeline(under_way)
         except JobError as error:  # too large for the workers, or it cannot be pickled
             self._fail(job.number, error)
 
-    def _cast(self, job: JobUnderWay) -> None:
+    def _add_to_pipeline(self, job: JobUnderWay) -> None:
         """Add a job to the pipeline, begin its planning, and estimate the scans to come."""
         cluster = self._cluster
         is_only = self._writer is None

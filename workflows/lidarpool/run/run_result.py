@@ -12,7 +12,7 @@ from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow

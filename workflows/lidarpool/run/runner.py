@@ -1,4 +1,14 @@
-"""A run of one or many jobs, from its options to its result: for commands and for Python."""
+"""A run of one or many jobs, from its options to its result: for commands and for Python.
+
+The way through the driver: `Run.execute` locks the output, opens the `RunStore` and makes the
+first `Job`; for what is left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each
+job to the `Pipeline`, whose stage 1 sends ranges of scans; the `Dispatcher` makes batches of them,
+and `CastingWorkers.submit` gives batches to a worker as a task. There `intersect` casts each batch
+by a `Rig`, as `lidarsim/simulator/pulses.py` tells. A collector stores the columns as a part and
+sends a `Receipt`, which the loop commits; stage 3 sends a `ScanFrame`, which `on_frame` gets. The
+parts of a job whose scans are committed go to the `JobWriter`, or become the points of a
+`RunResult`. `Output.finish` writes the files.
+"""
 
 from __future__ import annotations
 
@@ -125,7 +135,7 @@ class Run(Generic[R]):
             self._open_store()
             self.output.prepare()
             if (first := self._first_job()) is not None:
-                self._cast(first)
+                self._run_on_cluster(first)
             return self.output.finish(self)
 
     def warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
@@ -204,7 +214,7 @@ class Run(Generic[R]):
             self.page.ended(entry)
         return entry
 
-    def _cast(self, first: Job) -> None:
+    def _run_on_cluster(self, first: Job) -> None:
         """Cast the remaining jobs, on a cluster with the slots that the first job needs."""
         store = self.store
         options = self.options

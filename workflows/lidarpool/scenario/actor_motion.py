@@ -36,19 +36,27 @@ from lidarsim.base.input_files import input_size, open_input
 from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
 from lidarsim.base.words import fits, in_yaml, name_hint, plural, printable
 from lidarsim.base.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
-from lidarsim.scene.actors import Actor
-from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor import Mounted, Pose, Track, load_trajectory
-from lidarsim.sensor.survey import StepCount
-from lidarsim.sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
-from lidarsim.sensor.trajectory_files import (
+from lidarsim.motion.trajectory import (
+    CLOCK_S,
+    Beyond,
+    InstrumentPose,
+    Pose,
+    Track,
+    quaternions_of,
+    rotations_of,
+)
+from lidarsim.motion.trajectory_files import (
     Duration,
     Height,
     Latitude,
     Longitude,
     Seconds,
     TrajectoryFormat,
+    load_trajectory,
 )
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.survey.survey import Mounted, StepCount
 
 from .ground import StandingSurfaces, follow_surfaces
 from .sections import (

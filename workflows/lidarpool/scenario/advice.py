@@ -10,12 +10,11 @@ import numpy as np
 
 from lidarsim.base.words import as_scenario, listed, plural
 from lidarsim.columns.table import VELOCITY
+from lidarsim.media.materials import MaterialTable
+from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
-from lidarsim.sensor import Survey, Track
-from lidarsim.sensor.materials import MaterialTable
-from lidarsim.sensor.survey import START_FROM
-from lidarsim.sensor.trajectory import presence_ns
+from lidarsim.survey.survey import START_FROM, Survey
 
 from ..clouds.laser_scan import has_planar_sensors
 from .build import Built

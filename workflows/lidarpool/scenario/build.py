@@ -17,23 +17,24 @@ from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import name_hint, plural
-from lidarsim.scene.actors import Actor, check_spray
-from lidarsim.scene.files.coordinate_systems import target_problem
-from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
-from lidarsim.sensor.materials import (
+from lidarsim.media.materials import (
+    Material,
     MaterialTable,
     SurfaceKinds,
     rows_named,
     with_class,
     with_classes,
 )
-from lidarsim.sensor.survey import CloudOptions
-from lidarsim.sensor.trajectory import CENTRE
-from lidarsim.sensor.weather import Weather
+from lidarsim.media.weather import Weather
+from lidarsim.motion.trajectory import CENTRE, Pose, Track
+from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.files.coordinate_systems import target_problem
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.casting.static_bodies import warn_of_reach
 from lidarsim.simulator.casting.surfaces import warn_of_grey
 from lidarsim.simulator.casting.visibility import unseen_objects
+from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.format_table import check_whole

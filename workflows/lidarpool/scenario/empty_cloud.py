@@ -9,8 +9,8 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
 from lidarsim.simulator.sampling import sample_ranges
+from lidarsim.survey.survey import Survey
 
 from ..datasets.job_table import JobRow
 from .placing import seen_from

@@ -11,11 +11,10 @@ import numpy as np
 from lidarsim.base.arrays import Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import name_hint
+from lidarsim.media.materials import rows_named
+from lidarsim.motion.trajectory import Track, quaternions_of
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
-from lidarsim.sensor import Track
-from lidarsim.sensor.materials import rows_named
-from lidarsim.sensor.trajectory import quaternions_of
 from raybeam import RayCaster, available_backends
 
 STEP_M = 0.5  # of a trajectory that follows a surface

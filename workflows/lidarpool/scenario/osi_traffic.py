@@ -17,9 +17,8 @@ from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import plural
 from lidarsim.columns.mcap_chunks import check_chunks
+from lidarsim.motion.trajectory import Track, quaternions_of, rotations_of
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor import Track
-from lidarsim.sensor.trajectory import quaternions_of, rotations_of
 
 from .actor_motion import (
     HOST,

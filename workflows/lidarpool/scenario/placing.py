@@ -14,10 +14,12 @@ from lidarscenes.procedural.floor import heights_at, room_at, triangles_reaching
 from lidarscenes.procedural.surroundings import Surroundings, in_the_way, is_open
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
+from lidarsim.media.materials import rows_named
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
-from lidarsim.sensor import Mounted, Pose, Sensor
-from lidarsim.sensor.materials import rows_named
+from lidarsim.sensor import Sensor
+from lidarsim.survey.survey import Mounted
 
 # Heights above a floor; and the smallest distance from the ceiling.
 _HEIGHTS_M = (1.0, 2.0, 3.0)

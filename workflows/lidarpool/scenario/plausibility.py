@@ -12,12 +12,12 @@ from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import as_scenario, printable
+from lidarsim.motion.trajectory import Track, full_poses, matrices, quaternions_of, velocities
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey, Track
 from lidarsim.sensor.sensor import LineSensor
-from lidarsim.sensor.trajectory import full_poses, matrices, quaternions_of, velocities
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
+from lidarsim.survey.survey import Survey
 
 from .build import Built
 from .placing import seen_from, surroundings_of

@@ -18,14 +18,15 @@ from lidarsim.base.input_files import not_found
 from lidarsim.base.validation import sentences
 from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLOURS
+from lidarsim.media.materials import ClassNames, Material
+from lidarsim.media.weather import Weather
+from lidarsim.motion.navigation import Navigation
+from lidarsim.motion.trajectory import CENTRE
+from lidarsim.motion.trajectory_files import files_of_trajectory
 from lidarsim.scene.files.mesh_formats import endings, format_of
-from lidarsim.sensor import Fault, Material, Navigation
-from lidarsim.sensor.materials import ClassNames
 from lidarsim.sensor.models import plugin_model_file
-from lidarsim.sensor.survey import MAX_SENSORS, CloudOptions, StepCount
-from lidarsim.sensor.trajectory import CENTRE
-from lidarsim.sensor.trajectory_files import files_of_trajectory
-from lidarsim.sensor.weather import Weather
+from lidarsim.survey.faults import Fault
+from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
 from .named_files import field_that_names

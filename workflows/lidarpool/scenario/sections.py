@@ -42,6 +42,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.sections import fields_of
 from lidarsim.base.validation import STRICT
 from lidarsim.base.vocabulary import BACKENDS
+from lidarsim.media.materials import SemanticClass
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.files.mesh_formats import (
     endings,
     format_of,
@@ -50,13 +52,12 @@ from lidarsim.scene.files.mesh_formats import (
 )
 from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions, Opacity, UpAxis
 from lidarsim.scene.transform import Transform
-from lidarsim.sensor import Mounted, Noise, Pose, Returns, Sensor
+from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.sensor.beams import Rate, Step
-from lidarsim.sensor.materials import SemanticClass
 from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor
 from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
-from lidarsim.sensor.survey import EpsgCode
+from lidarsim.survey.survey import EpsgCode, Mounted
 
 from ..clouds.formats import Format
 from ..plan.planning import Search

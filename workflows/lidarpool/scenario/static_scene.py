@@ -17,6 +17,8 @@ from lidarsim.base.errors import LidarError, Mistakes, message_of, prefixed
 from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
+from lidarsim.motion.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
+from lidarsim.motion.trajectory import rotations_of
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.mesh_formats import format_of, option_names
 from lidarsim.scene.files.meshfile import Objects, load_objects
@@ -28,8 +30,6 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import rolling
-from lidarsim.sensor.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
-from lidarsim.sensor.trajectory import rotations_of
 
 from .ground import StandingSurfaces
 from .scenario import Scenario

@@ -52,7 +52,7 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor.survey import EpsgCode
+from lidarsim.survey.survey import EpsgCode
 
 DRIVERS = {  # {ending: GDAL's name of the driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",

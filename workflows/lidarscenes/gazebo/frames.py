@@ -12,8 +12,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import shown
 from lidarsim.base.vectors import length, matmul
 from lidarsim.base.words import did_you_mean, printable
+from lidarsim.motion.trajectory import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
-from lidarsim.sensor.trajectory import matrices, rotations_of
 
 MAX_NUMBER = 1e8  # in a file, but for poses
 _MAX_POSE = 1e12  # number of a pose, beyond which it is as if it were infinite

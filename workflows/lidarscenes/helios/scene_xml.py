@@ -17,6 +17,7 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input_text
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.object_names import unique_names
@@ -25,7 +26,6 @@ from lidarsim.scene.scene_instances import MAX_COORDINATE_M, SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
-from lidarsim.sensor import Pose
 
 from ..procedural.floor import heights_at
 from .files import Assets, clean, number, read, rotation

@@ -17,11 +17,11 @@ import yaml
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import rotation_about
-from lidarsim.sensor import Pose
 from lidarsim.sensor.disc import SUBRAYS
-from lidarsim.sensor.survey import MAX_SENSORS
+from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
 from .files import Assets, clean, number, rotation, vector

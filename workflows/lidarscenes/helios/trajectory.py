@@ -15,8 +15,8 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.time_units import seconds_of
+from lidarsim.motion.trajectory import quaternions_of
 from lidarsim.scene.transform import rotation_about
-from lidarsim.sensor.trajectory import quaternions_of
 
 from .files import Assets, clean, flag, number, read, vector
 

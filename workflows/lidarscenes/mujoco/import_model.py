@@ -20,10 +20,10 @@ from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import length, turned
 from lidarsim.base.words import printable
-from lidarsim.mujoco.model_bodies import Choice, names_of, seen_geoms
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
+from lidarsim.worlds.mujoco_bodies import Choice, names_of, seen_geoms
 
 from ..writers.lidar_scenario import Lidar, clean, write_scenario
 from .model_file import MujocoOptions, body_matrix, load_model, objects_of_bodies

@@ -1,7 +1,7 @@
 """Models of MuJoCo, .xml of MJCF, as scenes: the geoms that a lidar sees, at the initial state.
 
 MuJoCo itself (Apache-2.0) reads the files, in a process of its own: `model_child.py`. Geoms become
-meshes as for `lidarsim.mujoco.MujocoScanner`.
+meshes as for `lidarsim.worlds.MujocoScanner`.
 """
 
 from __future__ import annotations
@@ -25,15 +25,6 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import listed, name_hint, printable
-from lidarsim.mujoco.geoms import SAG_M, GeomType, segments
-from lidarsim.mujoco.model_bodies import (
-    Choice,
-    bodies_of,
-    excluded,
-    names_of,
-    seen_geoms,
-    soft_bodies,
-)
 from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
     Content,
@@ -46,6 +37,15 @@ from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine
+from lidarsim.worlds.mujoco_bodies import (
+    Choice,
+    bodies_of,
+    excluded,
+    names_of,
+    seen_geoms,
+    soft_bodies,
+)
+from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, segments
 
 from ..files.child_process import Child
 from .model_sources import check_sources

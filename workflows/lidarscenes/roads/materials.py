@@ -22,7 +22,7 @@ LEAVES = "leaves"
 WALL = "wall"
 
 # {material: reflectance for red, green and blue light}. Luminances are those of measured spectra at
-# 905 nm (`lidarsim.sensor.materials.reflectances`) where the table has the material.
+# 905 nm (`lidarsim.media.materials.reflectances`) where the table has the material.
 _LINEAR = {
     ASPHALT: (0.13, 0.13, 0.13),
     CONCRETE: (0.31, 0.31, 0.31),

@@ -22,12 +22,18 @@ from lidarsim.base.time_units import TimeUnit
 from lidarsim.base.validation import as_array, checked
 from lidarsim.base.vectors import applied, matmul
 from lidarsim.base.words import name_hint, plural
+from lidarsim.motion.pose_columns import TIME
+from lidarsim.motion.trajectory import (
+    Pose,
+    Stations,
+    Trajectory,
+    full_poses,
+    presence_ns,
+    velocities,
+)
 from lidarsim.scene.actors import AT_ZERO, Actor, join_meshes
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import rotation_about
-from lidarsim.sensor import Pose, Stations, Trajectory
-from lidarsim.sensor.pose_columns import TIME
-from lidarsim.sensor.trajectory import full_poses, presence_ns, velocities
 
 _LATE_S = 1e-3  # the beams of the last firing are fired a little after the survey's end
 MOVING = ("revolute", "continuous", "prismatic")

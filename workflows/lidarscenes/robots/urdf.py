@@ -24,6 +24,7 @@ from lidarsim.base.validation import checked, shown
 from lidarsim.base.vectors import length
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
+from lidarsim.motion.trajectory import rotations_of
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
@@ -33,7 +34,6 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule
 from lidarsim.scene.transform import affine
-from lidarsim.sensor.trajectory import rotations_of
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot

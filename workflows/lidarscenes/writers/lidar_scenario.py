@@ -15,9 +15,9 @@ import yaml
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vectors import matmul
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.transform import inverted
-from lidarsim.sensor import Pose
-from lidarsim.sensor.survey import MAX_SENSORS
+from lidarsim.survey.survey import MAX_SENSORS
 
 SCENARIO_FILE = "scenario.yaml"
 _ZERO = 1e-9  # numbers below are roundings

@@ -25,9 +25,9 @@ from ..base.errors import LidarError
 from ..base.extras import reading
 from ..base.input_files import input_size
 from ..base.vectors import applied, inverse, matmul
+from ..motion.trajectory import matrices
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
-from ..sensor.trajectory import matrices
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE

@@ -8,12 +8,12 @@ from typing import Any
 from ..base.errors import LidarError
 from ..base.validation import checked
 from ..columns.cloud import Cloud
-from ..sensor import Mounted, Returns, Sensor, Survey
+from ..motion.trajectory import CENTRE
+from ..sensor import Returns, Sensor
 from ..sensor.optics import TWO_RETURNS
-from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import CENTRE
 from ..simulator import Scanner
 from ..simulator.scanner import StartSeconds, SweepNumber
+from ..survey.survey import Mounted, Survey, nanoseconds
 from ..sweeps.ray_image import Image
 from .encoders import START_NS, Datagrams, PacketEncoder, PacketSource, encoder_of
 from .shots import Shots, check_columns

@@ -21,8 +21,8 @@ from ..base.signatures import shown_readably, with_fields_of
 from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.vectors import hypot
 from ..base.words import listed, plural
-from ..sensor import Track
-from ..sensor.materials import SurfaceKinds
+from ..media.materials import SurfaceKinds
+from ..motion.trajectory import Track
 from .actors import Actor
 from .colours import GREY, Colours, are_indices, join_colours
 from .face_materials import ObjectMaterials

@@ -16,7 +16,7 @@ from ..base.elementary import decade
 from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, determinant, inverse, matmul, rank
-from ..sensor import Pose
+from ..motion.trajectory import Pose
 from .colours import Colours
 from .face_materials import FaceMaterials
 from .scene_mesh import Cutout, SceneMesh, Voxels, compacted

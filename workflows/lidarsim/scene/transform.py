@@ -13,7 +13,7 @@ from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarError
 from ..base.validation import as_array
 from ..base.vectors import applied, length, matmul, rank
-from ..sensor import Pose
+from ..motion.trajectory import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
 # rotating large coordinates loses no digit.

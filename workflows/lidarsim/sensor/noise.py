@@ -11,9 +11,9 @@ from pydantic import Field
 
 from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
 from ..base.errors import LidarError
+from ..base.random_numbers import named_seed
 from ..base.validation import checked_fields
-from .materials import at_right_angles
-from .random_numbers import named_seed
+from ..media.materials import at_right_angles
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0

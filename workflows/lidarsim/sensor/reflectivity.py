@@ -9,7 +9,7 @@ import numpy as np
 from ..base.arrays import Bytes, Floats
 from ..base.elementary import exp, log
 from ..base.elementary_scalars import log_of
-from .materials import RETRO_GAIN
+from ..media.materials import RETRO_GAIN
 
 _BEST = 8 * RETRO_GAIN  # reflectance of the best retro-reflective sheets
 

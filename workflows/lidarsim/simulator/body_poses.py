@@ -11,8 +11,15 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Bools, Floats
 from ..base.errors import LidarError, prefixed
 from ..base.validation import shown
-from ..sensor import Pose, StaticPose, Track, Trajectory
-from ..sensor.trajectory import CENTRE, check_rotations, pose_of
+from ..motion.trajectory import (
+    CENTRE,
+    Pose,
+    StaticPose,
+    Track,
+    Trajectory,
+    check_rotations,
+    pose_of,
+)
 
 ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
 

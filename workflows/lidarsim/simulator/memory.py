@@ -10,8 +10,8 @@ import numpy as np
 from ..base.elementary import exp
 from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
-from ..sensor import Survey
 from ..sensor.optics import TWO_RETURNS
+from ..survey.survey import Survey
 from .casting.visibility import static_key, unseen_objects
 from .points.device import needs_hits
 from .pulses import CHUNK_RAYS

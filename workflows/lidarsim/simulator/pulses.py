@@ -1,5 +1,12 @@
 """Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
+The way through a worker: `Rig.cast` finds the `Firings` of some scans and the `CastPoses` of their
+beams. `PulseCaster.scan` makes a `PulseBatch` of them and passes `PulseReturns` through the steps:
+first those that aim beams, then `CastStep`, which finds the hits of all rays, then those that make
+returns of hits, detect, lose and choose returns. What is kept of them is `Scanned`; the last steps
+change what is reported. `BatchPoints` makes positions and columns of it. Without steps between aim
+and report, each ray has one return: the caster itself counts and thins out its hits.
+
 Random numbers depend only on scan, ray and return, so batches do not change the result.
 """
 
@@ -15,7 +22,7 @@ from raybeam import Pattern
 
 from ..base.arrays import Ints, owned
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
 from .casting.surfaces import Surfaces, light_of

@@ -14,9 +14,11 @@ from raybeam import Pattern
 from ..base.arrays import Floats, Floats32, Integers
 from ..base.errors import LidarError
 from ..base.vectors import turned
+from ..motion.trajectory import Trajectory
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import ScanSpec, Sensor, Survey, Trajectory
+from ..sensor import Sensor
+from ..survey.survey import ScanSpec, Survey
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances

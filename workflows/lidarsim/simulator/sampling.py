@@ -13,10 +13,11 @@ from raybeam import available_backends
 from ..base.arrays import Floats, Ints
 from ..base.declared import declared
 from ..base.sampling import even_indices
+from ..media.weather import Weather
 from ..scene.scene import Scene
-from ..sensor import Mounted, Noise, Returns, Sensor, Survey
+from ..sensor import Noise, Returns, Sensor
 from ..sensor.beams import Beams
-from ..sensor.weather import Weather
+from ..survey.survey import Mounted, Survey
 from .rig import Rig
 
 SAMPLE_RAYS = 500_000  # largest number of rays that are cast

@@ -22,21 +22,12 @@ from ..base.validation import checked, shown
 from ..base.words import name_hint
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
+from ..media.materials import Material
+from ..motion.trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import (
-    Material,
-    Mounted,
-    Noise,
-    Pose,
-    Returns,
-    ScanSpec,
-    Sensor,
-    Stations,
-    Survey,
-    Trajectory,
-)
-from ..sensor.trajectory import CENTRE, pose_of
+from ..sensor import Noise, Returns, Sensor
+from ..survey.survey import Mounted, ScanSpec, Survey
 from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
 from .casting.motion import check_trajectory
 from .casting.scene_caster import check_backend_here

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..base.input_files import open_input
-from ..sensor import Survey
-from ..sensor.trajectory import Pose, quaternions_of
+from ..motion.trajectory import Pose, quaternions_of
+from ..survey.survey import Survey
 
 IMU_FILE = "imu.csv"
 GNSS_FILE = "gnss.csv"

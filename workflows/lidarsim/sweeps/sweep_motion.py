@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Floats, Floats32, Ints
-from ..sensor import Pose, Survey, Trajectory
-from ..sensor.trajectory import full_poses, quaternions_of
+from ..motion.trajectory import Pose, Trajectory, full_poses, quaternions_of
+from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
 
 KNOT_NS = 2e6  # between stored poses: at 10 m/s², 5 µm from a straight line

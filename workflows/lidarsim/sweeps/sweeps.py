@@ -19,13 +19,7 @@ from ..base.errors import LidarError
 from ..base.vectors import applied, cross
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
-from ..scene.scene import Scene
-from ..scene.transform import affine
-from ..sensor import Fault, Sensor, Survey
-from ..sensor.optics import TWO_RETURNS
-from ..sensor.plain_data import from_plain_data, to_plain_data
-from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import (
+from ..motion.trajectory import (
     CLOCK_S,
     full_poses,
     matrices,
@@ -33,6 +27,13 @@ from ..sensor.trajectory import (
     quaternions_of,
     velocities,
 )
+from ..scene.scene import Scene
+from ..scene.transform import affine
+from ..sensor import Sensor
+from ..sensor.optics import TWO_RETURNS
+from ..sensor.plain_data import from_plain_data, to_plain_data
+from ..survey.faults import Fault
+from ..survey.survey import Survey, nanoseconds
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
 from .sweep_motion import STILL, FiringPoses, knots_of, poses_at

@@ -27,11 +27,11 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
+from lidarsim.motion.trajectory import presence_ns
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.colours import as_bytes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import simplified
-from lidarsim.sensor.trajectory import presence_ns
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from raybeam import RayCaster
 

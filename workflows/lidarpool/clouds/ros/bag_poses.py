@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.sensor.bag_trajectories import read_bag
-from lidarsim.sensor.trajectory import Track
+from lidarsim.motion.bag_trajectories import read_bag
+from lidarsim.motion.trajectory import Track
 
 _MAX_DISTANCE_NS = (
     2e8  # from a sweep to the nearest pose in time, before the first and after the last

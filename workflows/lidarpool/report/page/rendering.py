@@ -26,8 +26,8 @@ from lidarsim.base.errors import explained
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import natural, plural, shortened, without_common_prefix
+from lidarsim.media.weather import Weather
 from lidarsim.sensor import Noise, Returns
-from lidarsim.sensor.weather import Weather
 from lidarview.render.stage import nice_step
 
 from ...clouds.format_table import data_set_title

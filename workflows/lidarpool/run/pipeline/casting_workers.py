@@ -17,7 +17,7 @@ from distributed.utils import get_ip
 
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import TaskLocations, look_for_tasks
@@ -211,7 +211,7 @@ class CastingWorkers:
 
     # -- casting ---------------------------------------------------------------------------
 
-    def cast(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
+    def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
         """Submit batches, each with its job, to a worker as a task; return the key of the task.
 
         The jobs must share a scene.

@@ -174,7 +174,7 @@ class Dispatcher:
         chosen = policies.offers(batches, self._workers.slots, self.max_weight, self.per_task)
         for task, worker in chosen:
             spans = [(batch.job.number, (batch.first, batch.stop)) for batch in task]
-            key = self._workers.cast(spans, worker)
+            key = self._workers.submit(spans, worker)
             self._tasks[key] = task
             for batch in task:
                 batch.key = key

@@ -16,7 +16,8 @@ from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
-from lidarsim.sensor import Pose, Survey
+from lidarsim.motion.trajectory import Pose
+from lidarsim.survey.survey import Survey
 
 from ...base.tracing import trace
 from .placement import TaskRecord

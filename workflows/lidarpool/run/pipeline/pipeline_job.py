@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 
 from ...base.tracing import trace
 from .committed_job import CommittedJob

@@ -26,11 +26,11 @@ from distributed import get_worker
 from lidarsim.base.arrays import Floats32
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.scene import Scene
-from lidarsim.sensor import Survey
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.batch_points import BatchPoints
 from lidarsim.simulator.points.device import DevicePoints
 from lidarsim.simulator.rig import Rig
+from lidarsim.survey.survey import Survey
 from poolpart import own_device, own_device_share
 from raybeam.registry import choose
 
@@ -194,11 +194,11 @@ def intersect(
     results = []
     for work, plan in zip(works, plans, strict=True):
         rig = rig_of(work.handle, plan, scene)
-        results += [_cast(rig, work, first, stop) for first, stop in work.spans]
+        results += [_cast_batch(rig, work, first, stop) for first, stop in work.spans]
     return results
 
 
-def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
+def _cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     recorder = Recorder(INTERSECT, GPU)
     fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))

@@ -18,7 +18,7 @@ from typing import Any
 from distributed import Client, secede
 
 from lidarsim.base.storage import Storage
-from lidarsim.sensor import Survey
+from lidarsim.survey.survey import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart.fetch import fetch_available, hold_for_driver
 from poolpart.task_context import telling_departure

@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...base.arrays import Floats, Indices, Integers, Ints, owned
+from ...motion.trajectory import (
+    ALWAYS,
+    StaticPose,
+    Stations,
+    Track,
+    Trajectory,
+    batch_of,
+    presence_ns,
+)
 from ...scene.actors import Actor
-from ...sensor import Track, Trajectory
-from ...sensor.trajectory import ALWAYS, StaticPose, Stations, batch_of, presence_ns
 
 if TYPE_CHECKING:
     from .surface_loops import TrackTable

@@ -14,8 +14,9 @@ from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ...base.arrays import Floats, Indices, Integers, Ints, owned
 from ...base.vectors import into_axes, matmul
-from ...sensor import Mounted, ScanSpec, Sensor, Trajectory
-from ...sensor.trajectory import velocities
+from ...motion.trajectory import Trajectory, velocities
+from ...sensor import Sensor
+from ...survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories
 
 RING_FIRINGS = 16  # firings whose rays `along_rings` orders by rings

@@ -35,7 +35,7 @@ from ...base.words import did_you_mean
 from ...scene.actors import Actor, distinct_meshes
 from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, parts_of
-from ...sensor import Survey
+from ...survey.survey import Survey
 from .actor_trajectories import ActorTrajectories
 from .motion import CastPoses, Clock
 from .static_bodies import StaticBodies, largest_range_m, mesh_of

@@ -19,7 +19,7 @@ from raybeam.registry import choose
 from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, MeshPart
-from ...sensor import Survey
+from ...survey.survey import Survey
 from .clipping import CutMesh, box_planes, cut
 
 _log = logging.getLogger(__name__)

@@ -13,13 +13,14 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32, owned
 from ...base.vectors import applied, into_axes, inverse, length, products
+from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles, first_matches
+from ...motion.trajectory import velocities
 from ...scene.actors import distinct_meshes
 from ...scene.colours import GREY, Colours, Lookup, join_colours, luminance, packed
 from ...scene.face_materials import FaceMaterials
 from ...scene.scene import Scene
-from ...sensor import Sensor, Survey
-from ...sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles, first_matches
-from ...sensor.trajectory import velocities
+from ...sensor import Sensor
+from ...survey.survey import Survey
 from .actor_trajectories import ActorTrajectories
 from .voxels import Grids
 

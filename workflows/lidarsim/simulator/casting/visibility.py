@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ...base.arrays import Bools
+from ...media.materials import matching_rows
 from ...scene.scene import Scene
-from ...sensor import Survey
-from ...sensor.materials import matching_rows
+from ...survey.survey import Survey
 
 
 def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:

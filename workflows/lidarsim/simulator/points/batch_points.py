@@ -12,16 +12,16 @@ from raybeam import Pattern
 from ...base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ...base.elementary import arccos, arcsin, arctan2
 from ...base.errors import LidarError
+from ...base.random_numbers import normal
 from ...base.vectors import products, turned
 from ...columns.table import Column
 from ...columns.waveforms import column_type
+from ...media.materials import at_right_angles
 from ...scene.colours import unpacked
 from ...scene.scene import Scene
-from ...sensor import ScanSpec, Survey
-from ...sensor.materials import at_right_angles
 from ...sensor.optics import LIGHT_M_NS
-from ...sensor.random_numbers import normal
 from ...sensor.reflectivity import COUNTS, SCALES
+from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.surfaces import Surfaces, light_of
 from ..pulses import Scanned

@@ -23,9 +23,9 @@ from raybeam.device import filled, host_array, to_device
 
 from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
+from ...media.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
 from ...scene.scene import Scene
-from ...sensor import ScanSpec, Survey
-from ...sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces

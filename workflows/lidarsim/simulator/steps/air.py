@@ -16,12 +16,12 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Indices, Ints, owned
 from ...base.elementary import exp, expm1, geomspace, interp, log1p
 from ...base.elementary_scalars import exp_of
+from ...base.random_numbers import Purpose, named_seed, starts
 from ...columns.table import CAUSES
-from ...sensor.materials import MaterialTable
+from ...media.materials import MaterialTable
+from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
+from ...media.weather import reach as reach_of
 from ...sensor.noise import THRESHOLD_SIGMAS
-from ...sensor.random_numbers import Purpose, named_seed, starts
-from ...sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
-from ...sensor.weather import reach as reach_of
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
 from ..returns import (

@@ -6,9 +6,9 @@ import numpy as np
 
 from ...base.arrays import Floats, Integers
 from ...base.elementary import sin_cos
+from ...base.random_numbers import Purpose, normal
 from ...base.vectors import hypot
 from ...sensor.noise import Noise
-from ...sensor.random_numbers import Purpose, normal
 from ..returns import PulseReturns
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 

@@ -13,13 +13,13 @@ from raybeam import Pattern
 from ...base.arrays import Floats, Indices, Ints, Ints32, owned
 from ...base.elementary import arccos, exp
 from ...base.elementary_scalars import sin_cos_of
+from ...base.random_numbers import Purpose
 from ...base.vectors import into_axes, length, products, turned
 from ...columns.table import CAUSES
-from ...sensor import ScanSpec, Sensor, Survey
-from ...sensor.materials import at_right_angles
+from ...media.materials import at_right_angles
+from ...sensor import Sensor
 from ...sensor.optics import LIGHT_M_NS
-from ...sensor.random_numbers import Purpose
-from ...sensor.survey import firing_start_ns
+from ...survey.survey import ScanSpec, Survey, firing_start_ns
 from ..casting.motion import CastPoses, Clock
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...base.arrays import Bools, Floats, Integers
+from ...base.random_numbers import Purpose, normal, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
-from ...sensor.random_numbers import Purpose, normal, uniform
 from ..returns import PulseReturns, numbers
 from .step import PulseBatch, PulseStep, Role, Setup
 

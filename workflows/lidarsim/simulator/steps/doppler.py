@@ -2,7 +2,7 @@
 
 The velocity of the hit point minus the velocity of the ray's origin, along the ray, which the
 Doppler shift 2 v / wavelength of FMCW lidars shows (Hexsel, Vhavle and Chen 2022). Both are
-derivatives of the trajectories' curves (`lidarsim.sensor.trajectory.velocities`).
+derivatives of the trajectories' curves (`lidarsim.motion.trajectory.velocities`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...base.arrays import Floats, Integers, Ints, Ints32
+from ...base.random_numbers import Purpose
 from ...base.vectors import products
-from ...sensor.random_numbers import Purpose
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
 from ..casting.surfaces import Surfaces

@@ -8,10 +8,10 @@ import numpy as np
 
 from ...base.arrays import Floats, Indices, Integers
 from ...base.elementary import exp, log
+from ...base.random_numbers import Purpose, uniform
 from ...columns.table import CAUSES
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import LIGHT_M_NS
-from ...sensor.random_numbers import Purpose, uniform
 from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 

@@ -7,8 +7,7 @@ import numpy as np
 from ...base.arrays import Bools, Floats, owned
 from ...base.elementary import sin_cos
 from ...base.vectors import hypot
-from ...sensor import Fault
-from ...sensor.faults import PACKET
+from ...survey.faults import PACKET, Fault
 from ..returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 

@@ -21,11 +21,11 @@ from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Int
 from ...base.elementary import exp, log
 from ...base.elementary_scalars import log_of
 from ...base.errors import LidarError
+from ...base.random_numbers import Purpose
 from ...base.vectors import applied, products
+from ...media.leaves import brightness, projection
+from ...media.materials import MaterialTable, fresnel
 from ...scene.scene import Scene
-from ...sensor.leaves import brightness, projection
-from ...sensor.materials import MaterialTable, fresnel
-from ...sensor.random_numbers import Purpose
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, Clock
 from ..casting.scene_caster import SceneCaster

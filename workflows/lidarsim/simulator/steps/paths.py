@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
+from ...base.random_numbers import Purpose, raw
 from ...base.vectors import into_axes, products
 from ...columns.table import CAUSES, COLOURS
+from ...media.weather import FAINTEST
 from ...scene.colours import luminance
-from ...sensor.random_numbers import Purpose, raw
-from ...sensor.weather import FAINTEST
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, Clock, along_rings
 from ..casting.scene_caster import SceneCaster

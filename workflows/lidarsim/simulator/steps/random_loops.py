@@ -1,4 +1,4 @@
-"""Random numbers for compiled loops: as `lidarsim.sensor.random_numbers`, number by number."""
+"""Random numbers for compiled loops: as `lidarsim.base.random_numbers`, number by number."""
 
 # mypy: disable-error-code="no-untyped-def"
 

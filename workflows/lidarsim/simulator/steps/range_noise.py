@@ -6,8 +6,8 @@ import numpy as np
 
 from ...base.arrays import Floats, Integers, Ints
 from ...base.elementary import exp, log
+from ...base.random_numbers import Purpose, normal
 from ...sensor.noise import Noise
-from ...sensor.random_numbers import Purpose, normal
 from ..returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 

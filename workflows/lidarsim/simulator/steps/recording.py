@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ...base.arrays import Floats, Ints
 from ...base.elementary import exp
+from ...base.random_numbers import Purpose, normal, raw
 from ...columns.waveforms import SILENT, ZERO, record
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
-from ...sensor.random_numbers import Purpose, normal, raw
 from ..returns import Keys, PulseReturns, numbers, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, owned
+from ...base.random_numbers import quantiles, starts
 from ...scene.colours import GREY, packed
 from ...sensor.disc import neighbours
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import Mode
-from ...sensor.random_numbers import quantiles, starts
 from ..returns import (
     NO_SURFACE,
     RETURN_COLUMNS,

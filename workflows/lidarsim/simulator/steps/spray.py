@@ -14,11 +14,11 @@ import numpy as np
 from raybeam.moving import near_boxes
 
 from ...base.arrays import Floats, Ints, owned
+from ...base.random_numbers import Purpose
 from ...base.vectors import into_axes, length
 from ...columns.table import CAUSES
+from ...media.weather import FAINTEST, LARGE, reach, spray
 from ...scene.actors import check_spray
-from ...sensor.random_numbers import Purpose
-from ...sensor.weather import FAINTEST, LARGE, reach, spray
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import along_rings
 from ..casting.scene_caster import SceneCaster

@@ -19,12 +19,13 @@ import numpy as np
 from raybeam import Pattern, SubRays
 
 from ...base.arrays import Floats, Indices, Ints
+from ...base.random_numbers import Purpose
 from ...base.vectors import turned
 from ...columns.table import VELOCITY
 from ...scene.scene import Scene
-from ...sensor import Fault, Noise, Returns, Sensor, Survey
-from ...sensor.faults import FaultKind
-from ...sensor.random_numbers import Purpose
+from ...sensor import Noise, Returns, Sensor
+from ...survey.faults import Fault, FaultKind
+from ...survey.survey import Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces

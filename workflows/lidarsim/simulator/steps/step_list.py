@@ -6,7 +6,7 @@ from functools import reduce
 from operator import or_
 
 from ...scene.scene import Scene
-from ...sensor import Survey
+from ...survey.survey import Survey
 from .air import WeatherStep
 from .angle_noise import AngleNoiseStep, RippleStep
 from .crosstalk import CrosstalkStep

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
+from ...base.random_numbers import Purpose
 from ...base.vectors import into_axes, length, products, turned
 from ...columns.table import CAUSES
+from ...media.materials import MaterialTable
 from ...scene.scene import Scene
-from ...sensor.materials import MaterialTable
-from ...sensor.random_numbers import Purpose
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces, light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface

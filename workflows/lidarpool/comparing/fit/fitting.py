@@ -1,0 +1,202 @@
+"""Fits the performance of a sensor to a recording; writes a sensor file and its page.
+
+A figure is a number of the performance, such as the noise of ranges; intervals of figures are
+confidence intervals of 95 %. Arrays have the axes of `stack`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import Field
+
+from lidarsim._version import __version__
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.extras import need
+from lidarsim.base.signatures import ReadableSignature
+from lidarsim.base.storage import Storage
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.motion.trajectory import Pose
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
+
+from ...clouds.recording import Recording
+from ...columns.parts import StoredCloud
+from ...recordings.recordings import open_recording
+from ...report.page.rendering import rendered
+from .charts import draw_charts
+from .estimates import Estimate
+from .known_poses import KnownPoses
+from .measured import Measured, measure_moving, measure_standing
+from .motion import moving_message
+from .performance import has_frontal_rays
+from .stack import SweepStack, check_sweeps
+
+_RANGE_NOISE_FIELDS = ("range_m", "range_per_m", "range_at_threshold_m")
+_MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not one of its beams
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """Result of `fit`; printed as a table."""
+
+    __signature__ = ReadableSignature()
+
+    figures: dict[str, Any]  # numbers and texts of the page; lengths in metres
+    model: SensorModel  # the sensor with the fitted performance
+
+    def __repr__(self) -> str:
+        return rendered("fit.txt", report=self.figures).rstrip("\n")
+
+    @checked
+    def save(self, file: str | Path) -> list[Path]:
+        """Write the sensor file and a .html page beside the file; return both paths.
+
+        LidarError if the file is no .yaml, or cannot be written.
+        """
+        model_path = Path(file)
+        if model_path.suffix not in MODEL_FILES:
+            raise LidarError(f"{model_path} is no sensor file: give a name such as mine.yaml.")
+        model = self.model.model_dump(mode="json", exclude_defaults=True)
+        text = "".join(f"# {line}\n" for line in repr(self).splitlines())
+        text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
+        pictures = {"fit": draw_charts(self.figures).svg()}
+        page = rendered("fit.html", report=self.figures, pictures=pictures)
+        contents = {model_path: text, model_path.with_suffix(".html"): page}
+        advice = "choose a folder that exists and has room"
+        with explained(f"{model_path} cannot be written", advice):
+            for path, content in contents.items():
+                Storage.at(path.parent, durable=False).write(path.name, content.encode())
+        return [*contents]
+
+
+@checked
+def fit(
+    recording: str | Path | Cloud | StoredCloud | Recording,
+    *,
+    model: str | Path | None = None,
+    scene: str | Path | Scene | None = None,
+    pose: Pose | Sequence[Any] | np.ndarray | None = None,
+    sensor: str | None = None,
+    intensity: str | None = None,
+    white: Annotated[float, Field(gt=0)] | None = None,
+) -> Fit:
+    """Fit the performance of a sensor to sweeps of the sensor at a standstill, or in a scene.
+
+    Parameters
+    ----------
+    recording
+        Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
+    model
+        The sensor, by name or file; the model keeps its figures that the recording does not
+        determine. By default a sensor with the recorded beams.
+    scene
+        The recorded place as a scene. By default surfaces are those of the recording, and the
+        sensor has to stand.
+    pose
+        Pose of the sensor in the scene: a pose, or a pose for each sweep; also matrices (n, 4, 4).
+        By default poses are those of the recording, and without those the scene's origin. A result
+        has the poses of all its pulses; other poses hold for a sweep.
+    sensor, intensity
+        Name of the sensor, or topic of a bag, if the recording has several; column with the
+        intensities, if not ``intensity``.
+    white
+        Intensity that the sensor reports of a white surface, if the intensity is the same at all
+        ranges. By default the value of Velodyne and Ouster for their recordings, else unknown.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read, has no sweeps or rings, or is of several sensors; if the
+        sensor moves, and there is no scene or the poses are unknown; or scipy is missing.
+    """
+    need("scipy", "fit", "Figures are fitted")
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, sensor, intensity, name="the recording")
+    check_sweeps(recording)
+    loaded = Scene.load(scene) if isinstance(scene, str | Path) else scene
+    poses = KnownPoses.of_recording(recording, pose, loaded)
+    speed = None if poses is None else poses.speed(recording)
+    if poses is None or speed is None:
+        measured = measure_standing(recording, white, loaded, poses)
+    elif loaded is None:
+        raise LidarError(moving_message(recording.name, speed, "the --scene of its poses"))
+    else:
+        measured = measure_moving(recording, white, loaded, poses)
+    base = read_model(model) if model else _recorded_sensor(measured.stack)
+    return _fit_of(recording, measured, base)
+
+
+def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
+    """Return the fit of a sensor `base` to what was measured."""
+    stack = measured.stack
+    name = Path(recording.name).name
+    source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
+    estimates = measured.estimates
+    notes = list(stack.notes)
+    if not _has_rings(base, stack):
+        notes.append(f"the recorded rings are not those of {base.name}: check --model")
+    figures = {
+        "versions": {"lidarpool": __version__},
+        "name": name,
+        "model": base.name,
+        "sweeps": stack.sweep_count,
+        "moves": measured.moves,
+        "rays": len(measured.rays.row),
+        "frontal": has_frontal_rays(measured.rays),
+        "intensity": bool(np.isfinite(measured.rays.intensity).all()),
+        "energy": measured.energy is not None,
+        "figures": {key: estimate._asdict() for key, estimate in estimates.items()},
+        "notes": notes,
+        "channels": measured.channels(),
+        "curves": measured.curves(),
+    }
+    return Fit(figures, _with_performance(base, estimates, source) if estimates else base)
+
+
+def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
+    """Return True if each ring is near a beam of a model, or a calibration file has the beams."""
+    offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
+    is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
+    return model.needs_calibration or is_near
+
+
+def _with_performance(
+    base: SensorModel, estimates: Mapping[str, Estimate], source: str
+) -> SensorModel:
+    """Return a sensor with estimates in its performance; figures without estimates stay.
+
+    The figures of range noise go together: an estimate of one replaces all of these, and
+    `precision`.
+    """
+    values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
+    performance = base.performance or Performance()
+    has_range_noise = any(name in values for name in _RANGE_NOISE_FIELDS)
+    replaced = {"precision", *_RANGE_NOISE_FIELDS} if has_range_noise else set()
+    stated = performance.model_dump(exclude_defaults=True, exclude=replaced)
+    if range_m := values.get("detection_range_m"):
+        stated["detection"] = {"range_m": range_m, "reflectance": 0.1, "probability": 0.5}
+    names = [*_RANGE_NOISE_FIELDS, "angle_deg", "dropout"]
+    if "detection" in stated:
+        names.append("false_alarms")
+    stated |= {name: values[name] for name in names if name in values}
+    changes = {"performance": stated, "sources": {**base.sources, "performance": source}}
+    return SensorModel.model_validate(base.model_dump() | changes)
+
+
+def _recorded_sensor(stack: SweepStack) -> SensorModel:
+    """Return a sensor with the beams of a recording."""
+    return SensorModel(
+        name="Recorded sensor",
+        sources={"angles": "medians of the recorded points"},
+        firings_per_turn=stack.ranges.shape[2],
+        range_m=(0.0, float(np.ceil(1.1 * np.nanmax(stack.ranges)))),
+        beams={"elevation_deg": np.sort(stack.elevation_deg).round(3).tolist()},
+    )

@@ -1,0 +1,149 @@
+"""Poses of the sweeps of a recording that are known: by the recording, or by its user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.words import plural
+from lidarsim.motion.trajectory import Pose, check_rotations, pose_of
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.transform import affine
+from lidarsim.sweeps.sweep_motion import FiringPoses
+
+from ...clouds.recording import FiredPoints, Recording
+from .motion import Speed, sweep_period_ns
+
+_MAX_SWEEPS = 64  # whose poses are read
+# Poses of a sensor that stands differ by less: exact poses, and those of a localization.
+_MIN_SHIFT_M = 0.001
+_MIN_TURN_DEG = 0.01
+_LOCALIZED_SHIFT_M = 0.05
+_LOCALIZED_TURN_DEG = 0.5
+_MIN_SPEED_DEG = 0.005  # a smaller turn from sweep to sweep is not named
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPoses:
+    """Poses of sweeps in the frame of a scene, or in the world without a scene."""
+
+    numbers: Ints  # (n,): numbers of the sweeps
+    matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
+    are_given: bool  # by the user
+    origin: Floats  # (3,): of the scene in the world, metres
+
+    @classmethod
+    def of_recording(
+        cls, recording: Recording, pose: Any, scene: Scene | None
+    ) -> KnownPoses | None:
+        """Return the poses given as `pose`, else those of the recording; None if unknown.
+
+        LidarError if the given poses are neither one nor one for each sweep.
+        """
+        origin = np.zeros(3) if scene is None else scene.origin
+        if pose is not None:
+            matrices = _given_matrices(pose, recording)
+            if scene is None and len(matrices) == 1:
+                raise LidarError("pose is the sensor's in a scene: give scene, or leave out pose.")
+            return cls(np.arange(len(matrices)), matrices, True, origin)
+        numbers = even_indices(recording.count, _MAX_SWEEPS)
+        recorded = recording.poses(numbers.tolist())
+        if recorded is None:
+            return None
+        recorded[:, :3, 3] -= origin
+        return cls(numbers, recorded, False, origin)
+
+    def are_of_firings(self, recording: Recording) -> bool:
+        """Return True if the poses are of the firings of a result, and not of whole sweeps."""
+        return not self.are_given and recording.fired is not None
+
+    def speed(self, recording: Recording) -> Speed | None:
+        """Return the mean motion from sweep to sweep; None if the sensor stands."""
+        positions = self.matrices[:, :3, 3]
+        rotations = self.matrices[:, :3, :3]
+        is_exact = self.are_given or self.are_of_firings(recording)
+        min_shift_m = _MIN_SHIFT_M if is_exact else _LOCALIZED_SHIFT_M
+        min_turn_deg = _MIN_TURN_DEG if is_exact else _LOCALIZED_TURN_DEG
+        shift_m = np.linalg.norm(positions - positions[0], axis=1).max()
+        turn_deg = _angles_deg(rotations[:1], rotations).max()
+        if shift_m < min_shift_m and turn_deg < min_turn_deg:
+            return None
+        sweeps = int(self.numbers[-1] - self.numbers[0])
+        steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        turns_deg = _angles_deg(rotations[:-1], rotations[1:])
+        period_ns = sweep_period_ns(recording, np.arange(recording.count))
+        shift_m = float(steps_m.sum() / sweeps)
+        turn_deg = float(turns_deg.sum() / sweeps)
+        return Speed(shift_m, turn_deg if turn_deg > _MIN_SPEED_DEG else 0.0, period_ns)
+
+    def fired(self, recording: Recording) -> Callable[[int], FiredPoints]:
+        """Return a function that reads a sweep as fired, with poses in the scene frame.
+
+        A result says where each pulse was fired; otherwise the pose of a sweep is that of all its
+        pulses. LidarError if the recording has poses of some sweeps alone.
+        """
+        read = recording.fired
+        if self.are_given or read is None:
+            return self._of_whole_sweeps(recording)
+
+        def read_in_scene(number: int) -> FiredPoints:
+            fired = read(number)
+            poses = replace(fired.poses, position=fired.poses.position - self.origin)
+            return fired._replace(poses=poses)
+
+        return read_in_scene
+
+    def _of_whole_sweeps(self, recording: Recording) -> Callable[[int], FiredPoints]:
+        """Return a function that reads a sweep as fired from a single pose."""
+        matrices = self.matrices
+        if not self.are_given:
+            recorded = recording.poses(range(recording.count))
+            if recorded is None:
+                raise LidarError(f"{recording.name} lacks poses of some sweeps: give --pose.")
+            matrices = recorded
+            matrices[:, :3, 3] -= self.origin
+
+        def read_from_pose(number: int) -> FiredPoints:
+            points, columns, _ = recording.read(number)
+            positions = np.asarray(points, np.float64) * recording.metres
+            # Drivers write NaN or zeros for pulses without a return.
+            valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
+            poses = FiringPoses(matrices[number, :3, 3], matrices[number, :3, :3])
+            returned = {name: np.asarray(values)[valid] for name, values in columns.items()}
+            return FiredPoints(positions[valid], returned, poses)
+
+        return read_from_pose
+
+
+def _given_matrices(pose: Any, recording: Recording) -> Floats:
+    """Return one pose, or a pose for each sweep, as matrices (n, 4, 4)."""
+    if isinstance(pose, np.ndarray) and pose.shape[-2:] == (4, 4):
+        matrices = pose.astype(np.float64).reshape(-1, 4, 4)
+        check_rotations(matrices[:, :3, :3])
+        if not np.isfinite(matrices).all():
+            raise LidarError("pose has positions that are not finite.")
+    else:
+        is_single = isinstance(pose, Pose) or isinstance(next(iter(pose), 0), Real)
+        poses = [pose_of("pose", single) for single in ([pose] if is_single else pose)]
+        matrices = np.array(
+            [affine(pose.rotation_matrix, np.array(pose.position)) for pose in poses]
+        )
+    if len(matrices) not in (1, recording.count):
+        raise LidarError(
+            f"pose has {plural(len(matrices), 'pose')}, and {recording.name} has "
+            f"{plural(recording.count, 'sweep')}: give one pose, or one for each sweep."
+        )
+    return matrices
+
+
+def _angles_deg(first: Floats, second: Floats) -> Floats:
+    """Return the angles (n,) between rotations (n, 3, 3), degrees."""
+    traces = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
+    return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))

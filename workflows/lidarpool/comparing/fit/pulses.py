@@ -1,0 +1,359 @@
+"""Pulses of a sensor that moves, against a scene: the poses of their firings are known.
+
+Each pulse has a ray of its own, so the mean range of a ray is unknown: the scene gives the range.
+Arrays of a sweep have r rows and c columns, as of `stack`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+from lidarsim.base.sampling import even_indices
+from lidarsim.columns.table import NORMAL
+from lidarsim.motion.trajectory import Pose, matrices
+from lidarsim.scene.scene import Scene
+from lidarsim.sensor import Spin
+from lidarsim.sensor.ray_sensors import ListedSensor
+from lidarsim.simulator import Scanner
+
+from ...clouds.recording import FiredPoints, Read, Recording, rings_of
+from .stack import MAX_KINK_M, SweepStack
+from .surfaces import (
+    ASSUMED_DIRECTION_NOISE_RAD,
+    MAX_KINK_PER_M,
+    MAX_SIGMAS,
+    MAX_TANGENT,
+    MIN_RANGE_M,
+    SCENE_TOLERANCE_M,
+    Neighbours,
+    SmoothRays,
+    among_smooth,
+)
+
+_MAX_PULSES = 1 << 17  # that are fitted, chosen evenly
+_SAME_RANGE_M = 1e-3  # difference of the ranges of a return, as rounded
+_MAX_GAP_DEG = 2.0  # from a cell to the nearest return of its ring, whose pose counts
+_MIN_LOST_STEPS = 1.5  # from a return to the next, between which a pulse is lost
+_LIGHT_COLUMNS = 3  # cells on either side whose intensities count
+
+
+@dataclass(frozen=True, eq=False)
+class Pulses:
+    """Pulses that meet smooth surfaces of a scene, (n,) each."""
+
+    row: Ints
+    column: Ints
+    expected: Floats  # range of the scene, metres
+    slope: Floats  # growth of the range with the direction, metres in a radian
+    residual: Floats  # range less `expected`, metres; NaN of a lost pulse
+    intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
+    difference: Floats  # residual less that of the next pulse of the ring; NaN if unknown
+
+    def rough_sigma(self) -> Floats:
+        """Estimate the standard deviations (n,) of ranges, metres, for the choice of outliers."""
+        scatter_m = float(np.nanmedian(np.abs(self.difference))) / (0.6745 * np.sqrt(2))
+        return np.hypot(scatter_m, ASSUMED_DIRECTION_NOISE_RAD * self.slope)
+
+    def select(self, chosen: Bools | Indices) -> Pulses:
+        """Select pulses by mask or index."""
+        return Pulses(*(values[chosen] for values in vars(self).values()))
+
+    def near_scene(self, sigma: Floats) -> Bools:
+        """Mark pulses (n,) that are lost, or return from the scene, by ranges' `sigma` (n,)."""
+        limit_m = np.maximum(MAX_SIGMAS * sigma, SCENE_TOLERANCE_M)
+        return ~(np.abs(self.residual) > limit_m)  # also of NaN
+
+    def rays(self, sigma: Floats) -> SmoothRays:
+        """Return the pulses as rays of one pulse each; ranges have standard deviations (n,).
+
+        The variances are those of differences of neighbouring pulses: errors of poses and of the
+        scene are alike in both.
+        """
+        returned = np.isfinite(self.residual)
+        with np.errstate(invalid="ignore"):
+            paired = np.abs(self.difference) < MAX_SIGMAS * np.sqrt(2) * sigma
+        return SmoothRays(
+            row=self.row,
+            column=self.column,
+            distance=self.expected,
+            slope=self.slope,
+            intensity=self.intensity,
+            returns=returned.astype(np.int64),
+            trials=np.ones(len(self.row), np.int64),
+            variance=np.where(paired, self.difference**2 / 2, 0.0),
+            freedom=paired.astype(np.int64),
+        )
+
+
+class SweepPulses(NamedTuple):
+    """Pulses of a sweep on smooth surfaces, or of all sweeps; returns that the scene explains."""
+
+    pulses: Pulses
+    compared: int  # returns where the scene has a surface
+    near: int  # returns of these within `SCENE_TOLERANCE_M` of the surface
+
+    @classmethod
+    def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
+        """Join the pulses of sweeps; of many, choose pulses evenly."""
+        columns = zip(*(vars(sweep.pulses).values() for sweep in sweeps), strict=True)
+        pulses = Pulses(*map(np.concatenate, columns))
+        return cls(
+            pulses.select(even_indices(len(pulses.row), _MAX_PULSES)),
+            sum(sweep.compared for sweep in sweeps),
+            sum(sweep.near for sweep in sweeps),
+        )
+
+
+def measure_pulses(
+    recording: Recording, scene: Scene, fired: Callable[[int], FiredPoints]
+) -> tuple[SweepStack, SweepPulses]:
+    """Read the sweeps of a sensor that moves, and compare their pulses with a scene.
+
+    `fired` returns the points of a sweep as they were fired, with poses in the scene frame.
+    LidarError as of `SweepStack.read`.
+    """
+
+    def read(number: int) -> Read:
+        points = fired(number)
+        return points.points, points.columns, None
+
+    as_fired = replace(recording, read=read, firing_key="", metres=(1.0, 1.0, 1.0))
+    stack = SweepStack.read(as_fired)
+    caster = _CellCaster.of_stack(stack, scene)
+    sweeps = enumerate(stack.numbers.tolist())
+    return stack, SweepPulses.joined(
+        [_pulses_of_sweep(stack, index, caster, fired(number)) for index, number in sweeps]
+    )
+
+
+class _CellReturns(NamedTuple):
+    """For each cell of a sweep, its return, or the return of the ring nearest in azimuth."""
+
+    points: Floats  # (r, c, 3): in the sensor frame at their firings, metres
+    beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
+    own: Bools  # (r, c): whether the return is that of the cell
+    known: Bools  # (r, c): whether the pose of the cell's pulse is known
+    positions: Floats  # (r c, 3): of the sensor at the firings, scene frame, metres
+    rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
+
+    @classmethod
+    def of_sweep(cls, stack: SweepStack, sweep: int, fired: FiredPoints) -> _CellReturns:
+        """Find the returns of the cells of a sweep."""
+        points = np.asarray(fired.points, np.float64)
+        rings = np.asarray(rings_of(fired.columns), np.int64)
+        nearest = _NearestReturns.of_sweep(stack, sweep, points, rings)
+        index = nearest.indices
+        ranges = np.linalg.norm(points, axis=1)[index]
+        cell_ranges = stack.ranges[sweep]
+        with np.errstate(invalid="ignore"):
+            own = np.abs(cell_ranges - ranges) < _SAME_RANGE_M
+        known = stack.covered[sweep] & (nearest.gap_deg < _MAX_GAP_DEG)
+        # In points without the motion of the sensor, steps of azimuth are longer or shorter: cells
+        # are empty though no pulse is lost.
+        min_spacing_deg = _MIN_LOST_STEPS * 360 / cell_ranges.shape[1]
+        known &= np.where(np.isfinite(cell_ranges), own, nearest.spacing_deg > min_spacing_deg)
+        return cls(
+            points[index], points[nearest.sides], own, known, *_firing_poses(fired, index.ravel())
+        )
+
+
+class _NearestReturns(NamedTuple):
+    """For each cell of a sweep, the returns of its ring that are nearest in azimuth.
+
+    Distances are infinite in rings without a return.
+    """
+
+    indices: Ints  # (r, c): of the nearest points
+    gap_deg: Floats  # (r, c): from the cell to the point in azimuth
+    sides: Ints  # (2, r, c): of the points before and after the cell
+    spacing_deg: Floats  # (r, c): between the points before and after the cell
+
+    @classmethod
+    def of_sweep(
+        cls, stack: SweepStack, sweep: int, points: Floats, rings: Ints
+    ) -> _NearestReturns:
+        """Find the points (n, 3) of rings (n,) that are nearest to the cells of a sweep."""
+        azimuth = np.arctan2(stack.directions[..., 1], stack.directions[..., 0])
+        # A lost pulse has the mean azimuth of its cell.
+        azimuth = azimuth + np.nan_to_num(stack.azimuth_offsets[sweep])
+        cell_deg = (np.degrees(azimuth) + 180) % 360 - 180
+        azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        # Of several returns of a pulse the nearest is first.
+        order = np.lexsort((np.linalg.norm(points, axis=1), azimuth_deg, rings))
+        bounds = np.searchsorted(rings[order], np.stack([stack.rings, stack.rings + 1], axis=1))
+        parts = [order[start:stop] for start, stop in bounds.tolist()]
+        rows = zip(cell_deg, parts, strict=True)
+        found = [cls._of_ring(cells, azimuth_deg[part], part) for cells, part in rows]
+        indices, gap_deg, sides, spacing_deg = zip(*found, strict=True)
+        return cls(
+            np.stack(indices), np.stack(gap_deg), np.stack(sides, axis=1), np.stack(spacing_deg)
+        )
+
+    @classmethod
+    def _of_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
+        """Find the points (m,), of ascending azimuths, that are nearest to the cells (c,)."""
+        if not len(points):
+            no_point = np.zeros((2, len(cell_deg)), np.int64)
+            far_deg = np.full(len(cell_deg), np.inf)
+            return cls(no_point[0], far_deg, no_point, far_deg)
+        wrapped = np.concatenate([[ring_deg[-1] - 360], ring_deg, [ring_deg[0] + 360]])
+        following = np.searchsorted(wrapped, cell_deg).clip(1, len(wrapped) - 1)
+        before_deg = cell_deg - wrapped[following - 1]
+        after_deg = wrapped[following] - cell_deg
+        nearest = np.searchsorted(wrapped, wrapped[following - (before_deg < after_deg)])
+        return cls(
+            points[(nearest - 1) % len(points)],
+            np.abs(wrapped[nearest] - cell_deg),
+            points[(following - [[2], [1]]) % len(points)],
+            before_deg + after_deg,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _RayPoses:
+    """A trajectory in which each ray of a list has a pose; the time of ray i is i nanoseconds."""
+
+    positions: Floats  # (k, 3)
+    rotations: Floats  # (k, 3, 3)
+    stations: ClassVar[int] = 1
+    moves: ClassVar[bool] = True
+    duration_ns: ClassVar[float] = np.inf
+
+    def pose(self, station: int, time_ns: float = 0.0) -> Pose:
+        """Return the pose of the ray of a time."""
+        positions, rotations = self.poses(station, np.array([time_ns]))
+        return Pose.from_rotation(positions[0], rotations[0])
+
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
+        """Return the poses of the rays of times (k,)."""
+        ray = np.rint(times_ns).astype(np.int64).clip(0, len(self.positions) - 1)
+        return self.positions[ray], self.rotations[ray]
+
+
+@dataclass(frozen=True, eq=False)
+class _CellCaster:
+    """Casts a ray into each cell of a sweep."""
+
+    scanner: Scanner
+    directions: Floats  # (r, c, 3): unit directions in the sensor frame
+
+    @classmethod
+    def of_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
+        """Make the caster of the cells of a stack."""
+        rays = stack.directions.reshape(-1, 3)
+        shot_ns = np.arange(len(rays), dtype=np.float64)
+        sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=shot_ns)
+        scanner = Scanner(scene, sensor, columns=["ray", "range", *NORMAL])
+        return cls(scanner, stack.directions)
+
+    def surfaces(self, positions: Floats, rotations: Floats) -> _SceneSurfaces:
+        """Cast the rays of all cells from poses (r c, 3) and (r c, 3, 3)."""
+        cloud = self.scanner.sweep(_RayPoses(positions, rotations), number=0)
+        shape = self.directions.shape
+        cell = np.unravel_index(cloud["ray"].astype(np.int64), shape[:2])
+        distance = np.full(shape[:2], np.nan)
+        normal = np.full(shape, np.nan)
+        distance[cell] = cloud["range"]
+        normal[cell] = np.stack([cloud[name] for name in NORMAL], axis=1)
+        directions = _turned(rotations, self.directions)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cosine = (normal * directions).sum(axis=-1)
+            slope = distance * np.sqrt(np.maximum(1 / cosine**2 - 1, 0))
+            path = distance[..., None] * directions
+            scaled_normal = normal / cosine[..., None]
+            hits = positions.reshape(shape) + path
+            smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
+            tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance
+            smooth &= Neighbours.from_points(hits).are_coplanar(hits, scaled_normal, tolerance_m)
+        return _SceneSurfaces(distance, slope, path, scaled_normal, smooth)
+
+
+class _SceneSurfaces(NamedTuple):
+    """Surfaces of a scene in the cells of a sweep."""
+
+    distance: Floats  # (r, c): metres; NaN without a hit
+    slope: Floats  # (r, c): growth of the range with the direction, metres in a radian
+    path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, metres
+    scaled_normal: Floats  # (r, c, 3): normal n, as n / (n · d) for the direction d
+    smooth: Bools  # (r, c): whether the neighbours lie in one plane with the cell
+
+    def range_errors(self, points: Floats, rotations: Floats) -> Floats:
+        """Return the ranges (r, c) of points less the ranges of the planes of the cells, metres.
+
+        Ranges are along the points (r, c, 3), in the sensor frame: pulses are beside the middle of
+        their cell. `rotations` (r c, 3, 3) turn the sensor frame into the scene frame.
+        """
+        ranges = np.linalg.norm(points, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            directions = _turned(rotations, points / ranges[..., None])
+            offset = (self.path * self.scaled_normal).sum(axis=-1)
+            return np.asarray(ranges - offset / (directions * self.scaled_normal).sum(axis=-1))
+
+
+def _pulses_of_sweep(
+    stack: SweepStack, sweep: int, caster: _CellCaster, fired: FiredPoints
+) -> SweepPulses:
+    """Compare the pulses of a sweep with the smooth surfaces of a scene."""
+    returns = _CellReturns.of_sweep(stack, sweep, fired)
+    surfaces = caster.surfaces(returns.positions, returns.rotations)
+    residual = np.where(
+        returns.own, surfaces.range_errors(returns.points, returns.rotations), np.nan
+    )
+    beside = np.stack([surfaces.range_errors(side, returns.rotations) for side in returns.beside])
+    with np.errstate(invalid="ignore"):
+        limit_m = MAX_SIGMAS * ASSUMED_DIRECTION_NOISE_RAD * surfaces.slope
+        limit_m = np.maximum(limit_m, SCENE_TOLERANCE_M)
+        is_near = (np.abs(residual) < limit_m) & surfaces.smooth
+        usable = returns.known & (surfaces.distance < np.nanmax(stack.ranges))
+        # A pulse is lost between two returns of a surface; elsewhere the surface may be hidden, or
+        # missing in the recorded place.
+        usable &= returns.own | (np.abs(beside) < limit_m).all(axis=0)
+    # A surface of which no pulse nearby returns may be missing in the recorded place.
+    usable &= np.isfinite(_means_beside(np.where(is_near, stack.ranges[sweep], np.nan)))
+    difference = residual - np.roll(np.where(is_near, residual, np.nan), -1, axis=1)
+    difference[:, 1::2] = np.nan  # each return is in one difference
+    intensity = _means_beside(np.where(is_near, stack.intensities[sweep], np.nan))
+    cell = np.nonzero(usable & among_smooth(surfaces.smooth))
+    pulses = Pulses(
+        row=cell[0],
+        column=cell[1],
+        expected=surfaces.distance[cell],
+        slope=surfaces.slope[cell],
+        residual=residual[cell],
+        intensity=intensity[cell],
+        difference=difference[cell],
+    )
+    errors = np.abs(residual[np.isfinite(residual)])
+    return SweepPulses(pulses, len(errors), int((errors < SCENE_TOLERANCE_M).sum()))
+
+
+def _firing_poses(fired: FiredPoints, index: Ints) -> tuple[Floats, Floats]:
+    """Return the positions (k, 3) and rotations (k, 3, 3) of the firings of points (k,)."""
+    poses = fired.poses
+    if poses.quaternions is None or poses.offsets is None:
+        count = len(index)
+        rotations = np.broadcast_to(poses.rotation, (count, 3, 3))
+        return np.broadcast_to(poses.position, (count, 3)), rotations
+    rotations = poses.rotation @ matrices(poses.quaternions[:, index].T)
+    return poses.position + poses.offsets[:, index].T, rotations
+
+
+def _turned(rotations: Floats, vectors: Floats) -> Floats:
+    """Rotate vectors (r, c, 3) by rotations (r c, 3, 3)."""
+    turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
+    return np.asarray(turned.reshape(vectors.shape))
+
+
+def _means_beside(values: Floats) -> Floats:
+    """Return the means (r, c) of the values of the cells beside each cell; NaN without any."""
+    shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
+    beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
+    known = np.isfinite(beside)
+    sums = np.where(known, beside, 0).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(sums / np.where(known.any(axis=0), known.sum(axis=0), np.nan))

@@ -1,0 +1,14 @@
+"""Formats in which the pages of results offer points."""
+
+from __future__ import annotations
+
+from lidarview.viewer.view import Downloads
+
+from ...clouds.formats import Format, save_cloud
+
+DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
+
+
+def downloads() -> Downloads:
+    """Return the formats of a download whose packages are installed, and their writer."""
+    return Downloads([name for name in DOWNLOADS if Format(name).installed], save_cloud)

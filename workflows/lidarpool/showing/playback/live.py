@@ -1,0 +1,159 @@
+"""A scanner as a live sensor, from Python: for programs that move the sensor themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import count
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from lidarsim.base.arrays import Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import checked
+from lidarsim.columns.cloud import Cloud
+from lidarsim.motion.trajectory import Pose, Trajectory
+from lidarsim.packets.encoders import Datagrams
+from lidarsim.packets.send import LOOPBACK, Lateness
+from lidarsim.packets.sweep_packets import Packets
+from lidarsim.simulator import Scanner
+
+from ...base.fork_server import keep_freed_memory
+from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule, casting_threads
+from .transmitter import Transmitter, sensor_streams
+
+_AHEAD = 16  # sweeps that are cast before they are due, of a trajectory that is known
+_START_NS = 20e6  # from the start of the schedule to the first packet
+_NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
+Rate = Annotated[float, Field(ge=0.001, le=1000)]
+Seconds = Annotated[float | None, Field(gt=0)]
+
+
+@checked
+def play(
+    scanner: Scanner,
+    trajectory: Pose | Trajectory | Callable[[float], Any] | Sequence[float],
+    *,
+    to: str = LOOPBACK,
+    api: str = "",
+    rate: Rate = 1.0,
+    duration_s: Seconds = None,
+    start: Any = None,
+    ready: Callable[[str], Any] | None = None,
+    note: Callable[[str], Any] | None = None,
+) -> Lateness:
+    """Send the packets of a scanner as its sensor would, each at its time, until the end.
+
+    Parameters
+    ----------
+    scanner
+        The scanner, with the columns of `Packets`. Sweeps of a pose or trajectory are cast beside
+        each other, one on each core: ``threads=1`` is fastest then.
+    trajectory
+        Pose of a static sensor; trajectory of a moving sensor, at whose end this function returns;
+        or a function that returns the pose, or trajectory, of the sweep that starts at a time,
+        seconds. The function is called in this thread, up to a sweep before that time. Poses may
+        jump.
+    to, api
+        Where packets go, and where the sensor's interface listens, HOST or HOST:PORT, as of
+        `lidarpool play`.
+    rate
+        Speed: 0.5 takes twice as long.
+    duration_s
+        Length of time that is played, seconds of the scanner; by default that of the trajectory,
+        else until Ctrl-C.
+    start
+        Date and time of time 0, as in `Survey`, for the stamps.
+    ready, note
+        Get the addresses once all is ready, and notes, as lines for a user.
+
+    Returns
+    -------
+    Lateness
+        How many packets were sent, and how late they were.
+
+    Raises
+    ------
+    LidarError
+        If the scanner lacks a column, the sensor has no packets, or an address cannot be used.
+
+    Examples
+    --------
+    >>> from lidarpool import Packets, Pose, Scanner, Scene, load_sensor, play
+    >>> packets = Packets(load_sensor("velodyne/vlp16"))
+    >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=packets.columns)
+    >>> lateness = play(scanner, Pose((0, 0, 1)), duration_s=0.3)
+    >>> lateness.sent
+    242
+    """
+    keep_freed_memory()
+    packets = Packets.of_scanner(scanner, start)
+    names = {column.name for column in scanner.survey.stored_columns}
+    if missing := [name for name in packets.columns if name not in names]:
+        raise LidarError(
+            f"The scanner lacks the columns {', '.join(missing)}, which packets hold: make it with "
+            "columns=Packets(sensor).columns."
+        )
+    streams = sensor_streams([packets.encoder], [to], [api] if api else [])
+    sweeps = _sweeps(scanner, trajectory, duration_s)
+    with Transmitter(streams, note or (lambda words: None)) as transmitter:
+        if callable(trajectory):  # which says the next pose only when that sweep is due
+            clouds = (task() for task in sweeps)
+            _send_all(packets, clouds, Schedule(rate), transmitter, ready, note)
+        else:
+            with MadeAhead(sweeps, _AHEAD, casting_threads()) as made_ahead:
+                _send_all(packets, iter(made_ahead), Schedule(rate), transmitter, ready, note)
+        transmitter.sender.finish()
+    return transmitter.sender.lateness
+
+
+def _sweeps(
+    scanner: Scanner, trajectory: Any, duration_s: float | None
+) -> Iterator[Callable[[], _NumberedSweep]]:
+    """Yield functions that cast sweep after sweep, to the end of the trajectory or duration."""
+    end_s = getattr(trajectory, "duration_ns", float("inf")) / 1e9
+    for number in count():
+        first_s, last_s = scanner.span_s(number)
+        if last_s > end_s or first_s >= (duration_s or float("inf")):
+            return
+        pose = trajectory(first_s) if callable(trajectory) else trajectory
+        yield partial(_cast, scanner, pose, number, first_s)
+
+
+def _cast(scanner: Scanner, pose: Any, number: int, start_s: float) -> _NumberedSweep:
+    """Cast a sweep that starts at a time, seconds."""
+    return number, start_s, scanner.sweep(pose, number=number)
+
+
+def _send_all(
+    packets: Packets,
+    sweeps: Iterator[_NumberedSweep],
+    schedule: Schedule,
+    transmitter: Transmitter,
+    ready: Callable[[str], Any] | None,
+    note: Callable[[str], Any] | None,
+) -> None:
+    """Hand the packets of all sweeps over, each up to a sweep before its time."""
+
+    def send(groups: list[Datagrams]) -> None:
+        """Hand datagrams over to the process that sends them."""
+        transmitter.sender.send(0, groups, deadlines_ns)
+
+    def deadlines_ns(due_ns: Ints) -> Ints:
+        """Return times of the schedule, which starts with the first datagrams."""
+        if not schedule.started:
+            schedule.start(float(due_ns.min()), _START_NS)
+        return schedule.deadlines_ns(due_ns)
+
+    for number, start_s, points in sweeps:
+        groups = packets.encode(points, number=number)
+        if not schedule.started:
+            if ready is not None:
+                ready(f"ready: {transmitter.description}")
+        elif note is not None and schedule.late_s(start_s * 1e9) > BEHIND_S:
+            note(BEHIND)
+            note = None
+        send(groups)
+        schedule.wait_until(start_s * 1e9)  # the next sweep is cast, or taken, one sweep ahead
+    send(packets.finish())

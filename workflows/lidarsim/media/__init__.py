@@ -1,0 +1,1 @@
+"""What light meets: materials of surfaces, leaves, weather."""

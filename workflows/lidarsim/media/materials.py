@@ -1,0 +1,728 @@
+"""Materials by the names of objects and of their materials, energies of returns, weather."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase, translate
+from functools import cache, cached_property
+from glob import escape
+from importlib.resources import files
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, WrapValidator
+
+from ..base.arrays import Bools, Floats, Indices, Integers
+from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
+from ..base.elementary import exp, power
+from ..base.errors import LidarError
+from ..base.validation import checked_fields, shown
+from ..base.words import did_you_mean, name_hint
+from .leaves import LeafAngle
+
+REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
+REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
+# Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
+RETRO_GAIN = 220.0
+GLASS_INDEX = 1.5
+# Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
+WATER_INDEX = 1.328
+# Share of diffuse light in water that the water's surface reflects, 1 - (1 - r) / n², where r is
+# the mean of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+WATER_INWARDS = 0.4702
+NEAREST_M = 1e-3  # energies do not grow below this distance
+# wavelengths of the table of reflectances
+NEAR_NM = 905.0
+FAR_NM = 1550.0
+POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
+DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
+
+SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
+Transparent = Literal["none", "pass"]
+
+
+def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
+    """Raise ValueError for names of classes that files cannot hold, or that two classes share."""
+    for number, name in names.items() if isinstance(names, Mapping) else ():
+        valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
+        unique = [*names.values()].count(name) == 1
+        if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
+            raise ValueError(
+                f"{shown({number: name})} is no class with a name of its own: give whole numbers "
+                "of 0 to 65535 and a different text for each, such as {10: car}."
+            )
+    return handler(names)
+
+
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
+
+
+class Measured(NamedTuple):
+    """Reflectance of a material in a public spectral library."""
+
+    shares: tuple[float, float]  # at 905 and 1550 nm
+    library: str
+    sample: str
+
+
+@cache
+def reflectances() -> dict[str, Measured]:
+    """Return the table of reflectances: {name of a material: measurement}."""
+    text = (files("lidarsim.media") / "reflectances.csv").read_text("utf-8")
+    return {
+        row["name"]: Measured(
+            (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
+        )
+        for row in csv.DictReader(text.splitlines())
+    }
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Material:
+    """Optical properties and class of surfaces; of several entries for a face, the first counts.
+
+    An entry applies to objects by their names, to faces by the names of their materials in the
+    scene's files, or to faces by both.
+
+    Reflectance is at the sensor's wavelength, equal in all directions but for a gloss. Of light
+    that is not scattered, a share is mirrored; the rest passes, or is lost with "none".
+
+    Raises
+    ------
+    LidarError
+        If the entry has neither objects nor material, a value is outside its range, the table of
+        reflectances has no such spectrum, or two values contradict each other.
+    """
+
+    objects: Annotated[
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about("names of objects, with * and ?; by default all", min_length=1),
+    ] = None
+    reflectance: Annotated[
+        UnitShare | Literal["texture"] | None,
+        allowed("0 to 1, or texture"),
+        about(
+            "share of light that is scattered; by default 0.5, for glass and whole mirrors "
+            "0; texture: the luminance of the colour that was hit"
+        ),
+    ] = None
+    semantic_class: Annotated[SemanticClass, about("value of the column class", alias="class")] = 0
+    retro: Annotated[
+        bool, about("whether light returns in its own direction, as from traffic signs")
+    ] = False
+    transparent: Annotated[Transparent, about("pass: the rest of the light passes through")] = (
+        "none"
+    )
+    specular_reflectance: Annotated[
+        UnitShare | Literal["fresnel"] | None,
+        allowed("0 to 1, or fresnel"),
+        about(
+            "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
+            "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
+            0.04,
+        ),
+    ] = None
+    scale: Annotated[
+        float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
+    ] = 1.0
+    spectrum: Annotated[
+        str | None,
+        about("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
+    ] = None
+    roughness: Annotated[
+        float | None, about("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
+    ] = None
+    metalness: Annotated[
+        UnitShare, about("with roughness: 1 for metals, which scatter by their gloss alone")
+    ] = 0.0
+    refractive_index: Annotated[
+        float | None,
+        about(
+            "with transparent: pass, light is refracted and slower within the closed "
+            "surface, as 1.33 for water; by default it goes straight on",
+            1.33,
+            ge=1,
+            le=4,
+        ),
+    ] = None
+    attenuation_per_m: Annotated[
+        float, about("with refractive_index, extinction within the surface", ge=0, le=1e6)
+    ] = 0.0
+    leaf_area_density: Annotated[
+        float | None,
+        about(
+            "the closed surface is full of leaves: their one-sided area, m²/m³; "
+            "reflectance is theirs",
+            0.8,
+            gt=0,
+            le=1e4,
+        ),
+    ] = None
+    leaf_angle: Annotated[
+        LeafAngle,
+        about(
+            "with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
+            "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
+            "of axes"
+        ),
+    ] = "spherical"
+    material: Annotated[
+        str | Sequence[str] | None,
+        written_as(TextOrTexts | None),
+        about(
+            "names that materials have in the scene's files, with * and ?; by default all",
+            "Glass",
+            min_length=1,
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.objects is None and self.material is None:
+            raise LidarError(
+                'a material is for nothing: give objects, such as objects: "*", or material, a '
+                "name of the scene's file."
+            )
+        self._set_names("objects")
+        self._set_names("material")
+        self._check_reflectance()
+        self._check_roughness()
+        self._check_medium()
+
+    def _set_names(self, field_name: str) -> None:
+        """Replace a name by a tuple of names; LidarError for no or empty names."""
+        value = getattr(self, field_name)
+        if value is None:
+            return
+        names = (value,) if isinstance(value, str) else tuple(value)
+        if not names or not all(names):
+            raise LidarError(f"{field_name} is {value!r}; it must be names of {field_name}.")
+        object.__setattr__(self, field_name, names)
+
+    def _check_reflectance(self) -> None:
+        """Check that reflectance, spectrum and scale fit together."""
+        if self.spectrum is not None:
+            if self.spectrum not in (spectra := reflectances()):
+                hint = _materials_like(self.spectrum, [*spectra])
+                raise LidarError(f"There is no spectrum {self.spectrum!r}.{hint}")
+            if self.reflectance is not None:
+                raise LidarError("give either spectrum or reflectance, not both.")
+        if self.reflectance == "texture":
+            if self.transparent != "none":
+                raise LidarError(
+                    f"reflectance texture is for opaque objects: with transparent "
+                    f"{self.transparent}, give a number."
+                )
+        elif self.scale != 1:
+            raise LidarError("scale is a factor of colours: give reflectance texture with it.")
+
+    def _check_roughness(self) -> None:
+        """Check that only a matt, opaque surface has a gloss."""
+        if self.roughness is None and self.metalness:
+            raise LidarError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+        smooth = self.transparent != "none" or self.specular_reflectance is not None
+        if self.roughness is not None and (self.retro or smooth):
+            raise LidarError(
+                "roughness is for opaque surfaces without retro and specular_reflectance."
+            )
+
+    def _check_medium(self) -> None:
+        """Check that mirrored and passing light, the medium within a surface and leaves agree."""
+        mirrors = self.specular_reflectance
+        if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
+            raise LidarError(
+                f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
+                "fresnel for what light passes, else 0 to 1."
+            )
+        if self.refractive_index is not None and self.transparent != "pass":
+            raise LidarError("refractive_index is for light that passes: add transparent: pass.")
+        if self.attenuation_per_m and self.refractive_index is None:
+            raise LidarError("attenuation_per_m needs a refractive_index, such as 1.33.")
+        if self.leaf_area_density is None:
+            return
+        if not self._suits_leaves:
+            raise LidarError(
+                "leaf_area_density is for leaves that scatter light: leave out transparent, "
+                "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
+                "spectrum."
+            )
+
+    @property
+    def _suits_leaves(self) -> bool:
+        """Whether leaves can have this material, which only scatters light and needs no colours."""
+        scatters_otherwise = self.transparent != "none" or self.retro or self.roughness is not None
+        return (
+            not (scatters_otherwise or self.specular_reflectance) and self.reflectance != "texture"
+        )
+
+    def check_leaves(self, name: str, voxels: bool) -> None:
+        """Check that the material suits an object `name`, which may have `voxels`.
+
+        Raises
+        ------
+        LidarError
+            If the material has leaves of its own and the object has voxels, or the like.
+        """
+        if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
+            raise LidarError(
+                f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
+                "with a reflectance, or a spectrum, and perhaps a leaf_angle, but nothing else."
+            )
+        if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
+            raise LidarError(
+                f"materials: {name!r} has a leaf_angle, which needs a leaf_area_density, m²/m³, "
+                "such as 0.8, if it is not of voxels (.vox)."
+            )
+
+    def share(self, wavelength_nm: float) -> float:
+        """Return the share of light that is scattered; with a texture, where there is no colour."""
+        if self.spectrum is not None:
+            at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
+            # The nearer measurement: between both wavelengths, leaves absorb more than at either.
+            return at_905_nm if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else at_1550_nm
+        if self.reflectance == "texture":
+            return min(1.0, self.scale * REFLECTANCE)
+        if self.reflectance is None:
+            return (
+                0.0 if self.transparent == "pass" or self.specular_reflectance == 1 else REFLECTANCE
+            )
+        return float(self.reflectance)
+
+    @property
+    def specular(self) -> float:
+        """Share of the light not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
+
+    def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
+        """Return whether this entry applies to an object `name` with faces of `materials`."""
+        return _fits(name, self.objects) and any(_fits(face, self.material) for face in materials)
+
+    @property
+    def for_all(self) -> bool:
+        """Whether this material applies to all faces of all objects."""
+        return self.material is None and self.objects is not None and "*" in self.objects
+
+
+def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
+    """Return whether a name fits a pattern; None fits all names."""
+    return patterns is None or any(
+        name == pattern or fnmatchcase(name, pattern) for pattern in patterns
+    )
+
+
+def _materials_like(name: str, materials: Sequence[str]) -> str:
+    """Return a hint with the materials that contain a word, else the most similar, else all."""
+    containing = [material for material in materials if name.lower() in material.lower()]
+    if len(containing) > 1:
+        return f" There are: {'; '.join(containing)}."
+    return (
+        did_you_mean(name, containing or materials)
+        or f" There are: {'; '.join(containing or materials)}."
+    )
+
+
+def rows_named(pattern: str, names: Sequence[str]) -> Indices:
+    """Return the rows of the names that equal or fit a pattern with * and ?."""
+    if not any(sign in pattern for sign in "*?["):
+        return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
+    fits = re.compile(translate(pattern)).match
+    return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceKinds:
+    """Kinds of surfaces: a kind for each object, or for each material of an object.
+
+    Parameters
+    ----------
+    names
+        Names of all objects.
+    object
+        int (k,), ascending: row of `names` for each kind. Each object has at least one kind.
+    material
+        Names (k,) of the materials in the scene's files; "" for none.
+    """
+
+    names: Sequence[str]
+    object: Indices
+    material: Sequence[str]
+
+    @classmethod
+    def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
+        """Return a kind for each object, without materials."""
+        return cls(names, np.arange(len(names)), ("",) * len(names))
+
+    @cached_property
+    def first(self) -> Indices:
+        """First kind of each object, and the number of kinds: (objects + 1,)."""
+        return np.searchsorted(self.object, np.arange(len(self.names) + 1))
+
+    def of_rows(self, rows: Indices) -> Indices:
+        """Return the kinds of objects, by the objects' rows (m,)."""
+        if len(self.object) == len(self.names):
+            return rows
+        starts = self.first[rows]
+        stops = self.first[rows + 1]
+        ranges = [np.arange(start, stop) for start, stop in zip(starts, stops, strict=True)]
+        return np.concatenate([np.zeros(0, np.intp), *ranges])
+
+    def describe(self, kind: int) -> str:
+        """Return the name of a kind for errors, with its object and its material."""
+        name = repr(self.names[self.object[kind]])
+        return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
+
+
+def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
+    """Return the number of the first material that applies to each kind, -1 for none: (k,).
+
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind, or to all kinds although materials follow.
+    """
+    first = np.full(len(kinds.object), -1)
+    object_rows = {name: row for row, name in enumerate(kinds.names)}
+    kinds_by_material: dict[str, list[int]] = {}  # {name of a material: kinds}
+    if any(entry.material is not None for entry in materials):
+        for kind, name in enumerate(kinds.material):
+            if name:
+                kinds_by_material.setdefault(name, []).append(kind)
+    for number, entry in enumerate(materials):
+        if entry.for_all and number + 1 < len(materials):
+            raise LidarError(
+                f"materials: the first entry for a surface counts, so that none after number "
+                f'{number + 1}, {{objects: "*"}}, would: put it last.'
+            )
+        matches = _matching_kinds(entry, kinds, object_rows, kinds_by_material)
+        first[matches[first[matches] < 0]] = number
+    return first
+
+
+def _matching_kinds(
+    entry: Material,
+    kinds: SurfaceKinds,
+    object_rows: Mapping[str, int],
+    kinds_by_material: Mapping[str, Sequence[int]],
+) -> Indices:
+    """Return the kinds that a material applies to.
+
+    `object_rows` are {name of an object: row}, `kinds_by_material` {name of a material: kinds}.
+
+    Raises
+    ------
+    LidarError
+        If a name fits no object or no material of the scene.
+    """
+    matches: Indices | None = None
+    if entry.objects is not None:
+        rows = [
+            matching_rows(pattern, kinds.names, object_rows, "materials")
+            for pattern in entry.objects
+        ]
+        matches = kinds.of_rows(np.concatenate(rows))
+    if entry.material is None:
+        assert matches is not None, "a material applies to objects, or to materials"
+        return matches
+    names = [*kinds_by_material]
+    with_material: list[int] = []
+    for pattern in entry.material:
+        rows_of_pattern = rows_named(pattern, names)
+        if not len(rows_of_pattern):
+            measured = f" For a measured reflectance, write spectrum: {pattern!r}."
+            raise LidarError(
+                f"materials names the material {pattern!r}, but no face of the scene has one of "
+                "that name."
+                + (name_hint(pattern, names) if names else " No face has any.")
+                + measured * (pattern in reflectances())
+            )
+        for row in rows_of_pattern.tolist():
+            with_material += kinds_by_material[names[row]]
+    kinds_with_material = np.array(with_material, np.intp)
+    if matches is None:
+        return kinds_with_material
+    common = np.intersect1d(matches, kinds_with_material)
+    if not len(common):
+        raise LidarError(
+            f"materials: no face of {', '.join(map(repr, entry.objects or ()))} has the material "
+            f"{', '.join(map(repr, entry.material))}."
+        )
+    return common
+
+
+def matching_rows(
+    pattern: str, names: Sequence[str], object_rows: Mapping[str, int], subject: str
+) -> Indices:
+    """Return the rows of the objects that fit a pattern.
+
+    Parameters
+    ----------
+    pattern
+        Name of an object, or a pattern with * and ?.
+    names, object_rows
+        Names of all objects, and {name: row}.
+    subject
+        What names the objects, for the error: «materials».
+
+    Raises
+    ------
+    LidarError
+        If no object fits.
+    """
+    if pattern in object_rows and not any(sign in pattern for sign in "*?["):
+        return np.array([object_rows[pattern]])
+    rows = rows_named(pattern, names)
+    if not len(rows):
+        raise LidarError(
+            f"{subject} names {pattern!r}, but no object has that name.{name_hint(pattern, names)}"
+        )
+    return rows
+
+
+def with_classes(
+    materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
+) -> list[Material]:
+    """Return materials with classes for objects by their names, where a material has no class.
+
+    `classes` are {class: patterns}.
+
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind.
+    """
+    first = first_matches(materials, kinds)
+    insertions: list[list[Material]] = [[] for _ in materials]  # new entries before each entry
+    for semantic_class, patterns in classes.items():
+        for pattern in patterns:
+            rows = rows_named(pattern, kinds.names)
+            pattern_kinds = kinds.of_rows(rows)
+            for number in np.unique(first[pattern_kinds]).tolist():
+                entry = materials[number]
+                if number < 0 or entry.semantic_class:
+                    continue
+                unclassified = pattern_kinds[first[pattern_kinds] == number]
+                objects = [pattern]
+                if len(unclassified) < len(pattern_kinds):
+                    objects_of_kinds = np.unique(kinds.object[unclassified]).tolist()
+                    objects = [escape(kinds.names[row]) for row in objects_of_kinds]
+                classified = replace(entry, objects=objects, semantic_class=semantic_class)
+                insertions[number].insert(0, classified)
+    pairs = zip(materials, insertions, strict=True)
+    return [entry for material, inserted in pairs for entry in (*inserted, material)]
+
+
+def with_class(
+    materials: Sequence[Material], semantic_class: int, rows: Indices, kinds: SurfaceKinds
+) -> list[Material]:
+    """Return materials with a class for objects, by their rows (m,), and otherwise unchanged.
+
+    Raises
+    ------
+    LidarError
+        If a material applies to no kind.
+    """
+    first = first_matches(materials, kinds)
+    selected_kinds = kinds.of_rows(rows)
+    entries: list[Material] = []
+    for number in (*range(len(materials)), -1):
+        object_rows = np.unique(
+            kinds.object[selected_kinds[first[selected_kinds] == number]]
+        ).tolist()
+        if object_rows:
+            entry = materials[number] if number >= 0 else Material("*")
+            objects = [escape(kinds.names[row]) for row in object_rows]
+            entries.append(replace(entry, objects=objects, semantic_class=semantic_class))
+        if number >= 0:
+            entries.append(materials[number])
+    return entries
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTable:
+    """Materials of kinds of surfaces: arrays with a value for each kind."""
+
+    reflectance: Floats
+    scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
+    roughness: Floats  # 0 for no gloss
+    metalness: Floats
+    retro: Bools
+    passes: Bools
+    specular: Floats  # share of the light not scattered that is mirrored at right angles
+    semantic_class: NDArray[np.uint16]
+    refractive_index: Floats  # within; 0 where light goes straight on
+    attenuation: Floats  # within, 1/m
+    leaf_area: Floats  # density within, m²/m³; 0 for no leaves, 1 for voxels
+    leaf_angle: Indices  # rows of `leaf_angles`
+    leaf_angles: tuple[str | float, ...]
+
+    @classmethod
+    def build(
+        cls,
+        materials: Sequence[Material],
+        kinds: SurfaceKinds,
+        wavelength_nm: float = NEAR_NM,
+        voxels: Bools | None = None,
+    ) -> MaterialTable:
+        """Return the materials of kinds of surfaces: the first that applies to a kind counts.
+
+        `voxels` (objects,) says whether objects have voxels, and so leaves of their own; None if no
+        object has voxels.
+
+        Raises
+        ------
+        LidarError
+            If a name fits no object or material, some but not all kinds have a material, or the
+            material of an object with leaves is not for leaves.
+        """
+        first = first_matches(materials, kinds)
+        unmatched = np.flatnonzero(first < 0)
+        if len(unmatched) and materials:
+            uncovered = f" and {len(unmatched) - 1} more" if unmatched[1:].size else ""
+            raise LidarError(
+                f"materials: no entry names the object {kinds.describe(unmatched[0])}{uncovered}: "
+                'end with one for all the others, such as {objects: "*"}.'
+            )
+        entries = [*materials, Material("*")]  # the last is of all, if there are no materials
+        textured = [m.scale * (m.reflectance == "texture") for m in entries]
+        angles = tuple(dict.fromkeys(m.leaf_angle for m in entries))
+        leaf_area = np.array([m.leaf_area_density or 0.0 for m in entries])[first]
+        has_voxels = np.zeros(len(first), np.bool_) if voxels is None else voxels[kinds.object]
+        has_leaf_angle = np.array([m.leaf_angle != "spherical" for m in entries])[first]
+        for row in np.flatnonzero(has_voxels | has_leaf_angle).tolist():
+            name = kinds.names[kinds.object[row]]
+            entries[first[row]].check_leaves(name, bool(has_voxels[row]))
+        leaf_area[has_voxels] = 1.0
+        return cls(
+            np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
+            np.array(textured, np.float64)[first],
+            np.array([m.roughness or 0.0 for m in entries])[first],
+            np.array([m.metalness for m in entries])[first],
+            np.array([m.retro for m in entries], np.bool_)[first],
+            np.array([m.transparent == "pass" for m in entries], np.bool_)[first],
+            np.array([m.specular for m in entries], np.float64)[first],
+            np.array([m.semantic_class for m in entries], np.uint16)[first],
+            np.array([m.refractive_index or 0.0 for m in entries])[first],
+            np.array([m.attenuation_per_m for m in entries], np.float64)[first],
+            leaf_area,
+            np.array([angles.index(m.leaf_angle) for m in entries], np.intp)[first],
+            angles,
+        )
+
+    @property
+    def leafy(self) -> Bools:
+        """Whether surfaces are full of leaves: (k,)."""
+        return self.leaf_area > 0
+
+    @property
+    def refracts(self) -> Bools:
+        """Whether light is refracted at surfaces: (k,)."""
+        return self.refractive_index > 0
+
+    @property
+    def textured(self) -> bool:
+        """Whether the reflectance of any surface is its colour."""
+        return bool(self.scale.any())
+
+    def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
+        """Return the share of light that surfaces scatter, by their kinds (n,): (n,).
+
+        `luminance` (n,) is the luminance of the hit colours, if the table is `textured`.
+        """
+        shares = self.reflectance[rows]
+        if luminance is not None:
+            scale = self.scale[rows]
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        return shares
+
+    def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
+        """Return the share of light that surfaces return, by their kinds (n,): (n,).
+
+        The share is 1 for a white surface hit at right angles. `cosine` (n,) is the cosine of the
+        angle of incidence; `luminance` (n,) is the luminance of the hit colours, if the table is
+        `textured`.
+        """
+        shares = self.shares(rows, luminance)
+        back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        if self.roughness.any():
+            rough = np.flatnonzero(self.roughness[rows])
+            metal = self.metalness[rows[rough]]
+            diffuse = shares[rough]
+            front = POLISHED * (1 - metal) + diffuse * metal
+            back[rough] *= 1 - metal
+            back[rough] += front * gloss(cosine[rough], self.roughness[rows[rough]])
+        return back
+
+
+def gloss(cosine: Floats, roughness: Floats) -> Floats:
+    """Return the light that facets of a rough surface mirror back, relative to a white diffuser.
+
+    Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
+    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, the
+    light is π D G / (4 cos θ). Multiply it by the reflection at right angles.
+    """
+    width = np.square(roughness**2)
+    square = cosine**2
+    spread = 1 - square * (1 - width)
+    return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
+
+
+def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
+    """Return the share of unpolarised light that a surface reflects (Fresnel's equations).
+
+    `index` is the refractive index behind the surface over the index before it. Where `index` is
+    below 1 and the cosine is small, all light is reflected.
+    """
+    inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
+    perpendicular = (cosine - index * inside) / (cosine + index * inside)
+    parallel = (inside - index * cosine) / (inside + index * cosine)
+    return (perpendicular**2 + parallel**2) / 2
+
+
+def below_water(cosine: Any, reflectance: Any) -> Any:
+    """Return the light from matt surfaces below a film of water, relative to dry surfaces: (n,).
+
+    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
+    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
+    1988, Ångström 1925).
+    """
+    return within_water(fresnel(cosine, WATER_INDEX), reflectance)
+
+
+def within_water(mirrored: Any, reflectance: Any) -> Any:
+    """Return the light from matt surfaces below a film of water that mirrors a share of light.
+
+    The light is relative to dry surfaces, as in `below_water`.
+    """
+    through = (1 - mirrored) / WATER_INDEX
+    return through * through / (1 - WATER_INWARDS * reflectance)
+
+
+def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
+    """Return the energy from white surfaces hit at right angles, by distance in metres."""
+    distance = np.maximum(distance, NEAREST_M)
+    nearer = np.square(REFERENCE_M / distance)
+    return nearer * exp(-2 * extinction * distance) if extinction else nearer
+
+
+def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
+    """Return the extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
+
+    At the meteorological visibility, a contrast has fallen to 2 %; None is clear air without
+    extinction. The wavelength is the laser's.
+
+    Examples
+    --------
+    >>> round(1000 * extinction(1.0, 905), 2)  # 1/km in fog
+    2.92
+    """
+    v = visibility_km
+    if v is None:
+        return 0.0
+    q = 1.6 if v > 50 else 1.3 if v > 6 else 0.585 * float(power(v, 1 / 3))
+    return float(3.91 / v * float(power(wavelength_nm / 550, -q)) / 1000)

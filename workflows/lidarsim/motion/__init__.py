@@ -1,0 +1,17 @@
+"""Poses and trajectories, their files, and what instruments measure of them."""
+
+from .navigation import Gnss, Imu, Navigation
+from .trajectory import Pose, StaticPose, Stations, Track, Trajectory
+from .trajectory_files import load_trajectory
+
+__all__ = [
+    "Gnss",
+    "Imu",
+    "Navigation",
+    "Pose",
+    "StaticPose",
+    "Stations",
+    "Track",
+    "Trajectory",
+    "load_trajectory",
+]

@@ -1,0 +1,532 @@
+"""IMU and GNSS receiver of a carrier, and their errors, which drift.
+
+Truth comes from the carrier's trajectory: what an inertial measurement unit reports are means over
+its sampling interval, so that sums of its samples are the carrier's rotations and changes of
+velocity, whatever the trajectory does in between. Errors are added: white noise, a Gauss-Markov
+process of first order for a bias that wanders about zero, and a random walk for a bias that wanders
+off
+(IEEE Std 952-1997, annex C; Farrell 2008, chapter 4; Woodman 2007). Parameters are named as in the
+`imu.yaml` of kalibr, whose model is the first and the last of the three.
+
+The rotation of the Earth and its curvature are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import accumulate
+from typing import Annotated, NamedTuple, Protocol
+
+import numpy as np
+from pydantic import Field, Strict
+
+from ..base.arrays import Floats, Ints
+from ..base.declared import MinMax, Seed, Several, UnitShare, about
+from ..base.elementary import arctan2, exp, sin_cos
+from ..base.elementary_scalars import exp_of, sin_cos_of
+from ..base.errors import LidarError
+from ..base.extras import install_command
+from ..base.random_numbers import Purpose, named_seed, normal
+from ..base.validation import checked_fields
+from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
+from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, rotation_sines, velocities
+
+WHITE = Purpose(41, "white noise of an instrument")
+DRIVEN = Purpose(42, "steps of an instrument's bias")
+WALK = Purpose(43, "steps of an instrument's random walk")
+SKEW = Purpose(44, "scale factors of an instrument's axes, and angles between axes")
+OUTAGE = Purpose(45, "drift in outages of GNSS")
+BLOCK = 1 << 14  # samples in a block
+RETURNS_IN_S = 1.0  # time after an outage in which its error falls to 37 %
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-360, le=360)]
+GeodeticPosition = Annotated[
+    tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
+]
+TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
+SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # of an accelerometer
+Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
+Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
+Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
+Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Imu:
+    """An inertial measurement unit on the carrier; without arguments, an ideal unit.
+
+    `mount` is its pose in the carrier frame. Noise is named and measured as in kalibr's `imu.yaml`.
+
+    Raises
+    ------
+    LidarError
+        If a number is outside its range.
+    """
+
+    rate_hz: Annotated[
+        float, about("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
+    ] = 200.0
+    mount: Annotated[Pose, AT_CENTRE, about("pose in the carrier frame")] = CENTRE
+    gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk, rad/s/sqrt(Hz)")] = 0.0
+    gyroscope_bias: Annotated[
+        TurnNoise,
+        about(
+            "standard deviation of a bias that wanders about zero (Gauss-Markov of "
+            "first order), rad/s"
+        ),
+    ] = 0.0
+    gyroscope_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    gyroscope_random_walk: Annotated[
+        TurnNoise, about("random walk of the bias, rad/s^2/sqrt(Hz)")
+    ] = 0.0
+    accelerometer_noise_density: Annotated[
+        SpeedNoise, about("velocity random walk, m/s^2/sqrt(Hz)")
+    ] = 0.0
+    accelerometer_bias: Annotated[
+        SpeedNoise, about("standard deviation of a bias that wanders about zero, m/s^2")
+    ] = 0.0
+    accelerometer_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    accelerometer_random_walk: Annotated[
+        SpeedNoise, about("random walk of the bias, m/s^3/sqrt(Hz)")
+    ] = 0.0
+    scale: Annotated[UnitShare, about("standard deviation of each axis's scale factor")] = 0.0
+    misalignment_deg: Annotated[Skew, about("standard deviation of angles between axes")] = 0.0
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Gnss:
+    """A GNSS receiver on the carrier; without arguments, an ideal receiver.
+
+    `mount` is the pose of its antenna in the carrier frame.
+
+    Raises
+    ------
+    LidarError
+        If a number is outside its range.
+    """
+
+    rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
+    mount: Annotated[Pose, AT_CENTRE, about("pose of the antenna in the carrier frame")] = CENTRE
+    horizontal_m: Annotated[
+        Deviation, about("standard deviation of white noise to the east and north")
+    ] = 0.0
+    vertical_m: Annotated[Deviation, about("standard deviation of white noise, up")] = 0.0
+    drift_horizontal_m: Annotated[
+        Deviation,
+        about(
+            "standard deviation of an error that drifts (Gauss-Markov of first order), "
+            "to the east and north"
+        ),
+    ] = 0.0
+    drift_vertical_m: Annotated[
+        Deviation, about("standard deviation of an error that drifts, up")
+    ] = 0.0
+    drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
+    outages: Annotated[
+        Several[MinMax[Span]],
+        about(
+            "starts and ends, seconds; the IMU bridges outages, without it positions are missing"
+        ),
+    ] = ()
+    origin: Annotated[
+        GeodeticPosition | None,
+        about(
+            "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
+            "world's zero, x to the east and y to the north; by default by world.epsg",
+            [48.7758, 9.1829, 290.0],
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Navigation:
+    """Instruments that measure the carrier's motion, whose samples are written beside the cloud.
+
+    Parameters
+    ----------
+    imu, gnss
+        An IMU and a GNSS receiver, or None.
+
+    Raises
+    ------
+    LidarError
+        If a number is outside its range.
+    """
+
+    imu: Annotated[
+        Imu | None,
+        about(
+            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
+            "/imu/data_raw",
+            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
+        ),
+    ] = None
+    gnss: Annotated[
+        Gnss | None,
+        about(
+            "GNSS receiver: positions in gnss.csv, /gnss/fix",
+            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
+        ),
+    ] = None
+    gravity_m_s2: Annotated[
+        float, about("gravity, downwards along the world's z axis", ge=-100, le=100)
+    ] = 9.80665
+    seed: Annotated[Seed, about("the same seed gives the same errors")] = 0
+
+
+class ImuSamples(NamedTuple):
+    """Consecutive samples of an IMU, in the frame of the IMU."""
+
+    times_ns: Ints  # (k,): end of the interval, since the survey's start
+    rates: Floats  # (k, 3): mean angular velocities over the interval before, rad/s
+    forces: Floats  # (k, 3): mean specific forces, m/s^2: at rest, upwards, gravity
+
+
+class Fixes(NamedTuple):
+    """Consecutive positions of a GNSS receiver's antenna."""
+
+    times_ns: Ints  # (k,): since the survey's start
+    positions: Floats  # (k, 3): metres, scene coordinates
+
+
+class InstrumentedDrive(Protocol):
+    """The properties of a survey that the samples of instruments follow from."""
+
+    @property
+    def navigation(self) -> Navigation | None:
+        """Instruments on the carrier, if any."""
+
+    @property
+    def path(self) -> Trajectory:
+        """Trajectory of the carrier."""
+
+    @property
+    def duration_ns(self) -> float:
+        """Duration in nanoseconds."""
+
+    @property
+    def carrier(self) -> str:
+        """Name of the carrier, for the seeds of its instruments."""
+
+
+def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
+    """Check that instruments can be on a carrier, in a coordinate system.
+
+    Raises
+    ------
+    LidarError
+        If the carrier jumps between poses, or geodetic positions need a missing package.
+    """
+    if path.stations > 1:
+        raise LidarError(
+            f"navigation needs a carrier that drives or stands, and this one jumps between "
+            f"{path.stations} poses: give a trajectory, or one pose."
+        )
+    gnss = navigation.gnss
+    if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
+        raise LidarError(
+            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: "
+            f"{install_command('lidarpool[geo]')}, or give navigation.gnss.origin."
+        )
+
+
+def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSamples]:
+    """Yield the samples of the IMU on a drive, `block` samples at a time.
+
+    A sample ends at each whole multiple of its interval within the drive. Samples do not depend on
+    `block`.
+    """
+    navigation = drive.navigation
+    if navigation is None or navigation.imu is None:
+        return
+    imu = navigation.imu
+    seed = named_seed(navigation.seed, drive.carrier)
+    gyroscopes = _Triad.of_imu(imu, "gyroscope", seed)
+    accelerometers = _Triad.of_imu(imu, "accelerometer", seed)
+    count = math.floor(drive.duration_ns * imu.rate_hz / 1e9 + 1e-6)
+    for first in range(0, count, block):
+        samples = np.arange(first, min(first + block, count))
+        truth = _true_samples(drive.path, imu, navigation.gravity_m_s2, samples)
+        yield ImuSamples(
+            truth.times_ns,
+            gyroscopes.measure(truth.rates, samples),
+            accelerometers.measure(truth.forces, samples),
+        )
+
+
+def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints) -> ImuSamples:
+    """Return the samples of an ideal IMU on a trajectory, by their numbers (k,)."""
+    ends_ns: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
+    motion = _mounted_motion(path, imu.mount, ends_ns)
+    middles = (ends_ns[1:] + ends_ns[:-1]) / 2
+    halfway = _mounted_motion(path, imu.mount, middles).rotations
+    gravity = np.array([0.0, 0.0, -gravity_m_s2])
+    forces = np.diff(motion.velocities, axis=0) * imu.rate_hz - gravity
+    rates = _rotation_vectors(motion.rotations[:-1], motion.rotations[1:]) * imu.rate_hz
+    times_ns = np.rint(ends_ns[1:]).astype(np.int64)
+    return ImuSamples(times_ns, rates, into_axes(forces, halfway))
+
+
+class _Triad(NamedTuple):
+    """Three gyroscopes or accelerometers of an IMU."""
+
+    errors: _Errors
+    axes: Floats | None  # (3, 3): their skewed and scaled axes in the frame of the IMU
+
+    @classmethod
+    def of_imu(cls, imu: Imu, name: str, seed: int) -> _Triad:
+        """Return the «gyroscope»s or the «accelerometer»s of an IMU."""
+        names = ("noise_density", "bias", "bias_time_s", "random_walk")
+        seed = named_seed(seed, name)
+        density, bias, time_s, walk = (getattr(imu, f"{name}_{suffix}") for suffix in names)
+        white = density * math.sqrt(imu.rate_hz)
+        three = np.ones(3)
+        errors = _Errors(seed, 1 / imu.rate_hz, three * white, three * bias, time_s, three * walk)
+        if not (imu.scale or imu.misalignment_deg):
+            return cls(errors, None)
+        sigma = np.where(np.eye(3, dtype=bool), imu.scale, math.radians(imu.misalignment_deg))
+        skews = normal(seed, SKEW, 0, np.arange(9)).reshape(3, 3)
+        return cls(errors, np.eye(3) + sigma * skews)
+
+    def measure(self, truth: Floats, samples: Ints) -> Floats:
+        """Return the measurements (k, 3) of true values (k, 3), the next samples (k,)."""
+        return turned(truth, self.axes) + self.errors.next_errors(samples)
+
+
+def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
+    """Yield the positions of the GNSS receiver on a drive, `block` positions at a time."""
+    navigation = drive.navigation
+    path = drive.path
+    if navigation is None or navigation.gnss is None:
+        return
+    gnss = navigation.gnss
+    errors = _Errors(
+        named_seed(named_seed(navigation.seed, drive.carrier), "gnss"),
+        1 / gnss.rate_hz,
+        np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
+        np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
+        gnss.drift_time_s,
+        np.zeros(3),
+    )
+    count = math.floor(drive.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
+    for first in range(0, count, block):
+        samples = np.arange(first, min(first + block, count))
+        times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)
+        positions = _mounted_motion(path, gnss.mount, times).positions
+        positions = positions + errors.next_errors(samples)
+        for number, (begin, end) in enumerate(gnss.outages):
+            if navigation.imu is None:
+                received = (times < begin * 1e9) | (times >= end * 1e9)
+                times = times[received]
+                positions = positions[received]
+            else:
+                since_s = times / 1e9 - begin
+                positions += _bridging_errors(
+                    navigation.imu, errors.seed, number, since_s, end - begin
+                )
+        yield Fixes(np.rint(times).astype(np.int64), positions)
+
+
+def _bridging_errors(
+    imu: Imu, seed: int, number: int, since_s: Floats, duration_s: float
+) -> Floats:
+    """Return the errors of positions (k, 3) while an IMU bridges an outage, and after the outage.
+
+    A bias b grows to b t^2 / 2, a velocity random walk N to N sqrt(t^3 / 3) (Groves 2013).
+
+    Parameters
+    ----------
+    number
+        Number of the outage, for the random numbers.
+    since_s
+        (k,): seconds since the start of the outage.
+    duration_s
+        Duration of the outage.
+    """
+    elapsed = np.clip(since_s, 0, duration_s)[:, None]
+    remaining = exp(np.minimum(duration_s - since_s, 0) / RETURNS_IN_S)[:, None]
+    bias, walk = (normal(seed, OUTAGE, number, np.arange(3), k) for k in range(2))
+    by_bias = imu.accelerometer_bias * bias * (elapsed * elapsed / 2)
+    by_walk = imu.accelerometer_noise_density * walk * (elapsed * np.sqrt(elapsed / 3))
+    return np.asarray(remaining * (by_bias + by_walk))
+
+
+class _Motion(NamedTuple):
+    """Motion of an instrument, in the scene frame."""
+
+    positions: Floats  # (k, 3): metres
+    rotations: Floats  # (k, 3, 3)
+    velocities: Floats  # (k, 3): m/s
+
+
+def _mounted_motion(path: Trajectory, mount: Pose, times_ns: Floats) -> _Motion:
+    """Return the motion of an instrument on a carrier at times (k,), nanoseconds."""
+    times_ns = np.minimum(times_ns, path.duration_ns)
+    positions, rotations = full_poses(path, 0, times_ns)
+    speeds, rates = velocities(path, 0, times_ns)
+    levers = applied(rotations, mount.position)
+    return _Motion(
+        positions + levers,
+        matmul(rotations, mount.rotation_matrix),
+        speeds + np.cross(rates, levers),
+    )
+
+
+def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
+    """Return the rotation vectors (k, 3), radians, from `earlier` to `later` rotations (k, 3, 3).
+
+    The vectors are in the frames of the earlier rotations.
+    """
+    change = matmul(earlier.transpose(0, 2, 1), later)
+    sines = rotation_sines(change)
+    sines /= 2
+    sine = length(sines)
+    cosine = (change[:, 0, 0] + change[:, 1, 1] + change[:, 2, 2] - 1) / 2
+    scale = np.where(sine > 1e-9, arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
+    return np.asarray(sines * scale[:, None])
+
+
+class _Errors:
+    """White noise, a Gauss-Markov process and a random walk along three axes.
+
+    Both processes are sums over hashes from the first sample on, in one order: samples must be
+    requested in order, in blocks of any size.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        step_s: float,
+        white: Floats,  # (3,): standard deviation of a sample
+        bias: Floats,  # (3,): standard deviation of the Gauss-Markov process
+        bias_time_s: float,
+        walk: Floats,  # (3,): standard deviation of the random walk after a second
+    ) -> None:
+        self.seed = seed
+        self._white = white
+        self._bias = bias
+        self._walk = walk * math.sqrt(step_s)
+        self._persistence = exp_of(-step_s / bias_time_s)
+        self._driven = bias * math.sqrt(1 - self._persistence * self._persistence)
+        self._biases: Floats = np.zeros(3)  # of the last sample
+        self._walked: Floats = np.zeros(3)
+
+    def next_errors(self, samples: Ints) -> Floats:
+        """Return the errors of the next samples (k,), by their numbers: (k, 3)."""
+        errors = np.zeros((len(samples), 3))
+        if self._white.any():
+            errors += self._white * self._normal(WHITE, samples)
+        if self._bias.any():
+            noise = self._normal(DRIVEN, samples)
+            noise[samples > 0] *= self._driven
+            noise[samples == 0] *= self._bias  # the process has run for long before the drive
+            persistence = self._persistence
+            for axis in range(3):
+                biases = accumulate(
+                    noise[:, axis].tolist(),
+                    lambda bias, step: persistence * bias + step,
+                    initial=float(self._biases[axis]),
+                )
+                errors[:, axis] += (values := np.array(list(biases))[1:])
+                self._biases[axis] = values[-1]
+        if self._walk.any():
+            noise = self._walk * self._normal(WALK, samples)
+            noise[0] += self._walked
+            walked = np.cumsum(noise, axis=0)
+            self._walked = walked[-1]
+            errors += walked
+        return errors
+
+    def _normal(self, purpose: Purpose, samples: Ints) -> Floats:
+        """Return normal deviates for samples (k,) along each axis: (k, 3)."""
+        high_bits, low_bits = np.divmod(samples, 1 << 32)
+        return np.stack(
+            [normal(self.seed, purpose, high_bits, low_bits, axis) for axis in range(3)], axis=1
+        )
+
+
+def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Return latitudes and longitudes, degrees, and ellipsoidal heights, metres: (k, 3).
+
+    Through geocentric coordinates of WGS 84; Bowring's (1985) latitude is exact to 1e-9 degrees
+    below a height of 10 km.
+
+    Parameters
+    ----------
+    positions
+        (k, 3): metres east, north and up of the origin.
+    origin
+        Latitude and longitude, degrees, and ellipsoidal height, metres.
+    """
+    x, y, z = _geocentric(positions, origin)
+    level = hypot(x, y)
+    semi_minor = _A * math.sqrt(1 - _E2)
+    distance = hypot(z, level)
+    # First the reduced latitude, then the geodetic latitude.
+    slope = (semi_minor * z) / (_A * level) * (1 + _E2 / (1 - _E2) * semi_minor / distance)
+    cos = 1 / np.sqrt(1 + slope * slope)
+    sin = slope * cos
+    rise = z + _E2 / (1 - _E2) * semi_minor * (sin * sin * sin)
+    latitude = arctan2(rise, level - _E2 * _A * (cos * cos * cos))
+    sin, cos = sin_cos(latitude)
+    radius = _A / np.sqrt(1 - _E2 * sin * sin)
+    height = level * cos + z * sin - _A * _A / radius
+    return np.column_stack([np.degrees(latitude), np.degrees(arctan2(y, x)), height])
+
+
+def _geocentric(
+    positions: Floats, origin: tuple[float, float, float]
+) -> tuple[Floats, Floats, Floats]:
+    """Return geocentric x, y and z (k,), metres, of positions (k, 3) in metres.
+
+    Positions are east, north and up of the origin: latitude and longitude, degrees, and ellipsoidal
+    height, metres.
+    """
+    sp, cp = sin_cos_of(math.radians(origin[0]))
+    sl, cl = sin_cos_of(math.radians(origin[1]))
+    radius = _A / math.sqrt(1 - _E2 * sp * sp)
+    east, north, up = positions.T
+    x = (radius + origin[2]) * cp * cl - sl * east - sp * cl * north + cp * cl * up
+    y = (radius + origin[2]) * cp * sl + cl * east - sp * sl * north + cp * sl * up
+    z = (radius * (1 - _E2) + origin[2]) * sp + cp * north + sp * up
+    return x, y, z
+
+
+def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Return positions east, north and up of an origin (k, 3), metres; inverse of `geodetic`.
+
+    Parameters
+    ----------
+    coordinates
+        (k, 3): latitudes and longitudes, degrees, and ellipsoidal heights, metres.
+    origin
+        Latitude and longitude, degrees, and ellipsoidal height, metres.
+    """
+    (sp, cp), (sl, cl) = (sin_cos_of(math.radians(angle)) for angle in origin[:2])
+    x, y, z = (_cartesian(coordinates) - _cartesian(np.array([origin], np.float64))).T
+    east = cl * y - sl * x
+    outward = cl * x + sl * y
+    return np.column_stack([east, cp * z - sp * outward, cp * outward + sp * z])
+
+
+def _cartesian(coordinates: Floats) -> Floats:
+    """Return geocentric coordinates (k, 3), metres, of latitudes, longitudes and heights (k, 3)."""
+    latitude, longitude, height = coordinates.T
+    sp, cp = sin_cos(np.radians(latitude))
+    sl, cl = sin_cos(np.radians(longitude))
+    radius = _A / np.sqrt(1 - _E2 * sp * sp)
+    level = (radius + height) * cp
+    return np.column_stack([level * cl, level * sl, (radius * (1 - _E2) + height) * sp])
+
+
+# WGS 84: semi-major axis in metres, flattening, and square of the eccentricity.
+_A = 6378137.0
+_F = 1 / 298.257223563
+_E2 = _F * (2 - _F)

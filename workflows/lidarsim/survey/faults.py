@@ -1,0 +1,145 @@
+"""Faults of sensors, to test programs that read sensor data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ..base.arrays import Bools, Floats, Ints
+from ..base.declared import AngleDeg, MinMax, Several, Text, Two, UnitShare, about
+from ..base.errors import LidarError, prefixed
+from ..base.random_numbers import Purpose, uniform
+from ..base.validation import checked_fields, without_numpy
+from ..base.words import did_you_mean
+from ..sensor.sensor import Sensor
+
+PACKET = Purpose(61, "whether a packet is lost")
+FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
+Time = Annotated[float, Field(ge=0, le=1e9)]  # seconds since the survey's start
+Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+# {kind: fields that only this kind has}; sectors may be left out
+_KIND_FIELDS: dict[str, tuple[str, ...]] = {
+    "dirt": ("transmission", "azimuth_deg", "elevation_deg"),
+    "dead_channels": ("channels",),
+    "dropped_packets": ("share", "packet"),
+    "frozen": (),
+    "time_jump": ("by_s",),
+}
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Fault:
+    """A fault of a sensor, for a time; labels keep the truth, and list the faults.
+
+    Raises
+    ------
+    LidarError
+        If a number is outside its range, or its fields do not fit together.
+    """
+
+    kind: Annotated[FaultKind, about("kind of fault")]
+    from_s: Annotated[Time, about("start, seconds since the survey's start")] = 0.0
+    to_s: Annotated[Time | None, about("end; by default the survey's end")] = None
+    sensor: Annotated[Text | None, about("name of the faulty sensor; by default all")] = None
+    transmission: Annotated[UnitShare | None, about("of dirt: share of energy, out and back")] = (
+        None
+    )
+    azimuth_deg: Annotated[
+        Two[AngleDeg] | None, about("of dirt: start and end, counter-clockwise")
+    ] = None
+    elevation_deg: Annotated[MinMax[AngleDeg] | None, about("of dirt: lowest and highest")] = None
+    channels: Annotated[Channels | None, about("dead channels; 0 is the lowest")] = None
+    share: Annotated[UnitShare | None, about("share of packets that are lost")] = None
+    packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
+    by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.words().items():  # labels have them as JSON
+            listed = np.iterable(value) and not isinstance(value, str)
+            object.__setattr__(self, name, without_numpy(tuple(value) if listed else value))
+        kind_fields = _KIND_FIELDS[self.kind]
+        present = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
+        optional = {name for name in kind_fields if name.endswith("_deg")}
+        for name in sorted((present ^ {*kind_fields}) - optional):
+            advice = f"leave {name} out" if name in present else f"give {name}"
+            takes = f"takes {', '.join(kind_fields)}" if kind_fields else "has times only"
+            raise LidarError(f"{self.kind} {takes}: {advice}.")
+        if self.to_s is not None and self.to_s <= self.from_s:
+            raise LidarError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
+
+    def words(self) -> dict[str, Any]:
+        """Return the fields that are not None, for labels: {field: value}."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @property
+    def span_ns(self) -> tuple[float, float]:
+        """Start and end of the fault, nanoseconds since the survey's start."""
+        return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
+
+    def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
+        """Return whether the fault acts at times (n,), or in intervals to `stops_ns` (n,)."""
+        stops_ns = starts_ns if stops_ns is None else stops_ns
+        begin, end = self.span_ns
+        return np.asarray((stops_ns >= begin) & (starts_ns < end))
+
+    def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
+        """Return whether firings (n,) are in dropped packets, at any time.
+
+        `number` is the number of this fault in its survey, `seed` that of the sensor's noise.
+        """
+        packets = firings // (self.packet or 1)
+        return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
+
+    def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
+        """Return the shift of stamps at times (n,), nanoseconds."""
+        return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
+
+
+def check_faults(
+    faults: Sequence[Fault], sensors: Mapping[str, Sensor], duration_ns: float
+) -> None:
+    """Check that faults fit the sensors and the duration of a survey.
+
+    `sensors` are {name: sensor}.
+
+    Raises
+    ------
+    LidarError
+        If a fault does not fit.
+    """
+    for number, fault in enumerate(faults):
+        with prefixed(f"faults[{number}]"):
+            _check_fault(fault, sensors, duration_ns / 1e9)
+
+
+def _check_fault(fault: Fault, sensors: Mapping[str, Sensor], duration_s: float) -> None:
+    """Check that a fault fits the sensors {name: sensor} and the duration of a survey."""
+    faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
+    if not faulty:
+        advice = " Leave it out."
+        if any(sensors):
+            advice = f" There are {', '.join(sensors)}."
+        hint = did_you_mean(str(fault.sensor), sensors) or advice
+        raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
+    first_firing = np.zeros(1, np.int64)
+    starts_ns = [sensor.begins_ns(first_firing)[0] + sensor.lead_ns for sensor in faulty]
+    if fault.kind == "frozen" and fault.from_s <= max(starts_ns) / 1e9:
+        raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
+    if fault.from_s > duration_s:
+        raise LidarError(
+            f"from_s is {fault.from_s:g}, and the survey lasts {duration_s:.6g} s: make "
+            "from_s smaller."
+        )
+    channels = min(sensor.channels for sensor in faulty)
+    highest = max(fault.channels or (0,))
+    if highest >= channels:
+        raise LidarError(f"there is no channel {highest}, but 0 to {channels - 1}.")

@@ -1,0 +1,724 @@
+"""A survey: sensors on a carrier, its trajectory, and the resulting scans."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cached_property, partial
+from itertools import accumulate
+from math import ceil
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AwareDatetime, Field, Strict
+
+from ..base.arrays import Floats, Ints
+from ..base.declared import FILLED_IN, Names, Several, about, written_as
+from ..base.errors import LidarError
+from ..base.notebook import picture_of, table_of
+from ..base.signatures import ReadableSignature
+from ..base.validation import checked_fields, shown
+from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
+from ..base.words import listed, plural, scans_in_words
+from ..columns.table import (
+    COORDINATES,
+    OPTIONAL,
+    TABLE,
+    Column,
+    optional_columns,
+    stored,
+    waveform_column,
+)
+from ..media.materials import ClassNames, Material
+from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
+from ..motion.navigation import Navigation, check_navigation
+from ..motion.trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
+from ..sensor.noise import MAX_ALARMS, Noise
+from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
+from ..sensor.sensor import Sensor
+from .faults import Fault, FaultKind, check_faults
+
+STEPS = 36  # default at each pose: one revolution of most sensors
+MAX_STEPS = 10_000_000  # along a trajectory
+StepCount = Annotated[int, Field(ge=1, le=MAX_STEPS)]
+OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
+MAX_SENSORS = 255  # of the type of the column
+MAX_PARTICLES = 100  # that a pulse may return from
+MAX_RAYS = 1 << 32  # of a scan, which is cast in one call
+PRECISION_M = 0.01  # of points, if a sensor states no resolution
+START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
+# EPSG code of the world's coordinate system.
+EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
+MAX_DURATION_NS = 2.0**63  # of the type of the column time: 292 years
+
+
+def nanoseconds(moment: datetime) -> int:
+    """Return the nanoseconds from 1970-01-01 UTC to a time with a time zone."""
+    return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Mounted:
+    """A sensor on a carrier.
+
+    Parameters
+    ----------
+    sensor
+        The lidar.
+    mount
+        Pose in the carrier frame.
+    name
+        Name, needed with several sensors; part of all random numbers of the sensor.
+    steps
+        Time steps from each station; by default the survey's.
+    returns, noise
+        Instead of the survey's, which by default are the sensor's.
+    unseen
+        Names of objects that the sensor does not see, with * and ?: its rays pass through these
+        objects, such as the sensor's own housing.
+    """
+
+    sensor: Sensor
+    mount: Pose = CENTRE
+    name: str = ""
+    steps: StepCount | None = None
+    returns: Returns | None = None
+    noise: Noise | None = None
+    unseen: Names = ()
+
+    def __post_init__(self) -> None:
+        names = (self.unseen,) if isinstance(self.unseen, str) else tuple(self.unseen)
+        object.__setattr__(self, "unseen", names)
+
+
+@dataclass(frozen=True)
+class ScanSpec:
+    """The firings of a sensor's time step: the unit of ordering and exactly-once delivery.
+
+    Parameters
+    ----------
+    scan
+        Number in the survey.
+    station
+        Station of the trajectory, see `Trajectory`.
+    firings
+        Half-open range of firings, counted from the start of the station.
+    start_ns
+        Start of the station, nanoseconds since the survey's start.
+    sensor
+        Number of the sensor.
+    channels
+        Number of the sensor's channels.
+    ahead
+        Number of scans by which its random numbers are ahead of its number.
+    repeats
+        For a scan of a frozen sensor: the first scan of the sweep that is sent again, and the first
+        scan of the sweep that it replaces.
+    """
+
+    __signature__ = ReadableSignature()
+
+    scan: int
+    station: int
+    firings: tuple[int, int]
+    start_ns: int = 0
+    sensor: int = 0
+    channels: int = 1
+    ahead: int = 0
+    repeats: tuple[int, int] | None = None
+
+    @property
+    def ray_count(self) -> int:
+        """Number of rays in this scan."""
+        return (self.firings[1] - self.firings[0]) * self.channels
+
+    def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
+        """Return the scan with another start of the station, and other random numbers."""
+        spec = object.__new__(type(self))  # `replace` takes five times as long
+        vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
+        return spec
+
+
+@dataclass(frozen=True, kw_only=True)
+@checked_fields
+class CloudOptions:
+    """Selection of the hits that become points, and the columns of points.
+
+    In Python a column may also be a user's `Column`.
+    """
+
+    keep_every: Annotated[
+        int,
+        FILLED_IN,
+        about(
+            "keep every n-th hit of a scan; by default every hit, of a scene with the "
+            "default objects every 5th",
+            5,
+            ge=1,
+            le=1_000_000,
+        ),
+    ] = None  # type: ignore[assignment]
+    precision_m: Annotated[
+        Precision,
+        FILLED_IN,
+        about(
+            "step in metres that points are rounded to; by default the sensor's resolution of "
+            "ranges; if it states none 0.001, with the default objects and in Python 0.01",
+            0.001,
+        ),
+    ] = None  # type: ignore[assignment]
+    coordinates: Annotated[
+        Literal[COORDINATES],  # type: ignore[valid-type]
+        about("world; or sensor: the sensor frame at the firing, as in sensor drivers"),
+    ] = "world"
+    columns: Annotated[
+        Sequence[str | Column],
+        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # those always there, too
+        about(
+            "columns in addition to x, y, z, scan, channel and object: "
+            + ", ".join(OPTIONAL_NAMES),
+            ["time", "range", "intensity"],
+        ),
+    ] = ()
+    waveform_samples: Annotated[
+        int,
+        about(
+            "samples of the waveform that are recorded around each return, for LAS and "
+            "LAZ; 0 for none",
+            80,
+            ge=0,
+            le=4096,
+        ),
+    ] = 0
+    start: Annotated[
+        datetime | None,
+        written_as(Annotated[AwareDatetime, Strict(False)] | None),
+        about(
+            "when the survey starts, with its time zone, for LAS, LAZ and bags",
+            "2026-11-21T10:00:00Z",
+        ),
+    ] = None
+
+
+class SensorSweeps(NamedTuple):
+    """Sweeps of a sensor in a survey."""
+
+    firsts: Ints  # (s,): first scan
+    starts_ns: Floats  # (s,): start of the first firing, since the survey's start
+    stops_ns: Floats  # (s,): start of the last firing
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Survey(CloudOptions, Weather):
+    """All scans of a carrier's sensors.
+
+    Scans of a sensor are in time order, and all scans of a sensor come before the scans of the next
+    sensor, so that a batch is one cast, and each part belongs to one sensor or two. The column
+    `time` shows which points are simultaneous.
+
+    Several sensors always have the column `sensor`. Without materials, all objects scatter half of
+    the light.
+
+    Parameters
+    ----------
+    sensor
+        The lidar of a survey with one sensor, without a mount.
+    poses
+        Poses, one after the other: `Pose`, or x, y, z.
+    steps
+        Time steps from each pose, 36 by default; along a `Track` by default all that it lasts for.
+    trajectory
+        Instead of `poses`, if the carrier moves.
+    sensors
+        Instead of `sensor`: `Mounted`, several with a name each.
+    materials
+        Materials of objects, and of faces by the names of their materials; the first entry for a
+        face counts.
+    returns
+        Sub-rays of a beam, and the returns of a pulse that are reported; by default the sensor's.
+    noise
+        Noise of ranges and angles, and lost returns; by default the sensor's.
+    navigation
+        IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+    faults
+        Faults of sensors, such as dirt or lost packets.
+    classes
+        Names of semantic classes, {number: name}, for reports and files; with them the cloud has
+        the column `class`.
+    epsg
+        EPSG code of the world's coordinate system, which files that can hold one state;
+        `Scene.georeferenced` places a scene with local coordinates in it.
+    **options
+        The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
+
+    Raises
+    ------
+    LidarError
+        If a number is out of range, poses are missing, a column is unknown, or the trajectory does
+        not last long enough.
+
+    Examples
+    --------
+    >>> survey = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+    >>> survey.scan_count, survey.ray_count
+    (108, 120000)
+    """
+
+    sensor: Sensor = field(default_factory=Sensor.grid)
+    poses: Sequence[Any] = ()
+    steps: StepCount | None = None
+    trajectory: Trajectory | None = None
+    sensors: Sequence[Mounted] = ()
+    materials: Sequence[Material] = ()
+    returns: Annotated[Returns, FILLED_IN] = None  # type: ignore[assignment]
+    noise: Annotated[Noise, FILLED_IN] = None  # type: ignore[assignment]
+    navigation: Navigation | None = None
+    faults: Sequence[Fault] = ()
+    classes: ClassNames = field(default_factory=dict, compare=False)
+    epsg: EpsgCode | None = None
+
+    def __post_init__(self) -> None:
+        self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
+        self._set(trajectory=self._trajectory(), materials=tuple(self.materials))
+        self._check_names()
+        self._fill_in("returns", Returns())
+        self._fill_in("noise", Noise())
+        if self.sensors:
+            self._set(sensor=self.sensors[0].sensor)
+        added = {"sensor": len(self.sensors) > 1, "class": self.classes}
+        columns = (*self.columns, *(name for name, present in added.items() if present))
+        self._set(columns=optional_columns(columns), classes=dict(sorted(self.classes.items())))
+        finest = min(mounted.sensor.optics.resolution_m or PRECISION_M for mounted in self.carried)
+        for name, default in {"keep_every": 1, "precision_m": finest}.items():
+            if getattr(self, name) is None:
+                self._set(**{name: default})
+        self._check_values()
+        if self.steps is None and self.path.duration_ns == float("inf"):
+            self._set(steps=STEPS)
+        for carried, steps in zip(self.carried, self.steps_each, strict=True):
+            self._check_duration(carried.sensor, steps)
+        sensors = {carried.name: carried.sensor for carried in self.carried}
+        check_faults(self.faults, sensors, self.duration_ns)
+
+    def _repr_html_(self) -> str:
+        """Return the table of the main figures, and a picture if a package draws surveys."""
+        models = [
+            f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
+            for carried in self.carried
+        ]
+        poses = plural(self.path.stations, "position")
+        if self.path.moves:
+            poses = "along a trajectory"
+        rows = {
+            "survey": f"{plural(len(models), 'sensor')}: {listed(models, 8)}",
+            "poses": poses,
+            "scans": scans_in_words(self.scan_count, self.sweep_count),
+            "rays": f"{self.ray_count:,}",
+            "duration": f"{self.duration_ns / 1e9:.6g} s",
+            "columns": ", ".join(column.name for column in self.stored_columns),
+        }
+        return table_of(rows.items()) + picture_of(self)
+
+    def _fill_in(self, name: str, default: Returns | Noise) -> None:
+        """Set the returns or the noise of all sensors, if the survey has none."""
+        if getattr(self, name) is not None:
+            return
+        if self.sensors:
+            sensors = [
+                replace(mounted, **{name: getattr(mounted, name) or getattr(mounted.sensor, name)})
+                for mounted in self.sensors
+            ]
+            self._set(sensors=tuple(sensors))
+        else:
+            default = getattr(self.sensor, name) or default
+        self._set(**{name: default})
+
+    def _set(self, **fields: Any) -> None:
+        """Set fields of the frozen survey."""
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def _trajectory(self) -> Trajectory:
+        """Return the trajectory, or the poses as stations; LidarError for both or neither."""
+        if self.trajectory is None:
+            if not self.poses:
+                raise LidarError("A survey needs at least one pose to scan from.")
+            return Stations(tuple(self.poses))
+        if self.poses and self.trajectory != Stations(tuple(self.poses)):
+            raise LidarError("A survey has either poses or a trajectory, not both.")
+        return self.trajectory
+
+    def _check_names(self) -> None:
+        """Check that sensors have different names, and are not too many."""
+        names = [carried.name for carried in self.sensors]
+        if len(names) > MAX_SENSORS or len({*names}) < len(names):
+            raise LidarError(
+                f"A survey has at most {MAX_SENSORS} sensors, each with a name of its own; given: "
+                f"{', '.join(names[:10])}."
+            )
+
+    def _check_values(self) -> None:
+        """Check that options fit together and to the sensors."""
+        if self.epsg in WORLD_EPSG:
+            raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
+        if self.navigation is not None:
+            check_navigation(self.navigation, self.path, self.epsg)
+        if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
+            raise LidarError(
+                f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
+                "2026-11-21T10:00:00Z."
+            )
+        for carried, returns in zip(self.carried, self.returns_each, strict=True):
+            returns.divergence(carried.sensor.optics)  # LidarError for sub-rays without divergence
+            self._check_waveform(carried.sensor, returns)
+        for number, noise in enumerate(self.noise_each):
+            _check_noise(noise, self.carried[number].sensor)
+            if noise.crosstalk:
+                self._check_crosstalk(number)
+        if self.spray_g_m3 and not self.wet:
+            raise LidarError(
+                "spray_g_m3 is of wheels on wet ground, and none is: give wet as well, 0 to 1."
+            )
+        if self.returns_light or self.spray_g_m3:
+            for number in range(len(self.carried)):
+                self._check_air(number)
+
+    def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
+        """Check that the samples of waveforms suit the pulse of a sensor, and LAS."""
+        if returns.waveform != "none" or self.waveform_samples:
+            sigma_ns = returns.system_ns(sensor.optics)
+            min_samples = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
+            if 0 < self.waveform_samples < min_samples:
+                raise LidarError(
+                    f"waveform_samples is {self.waveform_samples}, and one echo takes "
+                    f"{min_samples} samples of {returns.sample_ns:g} ns: record as many at least."
+                )
+        if self.waveform_samples and abs(returns.sample_ns * 1000 % 1 - 0.5) < 0.5 - 1e-6:
+            raise LidarError(
+                f"returns.sample_ns is {returns.sample_ns:g}, and LAS records whole "
+                f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
+            )
+
+    def _check_crosstalk(self, number: int) -> None:
+        """Check that the survey has several sensors, with a greatest range and a divergence."""
+        if len(self.carried) == 1:
+            raise LidarError(
+                "noise.crosstalk needs several sensors, and this survey has one: give sensors."
+            )
+        for carried in self.carried:
+            if not carried.sensor.max_range_m < float("inf"):
+                raise LidarError(
+                    f"noise.crosstalk needs sensors with a greatest range, and {carried.name} has "
+                    "none: give its max_range_m."
+                )
+        if not self.returns_each[number].divergence(self.carried[number].sensor.optics):
+            raise LidarError(
+                "noise.crosstalk needs a field of view as wide as the beam, and "
+                f"{self.carried[number].name} has no divergence: give returns.divergence_mrad."
+            )
+
+    def _check_air(self, number: int) -> None:
+        """Check that a sensor's returns from the air can be computed, and are not too many."""
+        carried = self.carried[number]
+        sensor = carried.sensor
+        name = f" of {carried.name}" if carried.name else ""
+        if self.noise_each[number].detection_range_m is None:
+            missing = "is not given" if carried.noise is None else "its data sheet does not state"
+            guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
+            raise LidarError(
+                f"Returns from rain, snow, spray, dust or fog need noise.detection_range_m{name}, "
+                f"the range at 10 % reflectance, which {missing}: write what is known of it, or "
+                f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
+            )
+        divergences = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
+        if (self.particles or self.spray_g_m3) and divergences == (None, None):
+            raise LidarError(
+                f"Rain, snow and spray need the width of the beam{name}: give "
+                "returns.divergence_mrad."
+            )
+        if (particle_count := self.mean_particles(number)) > MAX_PARTICLES:
+            raise LidarError(
+                f"A pulse{name} would return from {particle_count:,.0f} drops or flakes, more than "
+                f"{MAX_PARTICLES}: make rain_mm_h, snow_mm_h or noise.detection_range_m smaller."
+            )
+
+    def _check_duration(self, sensor: Sensor, steps: int) -> None:
+        """Check that a sensor's steps fit into the trajectory, its rays and times into numbers."""
+        needed_s = _last_firing_ns(sensor, steps) / 1e9
+        available_s = self.path.duration_ns / 1e9
+        if needed_s > available_s:
+            raise LidarError(
+                f"steps {steps} take until {needed_s:.6g} s and the trajectory lasts "
+                f"{available_s:.6g} s, {needed_s - available_s:.6g} s less: take fewer steps, or "
+                "leave them out for as many as it lasts."
+            )
+        first, stop = sensor.firings(0)
+        if (rays := (stop - first) * sensor.channels) > MAX_RAYS:
+            raise LidarError(
+                f"A scan would have {rays:,} rays, more than {MAX_RAYS:,}: make step_deg smaller, "
+                "or take fewer rays."
+            )
+        duration_ns = firing_start_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
+        if not duration_ns < MAX_DURATION_NS:
+            raise LidarError(
+                f"The survey would last {duration_ns / 1e9:.3g} s, and times are counted in "
+                "nanoseconds for 292 years: make rate_hz larger, or start_s or steps smaller."
+            )
+
+    @cached_property
+    def path(self) -> Trajectory:
+        """The trajectory, or the poses as stations."""
+        assert self.trajectory is not None  # of the poses by default
+        return self.trajectory
+
+    @cached_property
+    def carried(self) -> tuple[Mounted, ...]:
+        """The sensors with their mounts, also of a survey with `sensor`."""
+        return tuple(self.sensors) or (Mounted(self.sensor),)
+
+    @property
+    def carrier(self) -> str:
+        """Name of the carrier, for the seeds of its instruments: the name of its first sensor."""
+        return self.carried[0].name
+
+    @cached_property
+    def returns_each(self) -> tuple[Returns, ...]:
+        """Returns that each sensor reports."""
+        return tuple(carried.returns or self.returns for carried in self.carried)
+
+    @cached_property
+    def noise_each(self) -> tuple[Noise, ...]:
+        """Noise of each sensor, with a seed by the sensor's name."""
+        return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
+
+    @cached_property
+    def stored_columns(self) -> tuple[Column, ...]:
+        """All columns that a part of the cloud stores."""
+        columns = stored(optional_columns(self.columns))
+        if self.waveform_samples:
+            columns = (*columns, waveform_column(self.waveform_samples))
+        return columns
+
+    def extinction(self, sensor: Sensor) -> float:
+        """Return the extinction of the air at a sensor's wavelength, 1/m."""
+        return self.extinction_at(sensor.optics.wavelength_nm)
+
+    def air(self, number: int) -> Air:
+        """Return the air as a sensor sees it, by the sensor's number."""
+        optics = self.carried[number].sensor.optics
+        divergence = self.returns_each[number].divergence(optics)
+        overlap_m = self.noise_each[number].overlap_m
+        exit_m = self.returns_each[number].exit_m(optics) or EXIT_M
+        return Air(self.extinction_at(optics.wavelength_nm), exit_m, divergence, overlap_m)
+
+    def mean_particles(self, number: int) -> float:
+        """Return the mean number of drops and flakes that a pulse of a sensor may return from."""
+        if not self.particles:
+            return 0.0
+        sensor = self.carried[number].sensor
+        min_energy = FAINTEST * self.noise_each[number].threshold
+        air = self.air(number)
+        span = reach(sensor.min_range_m, sensor.max_range_m)
+        return sum(air.mean_particles(kind, min_energy, *span) for kind in self.particles)
+
+    @cached_property
+    def steps_each(self) -> tuple[int, ...]:
+        """Number of time steps of each sensor at a station."""
+        counts = []
+        for carried in self.carried:
+            if steps := carried.steps or self.steps:
+                counts.append(steps)
+                continue
+            candidates = range(1, MAX_STEPS + 2)
+            end_ns = partial(_last_firing_ns, carried.sensor)
+            counts.append(bisect_right(candidates, self.path.duration_ns, key=end_ns))
+            if counts[-1] > MAX_STEPS:
+                raise LidarError(
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and "
+                    f"{MAX_STEPS:,} time steps of the sensor, the limit of a survey, take "
+                    f"{end_ns(MAX_STEPS) / 1e9:.6g} s: give duration_s or steps for a part of it, "
+                    "or a larger step_deg."
+                )
+            if not counts[-1]:
+                raise LidarError(
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "
+                    f"of the sensor takes until {end_ns(1) / 1e9:.6g} s."
+                )
+        return tuple(counts)
+
+    @cached_property
+    def _firsts(self) -> list[int]:
+        """First scan of each sensor, and the number of scans."""
+        return [0, *accumulate(steps * self.path.stations for steps in self.steps_each)]
+
+    @property
+    def scan_count(self) -> int:
+        """Number of scans."""
+        return self._firsts[-1]
+
+    @cached_property
+    def sweeps_each(self) -> tuple[SensorSweeps, ...]:
+        """Sweeps of each sensor."""
+        sweeps = []
+        stations = np.arange(self.path.stations)[:, None]
+        for number, carried in enumerate(self.carried):
+            sensor = carried.sensor
+            steps = self.steps_each[number]
+            base = self._firsts[number]
+            firsts = np.flatnonzero(np.diff(sensor.revolutions(np.arange(steps)), prepend=-1))
+            first_firings = [sensor.firings(step)[0] for step in firsts.tolist()]
+            last_firings = [
+                sensor.firings(step - 1)[1] - 1 for step in [*firsts[1:].tolist(), steps]
+            ]
+            starts_ns = sensor.begins_ns(np.array(first_firings)) + sensor.lead_ns
+            stops_ns = sensor.begins_ns(np.array(last_firings)) + sensor.lead_ns
+            sweeps.append(
+                SensorSweeps(
+                    (base + stations * steps + firsts).ravel(),
+                    (stations * self.station_ns + starts_ns).ravel(),
+                    (stations * self.station_ns + stops_ns).ravel(),
+                )
+            )
+        return tuple(sweeps)
+
+    @cached_property
+    def sweep_stops(self) -> Ints:
+        """Scan after the last scan of each sweep, ascending: int64 (sweeps,)."""
+        firsts = np.concatenate([sweeps.firsts for sweeps in self.sweeps_each])
+        return np.append(firsts[1:], self.scan_count)
+
+    @property
+    def sweep_count(self) -> int:
+        """Number of sweeps: revolutions, or frames of sensors whose heads do not rotate.
+
+        The last sweep of a sensor at a station may be a part of a revolution.
+        """
+        return sum(len(sweeps.firsts) for sweeps in self.sweeps_each)
+
+    def sweeps_within(self, start: int, stop: int) -> int:
+        """Return the number of sweeps whose last scan is among scans `start` to `stop` - 1."""
+        before, until = np.searchsorted(self.sweep_stops, (start, stop), "right")
+        return int(until - before)
+
+    @property
+    def ray_count(self) -> int:
+        """Number of rays in all scans."""
+        rays = (
+            carried.sensor.firings(steps - 1)[1] * carried.sensor.channels
+            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+        )
+        return self.path.stations * sum(rays)
+
+    @cached_property
+    def station_ns(self) -> int:
+        """Duration of a station, nanoseconds: until the last sensor is done."""
+        return max(
+            round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
+            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+        )
+
+    @property
+    def duration_ns(self) -> float:
+        """Time from the survey's start to the start of the last firing, nanoseconds."""
+        pairs = zip(self.carried, self.steps_each, strict=True)
+        last = max(_last_firing_ns(carried.sensor, steps) for carried, steps in pairs)
+        return (self.path.stations - 1) * self.station_ns + last
+
+    def scan(self, index: int) -> ScanSpec:
+        """Return scan `index`; scans are in the order of sensors, stations and steps."""
+        sensor = bisect_right(self._firsts, index) - 1
+        station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
+        lidar = self.carried[sensor].sensor
+        start = station * self.station_ns
+        return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
+
+    def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
+        """Return the faults of certain kinds of a sensor: {index in `faults`: fault}."""
+        name = self.carried[sensor].name
+        return {
+            index: fault
+            for index, fault in enumerate(self.faults)
+            if fault.kind in kinds and fault.sensor in (None, name)
+        }
+
+    def sent_scan(self, index: int) -> ScanSpec:
+        """Return the scan that a sensor sends as scan `index`: an older scan of a frozen sensor.
+
+        A sweep that starts while the sensor is frozen repeats the last sweep that started before.
+        The older scan follows from times alone, on whichever worker scans are cast.
+        """
+        spec = self.scan(index)
+        frozen = self.faults_of(spec.sensor, "frozen").values()
+        if not frozen:
+            return spec
+        firsts, starts_ns, _ = self.sweeps_each[spec.sensor]
+        sweep = int(np.searchsorted(firsts, index, "right")) - 1
+        source = sweep
+        while active := [fault for fault in frozen if fault.during(starts_ns[source])]:
+            source = int(np.searchsorted(starts_ns, active[0].from_s * 1e9)) - 1
+        if source == sweep:
+            return spec
+        # The last sweep at a pose may have fewer scans: then scans are lost, see `LossStep`.
+        older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
+        repeats = int(firsts[source]), int(firsts[sweep])
+        return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
+
+    def scans(self) -> Iterator[ScanSpec]:
+        """Return an iterator over all scans in order."""
+        return (self.scan(index) for index in range(self.scan_count))
+
+    def pose(self, index: int) -> Pose:
+        """Return the pose of the sensor at the start of scan `index`."""
+        spec = self.scan(index)
+        time = self.begins_ns(index) - spec.start_ns
+        return self.path.pose(spec.station, time).compose(self.carried[spec.sensor].mount)
+
+    def begins_ns(self, index: int) -> float:
+        """Return the start of scan `index`, nanoseconds since the survey's start."""
+        spec = self.scan(index)
+        sensor = self.carried[spec.sensor].sensor
+        return spec.start_ns + firing_start_ns(sensor, spec.firings[0]) + sensor.lead_ns
+
+
+def _check_noise(noise: Noise, sensor: Sensor) -> None:
+    """Check that noise suits a sensor, and that false alarms are not too many."""
+    biases = noise.channel_bias_m
+    channels = sensor.channels
+    if isinstance(biases, Sequence) and len(biases) != channels:
+        raise LidarError(
+            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}: "
+            "give one for each channel, or their standard deviation."
+        )
+    if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
+        raise LidarError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
+    if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
+        raise LidarError(
+            f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "
+            "none: give max_range_m."
+        )
+    if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > MAX_ALARMS:
+        raise LidarError(
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {mean:.3g} false alarms "
+            f"of each pulse; {MAX_ALARMS} are possible: make it or max_range_m smaller."
+        )
+
+
+def firing_start_ns(sensor: Sensor, firing: int) -> float:
+    """Return the start of a firing, nanoseconds since the start of the station."""
+    return float(sensor.begins_ns(np.array([firing], np.int64))[0])
+
+
+def _last_firing_ns(sensor: Sensor, steps: int) -> float:
+    """Return the start of the last firing of `steps` time steps, ns since the station's start."""
+    return firing_start_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
+
+
+def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
+    """Return poses, of which each may be x, y and z; LidarError if they are not a list of poses."""
+    if isinstance(poses, str) or not isinstance(poses, Iterable):
+        raise LidarError(f"poses is {shown(poses)}; it must be a list of poses: [(0, 0, 1)].")
+    return tuple(pose_of("poses", pose) for pose in poses)

@@ -1,0 +1,293 @@
+"""A lidar in a world that another program moves: meshes once, and matrices at each step."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.arrays import Floats, Floats32
+from ..base.errors import LidarError
+from ..base.validation import checked
+from ..columns.cloud import Cloud
+from ..motion.trajectory import StaticPose, Track
+from ..scene.actors import Actor
+from ..scene.object_names import unique_names
+from ..scene.scene import Scene
+from ..scene.scene_instances import SceneInstance
+from ..scene.scene_mesh import SceneMesh
+from ..sensor import Sensor
+from ..simulator.scanner import Scanner
+from ..survey.survey import Mounted
+
+_SLACK_S = 1e-9  # by which the time of a step may be before the last beam of a sweep
+
+
+class _Step(NamedTuple):
+    """A step of the world."""
+
+    time_s: float  # seconds since the first step
+    pose: Floats  # (4, 4), from the frame of the sensor's carrier to the world
+    matrices: Floats  # (k, 4, 4), from the frames of the bodies to the world
+
+
+class Follower:
+    """A lidar that follows the bodies of another program.
+
+    `sweep` and `ranges` scan a world that stands still, which is fastest: bodies are instances of
+    their meshes. `step` collects the steps of a world that moves, and scans each sweep once its
+    last beam is fired: each beam leaves from the pose of the sensor, and meets bodies at their
+    poses, at the time of the beam.
+
+    Parameters
+    ----------
+    bodies
+        Meshes of the k bodies that move, in their own frames. Bodies with the same arrays share a
+        tree.
+    sensor
+        The lidar, or the lidar `Mounted` on a carrier.
+    static
+        Meshes and instances that stand, in world coordinates; `step` needs at least one.
+    options
+        Options of `Scanner`, such as columns, noise, threads, and the names of `unseen` bodies.
+
+    Raises
+    ------
+    LidarError
+        If there are no meshes, or `Scanner` refuses an option.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lidarpool import Follower, load_sensor
+    >>> from lidarsim.scene.actors import box
+    >>> ground = box("Ground", (80, 80, 0.1))
+    >>> sensor = load_sensor("velodyne/vlp16")
+    >>> follower = Follower([box("Car", (4, 2, 1.5))], sensor, static=[ground])
+    >>> car = np.eye(4)
+    >>> car[0, 3] = 9
+    >>> lidar = np.eye(4)
+    >>> lidar[2, 3] = 1.7
+    >>> cloud = follower.sweep(lidar, [car])
+    >>> follower.names
+    ('Ground', 'Car')
+    >>> clouds = []
+    >>> for k in range(60):  # the car drives at 10 m/s
+    ...     car[0, 3] = 9 + 0.02 * k
+    ...     clouds += follower.step(0.002 * k, lidar, [car])
+    >>> len(clouds)
+    1
+    """
+
+    @checked
+    def __init__(
+        self,
+        bodies: Sequence[SceneMesh],
+        sensor: Sensor | Mounted,
+        *,
+        static: Sequence[SceneMesh | SceneInstance] = (),
+        **options: Any,
+    ) -> None:
+        self._static = list(static)
+        self.names = unique_names([item.name for item in (*static, *bodies)])
+        self._body_names = self.names[len(static) :]
+        self._bodies = list(bodies)
+        self._sensor = sensor
+        self._options = options
+        instances = [SceneInstance(mesh, np.eye(4), mesh.name) for mesh in bodies]
+        # Of a world that stands still during a sweep.
+        self._frozen = Scanner(Scene.from_meshes([*static, *instances]), sensor, **options)
+        self._matrices = np.tile(np.eye(4), (len(bodies), 1, 1))
+        self._steps: deque[_Step] = deque()
+        self._start_s: float | None = None  # time of the first step
+        self._number = 0  # of the sweep under way
+        # Times of the first and last beam of the sweep under way, seconds since the first step.
+        self._span_s: tuple[float, float] | None = None
+
+    def __repr__(self) -> str:
+        return f"<Follower of {len(self._bodies)} bodies: {self._frozen!r}>"
+
+    @cached_property
+    def _moving(self) -> Scanner:
+        """Scanner of a world that moves during a sweep, whose bodies are actors."""
+        if not self._static:
+            raise LidarError(
+                "Nothing stands in the world: `step` needs at least one static mesh, such as a "
+                "ground."
+            )
+        actors = [Actor(mesh) for mesh in self._bodies]
+        scene = Scene.from_meshes(self._static).with_actors(actors)
+        return Scanner(scene, self._sensor, **self._options)
+
+    @property
+    def backend(self) -> str:
+        """Name of the ray-casting backend in use."""
+        return self._frozen.backend
+
+    @checked
+    def sweep(
+        self, pose: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
+    ) -> Cloud:
+        """Scan a sweep of the world as it stands.
+
+        Parameters
+        ----------
+        pose
+            (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
+        matrices
+            (k, 4, 4): matrices from the frames of the bodies to the world, metres.
+        number
+            Number of the sweep, as of `Scanner.sweep`; by default each call has new noise.
+
+        Returns
+        -------
+        Cloud
+            The returns. The column `object` holds indices into `names`.
+
+        Raises
+        ------
+        LidarError
+            If there are not as many matrices as bodies, or a matrix mirrors or deforms.
+        """
+        sensor_pose = _matrices(pose, 1)
+        self._place(_matrices(matrices, len(self._bodies)))
+        origin = self._frozen.origin
+        path = StaticPose(sensor_pose[0, :3, 3] - origin, sensor_pose[0, :3, :3])
+        return self._frozen.sweep(path, number=number)
+
+    @checked
+    def ranges(
+        self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
+    ) -> Floats32:
+        """Return the ranges that sensors measure in the world as it stands.
+
+        Parameters
+        ----------
+        poses
+            (s, 4, 4): matrices from the frame of the sensor at s poses to the world.
+        matrices, number
+            As of `sweep`.
+
+        Returns
+        -------
+        float32 (s, firings, channels)
+            Metres; inf without a return. See `Scanner.ranges`.
+
+        Raises
+        ------
+        LidarError
+            As `sweep`.
+        """
+        sensor_poses = _matrices(poses, None)
+        self._place(_matrices(matrices, len(self._bodies)))
+        return self._frozen.ranges(_local(sensor_poses, self._frozen.origin), number=number)
+
+    def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
+        """Take note of a step of the world; return the sweeps that have ended since the last step.
+
+        The first sweep begins at the first step, and sweeps follow each other. A time before that
+        of the last step, as of a world that was reset, begins anew.
+
+        Parameters
+        ----------
+        time_s
+            Time of the world, seconds.
+        pose
+            (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
+        matrices
+            (k, 4, 4): matrices from the frames of the bodies to the world, metres. Between two
+            steps, bodies move straight and rotate evenly.
+
+        Returns
+        -------
+        The sweeps, mostly none or one.
+
+        Raises
+        ------
+        LidarError
+            If there are not as many matrices as bodies, a matrix mirrors or deforms, or nothing
+            stands in the world.
+        """
+        if self._start_s is None or (
+            self._steps and time_s < self._start_s + self._steps[-1].time_s
+        ):
+            self.reset()
+            self._start_s = time_s
+        step = _Step(
+            time_s - self._start_s,
+            _matrices(pose, 1)[0].copy(),
+            _matrices(matrices, len(self._bodies)).copy(),
+        )
+        if self._steps and step.time_s == self._steps[-1].time_s:
+            self._steps.pop()
+        self._steps.append(step)
+        return list(self._ended_sweeps())
+
+    def reset(self) -> None:
+        """Forget all steps, so that the next step begins the first sweep."""
+        self._steps.clear()
+        self._start_s = None
+        self._number = 0
+        self._span_s = None
+
+    def _ended_sweeps(self) -> Iterator[Cloud]:
+        """Yield the sweeps whose beams are fired until the last step."""
+        while True:
+            if self._span_s is None:
+                self._span_s = self._moving.span_s(self._number)
+            start_s, stop_s = self._span_s
+            if stop_s > self._steps[-1].time_s + _SLACK_S or len(self._steps) < 2:
+                return
+            self._drop_steps(start_s)
+            times_s, poses, matrices = map(np.array, zip(*self._steps, strict=True))
+            origin = self._moving.origin
+            if self._bodies:
+                by_body = _local(matrices.transpose(1, 0, 2, 3), origin)
+                self._moving.move(self._body_names, by_body, times_s=times_s)
+            # Held before the first step, since the scanner also asks for the pose at time 0.
+            (path,) = Track.from_matrices(times_s, _local(poses, origin)[None], "hold")
+            yield self._moving.sweep(path, number=self._number)
+            self._number += 1
+            self._span_s = None
+
+    def _drop_steps(self, start_s: float) -> None:
+        """Drop the steps before the last step at or before a time, seconds."""
+        while len(self._steps) > 2 and self._steps[1].time_s <= start_s:
+            self._steps.popleft()
+
+    def _place(self, matrices: Floats) -> None:
+        """Move the instances whose matrices (k, 4, 4) have changed."""
+        changed = np.flatnonzero((matrices != self._matrices).any(axis=(1, 2)))
+        if len(changed):
+            names = [self._body_names[row] for row in changed]
+            self._frozen.move(names, _local(matrices[changed], self._frozen.origin))
+            self._matrices = matrices.copy()
+
+
+def _local(matrices: Floats, origin: Floats) -> Floats:
+    """Return matrices (..., 4, 4) to local coordinates, from matrices to the world."""
+    if not origin.any():
+        return matrices
+    local = matrices.copy()
+    local[..., :3, 3] -= origin
+    return local
+
+
+def _matrices(values: ArrayLike, count: int | None) -> Floats:
+    """Return matrices as an array (k, 4, 4); LidarError if they are not `count` such matrices.
+
+    The scanner checks that matrices are rigid.
+    """
+    try:
+        matrices = np.asarray(values, np.float64).reshape(-1, 4, 4)
+    except (TypeError, ValueError) as error:
+        raise LidarError(f"Matrices must be numbers of the shape (k, 4, 4): {error}.") from error
+    if count is not None and len(matrices) != count:
+        raise LidarError(
+            f"There are {len(matrices)} matrices; expected {count}, one for each body."
+        )
+    return matrices

@@ -1,0 +1,243 @@
+"""Meshes of the bodies of MuJoCo's models."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Bytes, Floats
+from ..base.errors import LidarError
+from ..base.vectors import applied, length, matmul, turned
+from ..base.words import name_hint, plural
+from ..motion.trajectory import matrices as rotations_of_quaternions
+from ..scene.colours import LINEAR, Colours, as_bytes, as_srgb
+from ..scene.face_materials import FaceMaterials
+from ..scene.scene_mesh import SceneMesh, stacked
+from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
+
+_TEXTURE_OF_COLOURS = 1  # mjTEXROLE_RGB, column of mat_texid
+
+Objects = Literal["body", "geom"]
+
+
+class ModelBody(NamedTuple):
+    """A body, or a geom of a body, that a lidar may see."""
+
+    body: int  # number of the body
+    mesh: SceneMesh  # in the frame of the body; equal bodies share its arrays
+
+
+class ModelBodies(NamedTuple):
+    """Bodies of a model."""
+
+    static: list[SceneMesh]  # in world coordinates
+    moving: list[ModelBody]
+
+
+class Choice(NamedTuple):
+    """What a lidar sees of a model, and how."""
+
+    groups: Sequence[int]  # groups of geoms that are seen
+    excluded_bodies: Sequence[int]
+    excluded_geoms: Sequence[int]
+    objects: Objects  # what an object of the scene is: a body or a geom
+    sag_m: float = SAG_M
+    plane_m: float = PLANE_M
+
+
+def number_of(model: Any, kind: str, name: str | int) -> int:
+    """Return the number of a body, geom or site by its name or number; -1 if there is none."""
+    names = names_of(model, kind)
+    if isinstance(name, str):
+        return names.index(name) if name in names else -1
+    return int(name) if 0 <= name < len(names) else -1
+
+
+def names_of(model: Any, kind: str) -> list[str]:
+    """Return the names of all bodies, geoms or sites; those without a name are numbered."""
+    addresses = np.asarray(getattr(model, f"name_{kind}adr"))
+    table = bytes(model.names)
+    names = [table[start : table.index(b"\0", start)].decode() for start in addresses.tolist()]
+    return [name or f"{kind} {number}" for number, name in enumerate(names)]
+
+
+def required_number(model: Any, kind: str, name: str | int) -> int:
+    """Return the number of a body or site, by its name or number; LidarError if there is none."""
+    number = number_of(model, kind, name)
+    if number < 0:
+        raise LidarError(_unknown(name, kind, names_of(model, kind)))
+    return number
+
+
+def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
+    """Return the numbers of excluded bodies and geoms; numbers in `names` are of bodies.
+
+    LidarError if there is neither a body nor a geom with a name.
+    """
+    bodies = []
+    geoms = []
+    for name in names:
+        body = number_of(model, "body", name)
+        geom = number_of(model, "geom", name) if isinstance(name, str) else -1
+        if body < 0 and geom < 0:
+            known = [*names_of(model, "body"), *names_of(model, "geom")]
+            raise LidarError(_unknown(name, "body or geom", known))
+        bodies += [body] * (body >= 0)
+        geoms += [geom] * (geom >= 0)
+    return bodies, geoms
+
+
+def _unknown(name: str | int, kind: str, known: list[str]) -> str:
+    """Return the message on a name that a model lacks."""
+    return f"The model has no {kind} {name!r}.{name_hint(str(name), known)}"
+
+
+def bodies_of(model: Any, choice: Choice) -> ModelBodies:
+    """Return the bodies of a model with visible geoms.
+
+    Bodies that are welded to the world stand; mocap bodies and all others move. Geoms that are
+    completely transparent are left out, as by MuJoCo's rays, and so are flexes and skins.
+    """
+    geoms = seen_geoms(model, choice)
+    groups = [[geom] for geom in geoms]
+    if choice.objects == "body":
+        by_body: dict[int, list[int]] = {}
+        for geom in geoms:
+            by_body.setdefault(int(model.geom_bodyid[geom]), []).append(geom)
+        groups = list(by_body.values())
+    is_static = _static_bodies(model)
+    names = names_of(model, choice.objects)
+    colours = _colours(model)
+    meshes: dict[Hashable, SceneMesh] = {}  # of equal bodies, the mesh of the first
+    static = []
+    moving = []
+    for group in groups:
+        body = int(model.geom_bodyid[group[0]])
+        key = tuple(_key(model, geom) for geom in group)
+        if key not in meshes:
+            meshes[key] = _mesh_of_geoms(model, group, colours, choice)
+        name = names[group[0] if choice.objects == "geom" else body]
+        if is_static[body]:
+            rotation, position = _rest_pose(model, body)
+            static.append(meshes[key].moved(name, rotation, position))
+        else:
+            moving.append(ModelBody(body, replace(meshes[key], name=name)))
+    return ModelBodies(static, moving)
+
+
+def _static_bodies(model: Any) -> Any:
+    """Return whether each body stands: (bodies,)."""
+    return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
+
+
+def seen_geoms(model: Any, choice: Choice) -> list[int]:
+    """Return the numbers of the geoms that a lidar may see."""
+    colours = _colours(model)
+    seen = np.isin(model.geom_group, choice.groups) & (colours[:, 3] > 0)
+    seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)
+    seen[[*choice.excluded_geoms]] = False
+    return np.flatnonzero(seen).tolist()
+
+
+def _colours(model: Any) -> Floats:
+    """Return the colours and opacities of geoms: (geoms, 4), 0 to 1."""
+    colours = np.array(model.geom_rgba, np.float64).reshape(-1, 4)
+    material = np.asarray(model.geom_matid)
+    # As MuJoCo does: the material counts, unless the geom's own colour differs from the default.
+    by_material = (material >= 0) & (colours == [0.5, 0.5, 0.5, 1]).all(axis=1)
+    colours[by_material] = np.asarray(model.mat_rgba)[material[by_material]]
+    return colours
+
+
+def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
+    """Return the colour of a geom, multiplied by the mean of its texture: sRGB (3,)."""
+    srgb = as_bytes(colour[:3])
+    material = int(model.geom_matid[geom])
+    if material < 0:
+        return srgb
+    texture_numbers = np.atleast_1d(model.mat_texid[material])
+    role = _TEXTURE_OF_COLOURS if len(texture_numbers) > 1 else 0
+    texture = int(texture_numbers[role])
+    if texture < 0:
+        return srgb
+    channels = int(model.tex_nchannel[texture])
+    pixels = int(model.tex_height[texture]) * int(model.tex_width[texture])
+    start = int(model.tex_adr[texture])
+    texels = np.asarray(model.tex_data[start : start + pixels * channels], np.uint8)
+    light = LINEAR[texels.reshape(-1, channels)[:, : min(channels, 3)]].mean(axis=0)
+    return as_srgb(LINEAR[srgb] * light)
+
+
+def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, choice: Choice) -> SceneMesh:
+    """Return the mesh of geoms of a body, in the frame of the body, without a name.
+
+    `colours` (geoms, 4) are those of all geoms of the model.
+    """
+    shapes = [_placed_geom(model, geom, choice) for geom in geoms]
+    counts = [len(shape.faces) for shape in shapes]
+    vertices, faces = stacked((shape.vertices, shape.faces) for shape in shapes)
+    face_colours = [_srgb_of(model, geom, colours[geom]) for geom in geoms]
+    return SceneMesh(
+        "",
+        vertices,
+        faces,
+        colours=Colours.of_faces(np.repeat(face_colours, counts, axis=0)),
+        materials=_materials_of(model, geoms, counts),
+    )
+
+
+def _placed_geom(model: Any, geom: int, choice: Choice) -> GeomMesh:
+    """Return the triangles of a geom in the frame of its body."""
+    shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
+    points = turned(shape.vertices, _rotation(model.geom_quat[geom]))
+    return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
+
+
+def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMaterials | None:
+    """Return the materials of the faces of geoms, `counts` of each; None without materials."""
+    materials = np.asarray(model.geom_matid)[geoms]
+    if (materials < 0).all():
+        return None
+    names = ["", *names_of(model, "mat")]
+    used, index = np.unique(materials + 1, return_inverse=True)
+    face_index = np.repeat(index.reshape(-1), counts).astype(np.int32)
+    return FaceMaterials(tuple(names[number] for number in used.tolist()), face_index)
+
+
+def _key(model: Any, geom: int) -> Hashable:
+    """Return a key that is equal for geoms of the same triangles in the frames of their bodies."""
+    fields = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
+    return tuple(np.asarray(getattr(model, f"geom_{field}")[geom]).tobytes() for field in fields)
+
+
+def _rotation(quaternion: Any) -> Floats:
+    """Return the rotation (3, 3) of a quaternion w, x, y, z."""
+    w, x, y, z = np.asarray(quaternion, np.float64).tolist()
+    xyzw = np.array([[x, y, z, w]])
+    return np.asarray(rotations_of_quaternions(xyzw / length(xyzw)[:, None])[0])
+
+
+def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
+    """Return rotation (3, 3) and position (3,) of a body that is welded to the world."""
+    rotation = np.eye(3)
+    position = np.zeros(3)
+    while body:
+        local = _rotation(model.body_quat[body])
+        position = applied(local, position) + np.asarray(model.body_pos[body], np.float64)
+        rotation = matmul(local, rotation)
+        body = int(model.body_parentid[body])
+    return rotation, position
+
+
+def soft_bodies(model: Any) -> str:
+    """Return the numbers of flexes and skins, which a lidar does not see; empty without any."""
+    counts = {
+        "flex": (int(getattr(model, "nflex", 0)), "flexes"),
+        "skin": (int(getattr(model, "nskin", 0)), "skins"),
+    }
+    return " and ".join(
+        plural(count, singular, several) for singular, (count, several) in counts.items() if count
+    )
