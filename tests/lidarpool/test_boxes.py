@@ -12,7 +12,7 @@ from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_c
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.formats import Format
 from lidarsim.columns.cloud import Cloud
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps

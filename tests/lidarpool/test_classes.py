@@ -28,7 +28,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent
-from lidarview.viewer.view import open_result
+from lidarview.viewer.result_views import open_result
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}
 

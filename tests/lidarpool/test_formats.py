@@ -51,7 +51,7 @@ from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLOURS, TABLE
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps

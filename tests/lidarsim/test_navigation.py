@@ -30,7 +30,8 @@ from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.motion.navigation import fixes, geodetic, imu_samples
-from lidarsim.motion.trajectory import Stations, matrices
+from lidarsim.motion.rotations import matrices
+from lidarsim.motion.trajectory import Stations
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 

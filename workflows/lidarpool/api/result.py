@@ -133,7 +133,8 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from lidarsim.columns.cloud_file import CloudFile
-        from lidarview.viewer.view import View, result_page, wait_for_interrupt
+        from lidarview.viewer.result_views import result_page, wait_for_interrupt
+        from lidarview.viewer.view import View
 
         from ..showing.pages.downloads import downloads
 

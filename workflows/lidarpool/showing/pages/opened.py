@@ -18,7 +18,8 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.text_cloud import is_text_raster
-from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_result
+from lidarview.viewer.result_views import join_views, open_result
+from lidarview.viewer.view import CLOUD, GrowingView, View
 
 from ...datasets.dataset import INDEX_FILE
 from .downloads import downloads
