@@ -19,7 +19,7 @@ import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.report.charts import draw_sweep

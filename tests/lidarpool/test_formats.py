@@ -44,8 +44,8 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import parquet, pieces, well_known_text
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import EXPORTS, FORMATS, LAYOUTS
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.well_known_text import wkt
+from lidarpool.clouds.writing import Format
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns

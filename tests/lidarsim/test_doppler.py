@@ -26,8 +26,8 @@ from lidarsim.motion.trajectory import Stations, velocities
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.air import AIR
 from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
+from lidarsim.simulator.steps.particles import AIR
 from lidarsim.simulator.steps.separation import separated
 
 # of the train

@@ -24,8 +24,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
-    from .clouds.formats import save_cloud
     from .clouds.open3d_cloud import to_open3d
     from .clouds.ply import read_cloud
+    from .clouds.writing import save_cloud
     from .comparing.comparison import Comparison
     from .comparing.fit import Fit, fit
     from .comparing.two_clouds import compare
@@ -118,7 +118,7 @@ _MODULES = {
     ".api.simulation": ("Campaign", "simulate"),
     ".datasets.loader": ("sweeps",),
     ".datasets.sweep_data": ("Sweep",),
-    ".clouds.formats": ("save_cloud",),
+    ".clouds.writing": ("save_cloud",),
     ".clouds.open3d_cloud": ("to_open3d",),
     ".clouds.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),

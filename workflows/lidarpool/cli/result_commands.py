@@ -152,7 +152,7 @@ def export(
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..clouds.folder import local_result, result_folder, send
-    from ..clouds.formats import Format
+    from ..clouds.writing import Format
 
     # The report of a result is moved into place last.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")

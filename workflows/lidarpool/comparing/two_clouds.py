@@ -23,7 +23,7 @@ from ..base.neighbours import nearest
 from ..clouds.recording import RecordedPoints, Recording
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
-from ..recordings.recordings import open_recording
+from ..recordings.opening import open_recording
 from .comparison import CELLS, RESIDUALS, Comparison, MeasuredPoints
 from .range_image import RangeImages, paired_images, range_images
 

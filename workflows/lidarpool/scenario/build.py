@@ -38,9 +38,9 @@ from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.format_table import check_whole
-from ..clouds.formats import Format
 from ..clouds.laser_scan import with_laser_scans
 from ..clouds.packets import with_packet_columns
+from ..clouds.writing import Format
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
