@@ -15,7 +15,7 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.clouds.writing import Format
-from lidarpool.comparing import two_clouds
+from lidarpool.comparing import comparison, two_clouds
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.recordings.opening import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
