@@ -31,7 +31,7 @@ from distributed import Client
 from distributed.deploy.spec import ProcessInterface
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from lidarpool.run.pipeline.placement import TaskRecord, placement_violations, recorded
+from lidarpool.run.pipeline.task_records import TaskRecord, placement_violations, recorded
 from poolpart import Partition
 from poolpart.deploy import start_partitions
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
-from lidarpool.clouds.formats import save_cloud
+from lidarpool.clouds.writing import save_cloud
 from lidarpool.columns.parts import StoredCloud, pack
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns

@@ -24,7 +24,7 @@ from lidarpool.clouds.recording import Recording
 from lidarpool.comparing.fit.motion import read_static
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.comparing.fit.surfaces import find_surfaces, select_smooth_rays
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.steps.angle_noise import angle_errors
 from lidarsim.simulator.steps.detection import detected

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import Cloud, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import layout
 from lidarsim.sweeps.sweeps import Sweeps

@@ -9,7 +9,7 @@ except ImportError as error:
     raise SystemExit("This example needs Newton: pip install newton") from error
 
 from lidarpool import Follower, Noise, load_sensor, save_cloud
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import box
 from lidarsim.scene.transform import affine
 

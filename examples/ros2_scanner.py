@@ -11,7 +11,7 @@ from array import array
 import numpy as np
 
 from lidarpool import Pose, Scanner, Scene, load_sensor
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 
 FRAME = "lidar"
 RATE_HZ = 10

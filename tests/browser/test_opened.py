@@ -12,7 +12,7 @@ from tests.packet_surveys import points_of
 from tests.shapes import room
 
 from lidarpool import Mounted, Pose, Survey, Track, load_sensor
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.showing.pages import opened, recorded
 from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view

@@ -19,9 +19,10 @@ from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
+from lidarview.viewer.result_views import open_results
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import page_of
-from lidarview.viewer.view import View, open_results
+from lidarview.viewer.view import View
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

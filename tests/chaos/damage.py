@@ -143,7 +143,7 @@ class Resumed:
 
 def shown(place: Path) -> str:
     """Answer what the page of a result asks."""
-    from lidarview.viewer.view import open_result
+    from lidarview.viewer.result_views import open_result
 
     view = open_result(place)
     header, _ = view.answer("state", {}, lambda: False)

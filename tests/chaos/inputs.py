@@ -24,10 +24,10 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.recordings.recordings import open_sensors
+from lidarpool.recordings.opening import open_sensors
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.showing.playback.recording import Recording
+from lidarpool.showing.playback.pcap_recording import PcapRecording
 from raybeam.compiled import compiled
 
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}
@@ -113,7 +113,7 @@ def read_recordings(place: Path) -> str:
     """Read sweeps of each recording, and the datagrams of packets."""
     for path in sorted(place.rglob("*.*cap")):
         if path.suffix == ".pcap":
-            list(Recording(path).batches(100_000_000))
+            list(PcapRecording(path).batches(100_000_000))
         for recording in open_sensors(path).values():
             for number in range(min(2, recording.count)):
                 recording.read_points(number)

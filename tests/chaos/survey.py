@@ -32,7 +32,7 @@ from lidarpool import (
 )
 from lidarpool.report.growing_cloud import GrowingCloud
 from lidarpool.run.pipeline.messages import Receipt
-from lidarpool.run.pipeline.placement import placement_violations
+from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.run_result import RunResult
 from lidarpool.run.runner import Run, StoredOutput
 

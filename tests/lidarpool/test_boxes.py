@@ -10,9 +10,9 @@ import pytest
 
 from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarsim.columns.cloud import Cloud
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps

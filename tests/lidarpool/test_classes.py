@@ -19,7 +19,7 @@ import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.report.charts import draw_sweep
@@ -28,7 +28,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent
-from lidarview.viewer.view import open_result
+from lidarview.viewer.result_views import open_result
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}
 

@@ -14,10 +14,10 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
-from lidarpool.clouds.formats import Format
-from lidarpool.comparing import comparison
+from lidarpool.clouds.writing import Format
+from lidarpool.comparing import comparison, two_clouds
 from lidarpool.datasets.figures import rank_correlation
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS = 16
@@ -225,7 +225,7 @@ def test_what_has_no_range_image_says_why():
 
 
 def test_of_many_points_and_cells_some_are_compared(monkeypatch):
-    monkeypatch.setattr(comparison, "MAX_VALUES", 2000)
+    monkeypatch.setattr(two_clouds, "MAX_VALUES", 2000)
     rng = np.random.default_rng(5)
     found = compare(cloud(RANGES + rng.normal(0, 0.02, RANGES.shape)), cloud()).figures
     assert found["range_image"]["residual"]["cells"] == 2000

@@ -20,7 +20,7 @@ from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarpool.datasets.job_table import JobRow
 from lidarsim.base.storage import Storage

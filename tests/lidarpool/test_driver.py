@@ -31,8 +31,8 @@ from lidarpool.run.pipeline.messages import (
 )
 from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
 from lidarpool.run.pipeline.pipeline_job import PipelineJob
-from lidarpool.run.pipeline.placement import TaskRecord
 from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
+from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.store.database import RunDatabase
 from lidarsim.base.storage import Storage
 from poolpart.task_locations import TaskLocations

@@ -23,11 +23,11 @@ from lidarpool import (
     load_sensor,
     simulate,
 )
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.recording import Recording
+from lidarpool.clouds.writing import Format
 from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.sensor.models import read_model
 from lidarsim.sweeps.sweeps import Sweeps

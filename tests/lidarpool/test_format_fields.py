@@ -35,7 +35,7 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarscenes.procedural.city import city
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN

@@ -44,14 +44,14 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import parquet, pieces, well_known_text
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import EXPORTS, FORMATS, LAYOUTS
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.well_known_text import wkt
+from lidarpool.clouds.writing import Format
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLOURS, TABLE
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps

@@ -26,7 +26,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city

@@ -10,7 +10,7 @@ import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
 from lidarpool.clouds.format_table import FORMATS
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario

@@ -8,7 +8,7 @@ from lidarpool import compare
 from lidarpool.cli.result_commands import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.comparing.comparison import Comparison
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
 from lidarsim.base.errors import LidarError

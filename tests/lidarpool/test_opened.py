@@ -21,9 +21,9 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import view as view_command
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.ros import bag_poses
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.clouds.writing import Format
+from lidarpool.recordings.opening import open_recording
 from lidarpool.showing.pages import recorded
 from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view, open_views

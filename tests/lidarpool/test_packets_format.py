@@ -12,8 +12,8 @@ import pytest
 from tests.shapes import room
 
 from lidarpool import LidarError, Mounted, Pose, Scene, Sensor, Survey, load_sensor, save_cloud
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.packets import with_packet_columns
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud

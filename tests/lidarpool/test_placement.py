@@ -6,7 +6,7 @@ import pytest
 from distributed import Client
 from tests.clusters import cluster_of
 
-from lidarpool.run.pipeline.placement import placement_violations, recorded
+from lidarpool.run.pipeline.task_records import placement_violations, recorded
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.showing.playback import bridge as bridges
 from lidarpool.showing.playback.bridge import Bridge
 from lidarpool.showing.playback.bridge_table import BRIDGES, BridgeEntry

@@ -37,9 +37,9 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarpool.showing.playback.packets import RepeatedInstruments
-from lidarpool.showing.playback.recording import Recording
+from lidarpool.showing.playback.pcap_recording import PcapRecording
 from lidarpool.showing.playback.sources import open_source, scenario_job
 from lidarpool.showing.playback.transmitter import Transmitter, sensor_streams
 from lidarsim.columns.cloud import Cloud
@@ -441,7 +441,7 @@ def test_a_recording_is_read_with_fragments_and_tags_and_without_other_frames(tm
     ]
     path = tmp_path / "a.pcap"
     path.write_bytes(pcap(frames_of_file)[:-1])  # cut off
-    recording = Recording(path)
+    recording = PcapRecording(path)
     assert recording.ports == {"192.168.1.201": [2368, 9, 7502]}
     datagrams = [
         (group.due_ns[0], group.port, group.payloads[0].tobytes())

@@ -12,8 +12,8 @@ from lidarpool import Cloud, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
-from lidarpool.clouds.formats import Format
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.clouds.writing import Format
+from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points

@@ -16,8 +16,8 @@ from hypothesis.extra import numpy as npst
 
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import ply
-from lidarpool.clouds.formats import save_cloud
 from lidarpool.clouds.ply import read_cloud
+from lidarpool.clouds.writing import save_cloud
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import Column

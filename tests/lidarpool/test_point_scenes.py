@@ -7,7 +7,7 @@ from click.testing import CliRunner
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
 from lidarscenes.writers.scene_file import write_scene

@@ -9,7 +9,6 @@ import pytest
 
 from lidarpool.run.pipeline.batches import Batch, BatchState, Outcome
 from lidarpool.run.pipeline.names import INTERSECT
-from lidarpool.run.pipeline.placement import TaskRecord
 from lidarpool.run.pipeline.policies import (
     LATE_FACTOR,
     LATE_S,
@@ -25,6 +24,7 @@ from lidarpool.run.pipeline.policies import (
     slots_wanted,
 )
 from lidarpool.run.pipeline.task_book import MAX_MISPLACED, MAX_RECORDS, StageTotals, TaskBook
+from lidarpool.run.pipeline.task_records import TaskRecord
 from poolpart.task_locations import TaskLocations, TaskPlace
 
 A = "tcp://a:1"

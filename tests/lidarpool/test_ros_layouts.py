@@ -29,10 +29,10 @@ from lidarpool import (
 )
 from lidarpool.cli.result_commands import export
 from lidarpool.clouds.format_table import FORMATS
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.ros import layouts
 from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.clouds.writing import Format
+from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -20,9 +20,9 @@ from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
 from lidarpool import Cloud, LidarError
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.formats import Format, save_cloud
+from lidarpool.clouds.writing import Format, save_cloud
 from lidarpool.showing.playback.sources import open_source
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
 
 SCENARIO = VIEWED.replace("cloud: {", "cloud: {start: 2026-05-04T10:20:30.5Z, ")

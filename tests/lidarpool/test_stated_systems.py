@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import growing_view, open_view
 from lidarsim.base.errors import LidarError

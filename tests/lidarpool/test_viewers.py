@@ -41,7 +41,7 @@ from lidarpool.showing.playback.schedule import Schedule
 from lidarpool.showing.playback.sources import open_source
 from lidarpool.showing.viewers import attached_child
 from lidarpool.showing.viewers.viewer import Address, Viewer, open_viewer
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.actors import box
 

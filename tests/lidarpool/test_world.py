@@ -14,8 +14,8 @@ from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
 
 from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.las_header import las_system
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.empty_cloud import empty_cloud_reason

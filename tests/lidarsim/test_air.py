@@ -30,7 +30,7 @@ from lidarsim.media.weather import EXIT_M, dust, rain, snow, spray
 from lidarsim.scene.actors import box as cuboid
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.air import highest_probabilities
+from lidarsim.simulator.steps.particles import highest_probabilities
 
 SEEN = Noise(detection_range_m=100)
 THRESHOLD = 0.1 * (10 / 100) ** 2

@@ -16,7 +16,7 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import box, distinct_meshes, join_meshes
 from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation
 from lidarsim.scene.files.meshfile import load_objects

@@ -21,12 +21,13 @@ from lidarpool import (
     load_sensor,
 )
 from lidarscenes.robots.robot import Hinge, LinkPath
-from lidarsim.motion.trajectory import Stations, quaternions_of, rotations_of, velocities
+from lidarsim.motion.rotations import quaternions_of, rotations_of
+from lidarsim.motion.trajectory import Stations, velocities
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.air import AIR
 from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
+from lidarsim.simulator.steps.particles import AIR
 from lidarsim.simulator.steps.separation import separated
 
 # of the train

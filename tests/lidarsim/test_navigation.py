@@ -24,13 +24,14 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.clouds.formats import Format
 from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
+from lidarpool.clouds.writing import Format
 from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.motion.navigation import fixes, geodetic, imu_samples
-from lidarsim.motion.trajectory import Stations, matrices
+from lidarsim.motion.rotations import matrices
+from lidarsim.motion.trajectory import Stations
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -30,10 +30,11 @@ from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Weather, rain, snow
 from lidarsim.motion.navigation import fixes, imu_samples
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps import air_loops, pulse_loops, random_loops, spray_loops
+from lidarsim.simulator.steps import particle_loops as air_loops
+from lidarsim.simulator.steps import pulse_loops, random_loops, spray_loops
 from lidarsim.simulator.steps.losses import PACKET
 from lidarsim.simulator.steps.range_noise import CHANNEL
-from lidarsim.simulator.steps.recording import SAMPLE, SAMPLES
+from lidarsim.simulator.steps.waveform_samples import SAMPLE, SAMPLES
 from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)

@@ -30,7 +30,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.clouds.navigation_files import write_instruments
-from lidarpool.recordings.recordings import open_recording
+from lidarpool.recordings.opening import open_recording
 from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of

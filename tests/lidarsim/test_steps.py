@@ -17,10 +17,9 @@ from lidarsim.columns.table import CAUSES
 from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
 from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, returns_without_surface
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.steps.cast import CastStep
 from lidarsim.simulator.steps.doppler import VELOCITY
 from lidarsim.simulator.steps.losses import DirtStep
-from lidarsim.simulator.steps.paths import CastStep
-from lidarsim.simulator.steps.recording import RecordingStep
 from lidarsim.simulator.steps.step import PulseStep, Role
 from lidarsim.simulator.steps.step_list import (
     STEPS,
@@ -28,6 +27,7 @@ from lidarsim.simulator.steps.step_list import (
     received_causes,
     remove_step,
 )
+from lidarsim.simulator.steps.waveform_samples import RecordingStep
 from lidarsim.survey.survey import OPTIONAL_NAMES
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"

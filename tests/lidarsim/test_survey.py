@@ -27,7 +27,8 @@ from lidarpool import (
     load_trajectory,
 )
 from lidarpool.base.fingerprint import fingerprint
-from lidarsim.motion.trajectory import matrices, quaternions_of, rotations_of, velocities
+from lidarsim.motion.rotations import matrices, quaternions_of, rotations_of
+from lidarsim.motion.trajectory import velocities
 from lidarsim.survey.survey import MAX_STEPS
 
 RNG = np.random.default_rng(5)

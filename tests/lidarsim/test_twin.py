@@ -18,8 +18,8 @@ from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
-from lidarsim.simulator.steps.air import AIR, WeatherStep, exponential, seen_by_range
 from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.particles import AIR, WeatherStep, exponential, seen_by_range
 from lidarsim.simulator.steps.pulse_loops import SampledHits
 from lidarsim.simulator.steps.random_loops import RandomKeys
 from lidarsim.simulator.steps.range_noise import noisy_ranges

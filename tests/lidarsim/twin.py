@@ -21,7 +21,8 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.random_numbers import Purpose, quantiles
 from lidarsim.media.weather import Air, Particles
 from lidarsim.sensor.disc import Beam
-from lidarsim.simulator.steps.air import (
+from lidarsim.simulator.steps.detection import DETECTION, LOSS
+from lidarsim.simulator.steps.particles import (
     FOG_CELL,
     FOG_PLACE,
     PARTICLE_DIAMETER,
@@ -29,7 +30,6 @@ from lidarsim.simulator.steps.air import (
     PARTICLE_SUBRAY,
     PARTICLES,
 )
-from lidarsim.simulator.steps.detection import DETECTION, LOSS
 from lidarsim.simulator.steps.range_noise import RANGE
 from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps.waveform import Digitizer

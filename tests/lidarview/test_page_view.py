@@ -30,6 +30,7 @@ from lidarview.picture_file import (
 )
 from lidarview.render.colouring import colours_of as colouring_of
 from lidarview.viewer import point_selection as points
+from lidarview.viewer.legends import legend_of
 from lidarview.viewer.point_selection import (
     TILES,
     Abandoned,
@@ -39,17 +40,10 @@ from lidarview.viewer.point_selection import (
     PointFinder,
     read_scans,
 )
-from lidarview.viewer.view import (
-    Downloads,
-    ShownSurface,
-    View,
-    colours_for,
-    legend_of,
-    open_result,
-    open_results,
-    range_image,
-    show_view,
-)
+from lidarview.viewer.range_pictures import range_image
+from lidarview.viewer.result_views import open_result, open_results, show_view
+from lidarview.viewer.shown_surface import ShownSurface, colours_for
+from lidarview.viewer.view import Downloads, View
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -549,7 +543,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
         assert captured.out.startswith("http://127.0.0.1:")  # the address is the result
         asked.append(captured.err + captured.out)
 
-    monkeypatch.setattr("lidarview.viewer.view.wait_for_interrupt", look)
+    monkeypatch.setattr("lidarview.viewer.result_views.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
     show_view(open_result(cloud.parent), port=0, browser=False)
     (said,) = asked

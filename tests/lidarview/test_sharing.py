@@ -25,8 +25,8 @@ from lidarview.picture_file import PICTURE_FILE, PictureContent, sensor_position
 from lidarview.render.film import ACTOR, SURFACE, Film
 from lidarview.render.theme import rgb
 from lidarview.viewer.packing import pack_column
+from lidarview.viewer.result_views import open_result
 from lidarview.viewer.sharing import film_of, page_of, share
-from lidarview.viewer.view import open_result
 
 COUNT = 3600
 SCANS = 360

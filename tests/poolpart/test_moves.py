@@ -10,7 +10,7 @@ import pytest
 from distributed import Event, secede
 from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, wait_for, worker_name
 
-from lidarpool.run.pipeline.placement import recorded
+from lidarpool.run.pipeline.task_records import recorded
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
 from poolpart.workers import worker_identities
 

@@ -10,7 +10,7 @@ from tests.clusters import thread_cluster
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.cluster.watch import WATCH_EVERY_S
 from lidarpool.run.pipeline.pipeline import Pipeline
-from lidarpool.run.pipeline.placement import placement_violations
+from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.trials import TrialPump
 from poolpart.workers import worker_identities
 

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
 from lidarpool.clouds import pieces
 from lidarpool.clouds.folder import result_folder
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -117,7 +117,7 @@ def test_its_page_and_that_of_its_run(result, scene, cluster_client, monkeypatch
         with urllib.request.urlopen(url, timeout=120) as page:
             assert page.status == 200
 
-    monkeypatch.setattr("lidarview.viewer.view.wait_for_interrupt", look)
+    monkeypatch.setattr("lidarview.viewer.result_views.wait_for_interrupt", look)
     result.view(port=0, browser=False)
     frames = []
     monkeypatch.setattr("lidarview.viewer.server.open_browser", lambda url: True)

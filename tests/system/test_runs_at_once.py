@@ -10,7 +10,7 @@ from tests.chaos.traces import scheduler_state, settled_differences
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError, Planning, Result, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.run.pipeline.placement import placement_violations
+from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.progress import Progress
 from poolpart import Pool
 

@@ -228,7 +228,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             "preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
         (
-            "lidarpool.run.pipeline.stages.pack",
+            "lidarpool.run.pipeline.long_stage_tasks.pack",
             raise_at(None),
             r"stage collect failed: scan \d+: FloatingPointError",
         ),

@@ -12,7 +12,7 @@ from pathlib import Path
 from distributed import Client
 from lidarpool import LidarError, Scene, Survey, read_cloud, simulate, save_cloud
 from lidarpool.cli.commands import main
-from lidarview.viewer.view import open_result, result_page
+from lidarview.viewer.result_views import open_result, result_page
 
 def command(*arguments):
     try:

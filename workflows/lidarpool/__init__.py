@@ -32,11 +32,12 @@ if TYPE_CHECKING:
     from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
-    from .clouds.formats import save_cloud
     from .clouds.open3d_cloud import to_open3d
     from .clouds.ply import read_cloud
-    from .comparing.comparison import Comparison, compare
+    from .clouds.writing import save_cloud
+    from .comparing.comparison import Comparison
     from .comparing.fit import Fit, fit
+    from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
     from .plan import Plan, Planning
@@ -117,7 +118,7 @@ _MODULES = {
     ".api.simulation": ("Campaign", "simulate"),
     ".datasets.loader": ("sweeps",),
     ".datasets.sweep_data": ("Sweep",),
-    ".clouds.formats": ("save_cloud",),
+    ".clouds.writing": ("save_cloud",),
     ".clouds.open3d_cloud": ("to_open3d",),
     ".clouds.ply": ("read_cloud",),
     ".run.pipeline.messages": ("ScanFrame",),
@@ -125,7 +126,8 @@ _MODULES = {
     ".plan": ("Plan", "Planning"),
     ".showing.playback.live": ("play",),
     ".report.merging": ("merge",),
-    ".comparing.comparison": ("Comparison", "compare"),
+    ".comparing.comparison": ("Comparison",),
+    ".comparing.two_clouds": ("compare",),
     ".comparing.fit": ("Fit", "fit"),
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lidarpool import Material, Noise, Survey, load_sensor
-from lidarpool.clouds.formats import Format
+from lidarpool.clouds.writing import Format
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.scene import Scene

@@ -16,7 +16,7 @@ from lidarsim.base.notebook import PICTURE_SIZE, cell_display, image_of, table_o
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural, scans_in_words
 
-from ..clouds.formats import save_cloud
+from ..clouds.writing import save_cloud
 from ..run.job_source import fields_of
 from ..run.run_result import RunResult
 
@@ -72,7 +72,7 @@ class Result(RunResult):
             format lacks a package or column.
         """
         from ..clouds.folder import output_place
-        from ..clouds.formats import Format
+        from ..clouds.writing import Format
         from ..report.output import SurveyOutput
 
         further_formats = [Format.from_entry(entry) for entry in formats]
@@ -133,7 +133,8 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from lidarsim.columns.cloud_file import CloudFile
-        from lidarview.viewer.view import View, result_page, wait_for_interrupt
+        from lidarview.viewer.result_views import result_page, wait_for_interrupt
+        from lidarview.viewer.view import View
 
         from ..showing.pages.downloads import downloads
 

@@ -134,11 +134,11 @@ def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
     """Play a recording of packets."""
-    from ..showing.playback.recording import Recording, play_recording, recorded_streams
+    from ..showing.playback.pcap_recording import PcapRecording, play_recording, recorded_streams
     from ..showing.playback.transmitter import Transmitter
     from .terminal import Terminal
 
-    recording = Recording(path)
+    recording = PcapRecording(path)
     streams = recorded_streams(recording, to, settings.get("api", ()))
     transmitter = Transmitter(streams, Terminal().tell, settings.get("lateness"))
     with _summarized(lambda: transmitter.summary), transmitter:

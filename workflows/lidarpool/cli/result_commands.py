@@ -152,7 +152,7 @@ def export(
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..clouds.folder import local_result, result_folder, send
-    from ..clouds.formats import Format
+    from ..clouds.writing import Format
 
     # The report of a result is moved into place last.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -256,7 +256,8 @@ def view(
     """  # noqa: D301 - click wants the character, not its name
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
     from lidarview.picture_file import PICTURE_FILE
-    from lidarview.viewer.view import CLOUD, show_view
+    from lidarview.viewer.result_views import show_view
+    from lidarview.viewer.view import CLOUD
 
     from ..clouds.folder import local_result
     from ..showing.pages.opened import growing_view, is_data_set, open_views
@@ -356,7 +357,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
       lidarpool compare scan.laz model.ply --unit-b ft
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..comparing.comparison import compare as compared
+    from ..comparing.two_clouds import compare as compared
 
     keep_freed_memory()
     comparison = compared(a, b, **settings)

@@ -194,7 +194,7 @@ def _show_coverage(
 ) -> None:
     """Print what the stations of a scenario see, and what a cloud covers of it."""
     from ..plan.stations import survey_coverage
-    from ..recordings.recordings import open_recording
+    from ..recordings.opening import open_recording
     from .terminal import Terminal
 
     if scenario.poses is None:

@@ -10,7 +10,7 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from lidarsim.base.vectors import applied
 from lidarsim.columns.cloud import Cloud
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 

@@ -403,7 +403,7 @@ FORMATS = {
 _READ_ONLY = {
     "text": FormatRow(
         "",
-        "lidarpool.clouds.scans",
+        "lidarpool.clouds.text_and_arrays",
         suffixes=(".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".npy"),
         reads=("sweeps", "points"),
     ),

@@ -17,7 +17,7 @@ from lidarsim.base.input_files import read_input, read_input_text
 from lidarsim.base.time_units import seconds_of
 from lidarsim.base.words import natural
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns, read_float_rows
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, plain_names

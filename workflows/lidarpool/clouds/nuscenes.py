@@ -19,7 +19,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names

@@ -20,7 +20,7 @@ import numpy as np
 from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.base.elementary import arctan2
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.motion.trajectory import matrices
+from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .boxes import Boxes, SweepBoxes

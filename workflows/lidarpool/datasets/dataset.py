@@ -29,10 +29,10 @@ from ..base.sealed import SealedWriter
 from ..clouds.boxes import Boxes
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
-from ..clouds.formats import Format
 from ..clouds.kitti import NAMES_FILE, labels_file
 from ..clouds.nuscenes import merge
 from ..clouds.pieces import Entry, Pieces, pieces_of
+from ..clouds.writing import Format
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")

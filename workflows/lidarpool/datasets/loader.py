@@ -32,9 +32,9 @@ from ..base.sealed import unsealed
 from ..clouds.boxes import Boxes
 from ..clouds.folder import refuse_missing
 from ..clouds.format_table import DATA_SETS
-from ..clouds.formats import Format
 from ..clouds.pieces import Entry
 from ..clouds.sweep_reader import Reader
+from ..clouds.writing import Format
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import Sweep

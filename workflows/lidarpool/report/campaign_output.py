@@ -22,7 +22,7 @@ from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
 from ..clouds.folder import LAST_FILE, refuse_missing, result_folder
 from ..clouds.format_table import DATA_SETS
-from ..clouds.formats import Format
+from ..clouds.writing import Format
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table

@@ -26,8 +26,8 @@ from ..base.field_words import differences
 from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
 from ..clouds.format_table import FORMATS, FormatRow, plugin_rows
-from ..clouds.formats import Format, refuse_strangers
 from ..clouds.navigation_files import write_instruments
+from ..clouds.writing import Format, refuse_strangers
 from ..columns.parts import StoredCloud
 from ..run.pipeline.messages import Receipt
 from ..run.run_result import RunResult

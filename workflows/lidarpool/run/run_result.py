@@ -17,8 +17,8 @@ from lidarsim.survey.survey import Survey
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
 from ..plan import Plan, Planning, Trial
-from .pipeline.placement import TaskRecord
 from .pipeline.task_book import StageTotals
+from .pipeline.task_records import TaskRecord
 
 
 @dataclass(frozen=True, eq=False)

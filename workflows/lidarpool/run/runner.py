@@ -1,13 +1,18 @@
 """A run of one or many jobs, from its options to its result: for commands and for Python.
 
-The way through the driver: `Run.execute` locks the output, opens the `RunStore` and makes the
-first `Job`; for what is left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each
-job to the `Pipeline`, whose stage 1 sends ranges of scans; the `Dispatcher` makes batches of them,
-and `CastingWorkers.submit` gives batches to a worker as a task. There `intersect` casts each batch
-by a `Rig`, as `lidarsim/simulator/pulses.py` tells. A collector stores the columns as a part and
-sends a `Receipt`, which the loop commits; stage 3 sends a `ScanFrame`, which `on_frame` gets. The
-parts of a job whose scans are committed go to the `JobWriter`, or become the points of a
-`RunResult`. `Output.finish` writes the files.
+The way through the driver: `Run.execute` locks the output, which may have the result already.
+Workers of this machine begin to start while the `RunStore` is opened. For the first `Job` with
+something left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each job, as a
+`JobUnderWay` of the store, to the `Pipeline`. Stage 1 sends ranges of scans; the `Dispatcher`
+makes batches of them, asks `policies.offers` which worker gets them, and `CastingWorkers.submit`
+gives them to that worker as a task. There `rigs.intersect` casts each batch by a `Rig`, as
+`lidarsim/simulator/pulses.py` tells. The dispatcher sends a `CollectOrder` to a collector, which
+stores the columns as a part and sends a `Receipt`; `Pipeline` commits it. Of a survey, stage 3
+returns the `Summaries` of scans in order, and the pipeline hands a `ScanFrame` of each to
+`on_frame`. The parts of a campaign's job whose scans are committed go to the `JobWriter`, and
+`RunLoop` commits the job's row; those of a survey become the points of a `RunResult`.
+`Output.finish` makes the result: files of a survey (`report/output.py`) or a campaign
+(`report/campaign_output.py`).
 """
 
 from __future__ import annotations

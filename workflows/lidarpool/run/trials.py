@@ -12,7 +12,7 @@ from poolpart.task_locations import TaskLocations
 from ..plan import Planning, Trial, run_trial
 from .cluster.tasks import Tasks
 from .pipeline.failures import raise_if_failed, was_killed
-from .pipeline.placement import recorded
+from .pipeline.task_records import recorded
 
 TRIAL = "trial"
 MAX_ROUNDS = 3  # submissions of a trial whose workers die

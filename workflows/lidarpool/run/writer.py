@@ -30,7 +30,7 @@ from .cluster.tasks import Tasks
 from .pipeline.casting_workers import share
 from .pipeline.failures import JobError, raise_if_failed, was_killed
 from .pipeline.names import EXPORT, LIDAR
-from .pipeline.placement import Recorder, TaskRecord
+from .pipeline.task_records import Recorder, TaskRecord
 from .run_result import RunResult
 from .store.run_store import RunStore
 

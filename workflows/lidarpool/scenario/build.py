@@ -38,14 +38,19 @@ from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.format_table import check_whole
-from ..clouds.formats import Format
 from ..clouds.laser_scan import with_laser_scans
 from ..clouds.packets import with_packet_columns
+from ..clouds.writing import Format
 from ..plan import Planning
 from ..plan.planning import Search
-from .actor_motion import (
-    ActorSection,
-    MountSection,
+from .actor_motion import ActorSection, MountSection
+from .ground import StandingSurfaces
+from .osi_traffic import OSI_SUFFIXES, read_osi
+from .placing import Placing, place_sensor
+from .scenario import Scenario
+from .sections import CopiesSection, SensorSection
+from .static_scene import Findings, SceneCache, Shapes, read_static_scene
+from .traffic import (
     TrafficContent,
     TrafficSection,
     TravellerChoice,
@@ -54,12 +59,6 @@ from .actor_motion import (
     carrier_of,
     read_fcd,
 )
-from .ground import StandingSurfaces
-from .osi_traffic import OSI_SUFFIXES, read_osi
-from .placing import Placing, place_sensor
-from .scenario import Scenario
-from .sections import CopiesSection, SensorSection
-from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2

@@ -53,7 +53,7 @@ from lidarsim.base.words import did_you_mean_each, in_yaml, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
-from ..clouds.formats import Format
+from ..clouds.writing import Format
 from ..datasets.job_table import Value
 from .sections import IgnoredColumns, Section, may_be_empty
 

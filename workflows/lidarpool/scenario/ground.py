@@ -12,7 +12,8 @@ from lidarsim.base.arrays import Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import name_hint
 from lidarsim.media.materials import rows_named
-from lidarsim.motion.trajectory import Track, quaternions_of
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.motion.trajectory import Track
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from raybeam import RayCaster, available_backends

@@ -17,10 +17,11 @@ from lidarsim.base.extras import need, reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import plural
 from lidarsim.columns.mcap_chunks import check_chunks
-from lidarsim.motion.trajectory import Track, quaternions_of, rotations_of
+from lidarsim.motion.rotations import quaternions_of, rotations_of
+from lidarsim.motion.trajectory import Track
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .actor_motion import (
+from .traffic import (
     HOST,
     TrafficClock,
     TrafficContent,

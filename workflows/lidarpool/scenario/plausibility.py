@@ -12,7 +12,8 @@ from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import as_scenario, printable
-from lidarsim.motion.trajectory import Track, full_poses, matrices, quaternions_of, velocities
+from lidarsim.motion.rotations import matrices, quaternions_of
+from lidarsim.motion.trajectory import Track, full_poses, velocities
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor

@@ -28,7 +28,7 @@ from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
-from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrafficSection, TrajectoryEntry
+from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrajectoryEntry
 from .named_files import field_that_names
 from .sections import (
     CopiesSection,
@@ -45,6 +45,7 @@ from .sections import (
     may_be_empty,
     scene_in_short,
 )
+from .traffic import TrafficSection
 
 # Options of a mesh file without a scenario, and the fields of a scenario for them.
 MESH_OPTIONS = {

@@ -59,7 +59,7 @@ from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 from lidarsim.survey.survey import EpsgCode, Mounted
 
-from ..clouds.formats import Format
+from ..clouds.writing import Format
 from ..plan.planning import Search
 
 MAX_COPIES = 1_000_000  # of an entry

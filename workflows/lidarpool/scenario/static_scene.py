@@ -18,7 +18,7 @@ from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.words import plural
 from lidarsim.motion.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
-from lidarsim.motion.trajectory import rotations_of
+from lidarsim.motion.rotations import rotations_of
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.mesh_formats import format_of, option_names
 from lidarsim.scene.files.meshfile import Objects, load_objects

@@ -12,7 +12,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import shown
 from lidarsim.base.vectors import length, matmul
 from lidarsim.base.words import did_you_mean, printable
-from lidarsim.motion.trajectory import matrices, rotations_of
+from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
 
 MAX_NUMBER = 1e8  # in a file, but for poses

@@ -15,7 +15,7 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.time_units import seconds_of
-from lidarsim.motion.trajectory import quaternions_of
+from lidarsim.motion.rotations import quaternions_of
 from lidarsim.scene.transform import rotation_about
 
 from .files import Assets, clean, flag, number, read, vector

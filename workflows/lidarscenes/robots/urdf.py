@@ -24,7 +24,7 @@ from lidarsim.base.validation import checked, shown
 from lidarsim.base.vectors import length
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
-from lidarsim.motion.trajectory import rotations_of
+from lidarsim.motion.rotations import rotations_of
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials

@@ -15,7 +15,8 @@ from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean
 from ..columns.bags import messages_of, opened_bag
 from .navigation import local_positions
-from .trajectory import Track, quaternions_of
+from .rotations import quaternions_of
+from .trajectory import Track
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader

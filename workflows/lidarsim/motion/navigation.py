@@ -32,7 +32,8 @@ from ..base.extras import install_command
 from ..base.random_numbers import Purpose, named_seed, normal
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
-from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, rotation_sines, velocities
+from .rotations import rotation_sines
+from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, velocities
 
 WHITE = Purpose(41, "white noise of an instrument")
 DRIVEN = Purpose(42, "steps of an instrument's bias")

@@ -19,7 +19,7 @@ from ..base.elementary import log, sin_cos
 from ..base.elementary_scalars import sin_cos_of
 from ..base.input_files import read_input_text
 from ..base.words import natural
-from .trajectory import quaternions_of, rotations_of
+from .rotations import quaternions_of, rotations_of
 
 WIDTH = 30  # numbers of a row
 _RADIUS_M = 6378137.0  # of KITTI's Mercator projection

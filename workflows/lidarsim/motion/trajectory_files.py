@@ -30,14 +30,8 @@ from .pose_columns import (
     angles_of,
     with_yaw,
 )
-from .trajectory import (
-    QUATERNION_SLACK,
-    Beyond,
-    Track,
-    check_rotations,
-    quaternions_of,
-    rotations_of,
-)
+from .rotations import check_rotations, quaternions_of, rotations_of
+from .trajectory import QUATERNION_SLACK, Beyond, Track
 
 TrajectoryFormat = Literal["tum", "kitti", "csv", "oxts", "bag"]
 Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]

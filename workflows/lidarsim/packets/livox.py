@@ -15,7 +15,7 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
 from ..base.vectors import applied, inverse, matmul
-from ..motion.trajectory import matrices
+from ..motion.rotations import matrices
 from .encoders import Datagrams, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
 from .service import Destination, Service

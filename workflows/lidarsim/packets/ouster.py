@@ -25,7 +25,7 @@ from ..base.errors import LidarError
 from ..base.extras import reading
 from ..base.input_files import input_size
 from ..base.vectors import applied, inverse, matmul
-from ..motion.trajectory import matrices
+from ..motion.rotations import matrices
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource

@@ -14,16 +14,15 @@ from ..base.elementary import interp
 from ..base.errors import LidarError, prefixed
 from ..base.validation import checked_fields
 from ..base.vectors import length, products, turned
+from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
     CENTRE,
     StaticPose,
     Stations,
     Track,
     Trajectory,
-    check_rotations,
     full_poses,
     presence_ns,
-    quaternions_of,
 )
 from . import face_materials
 from .colours import join_colours

@@ -11,15 +11,8 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Bools, Floats
 from ..base.errors import LidarError, prefixed
 from ..base.validation import shown
-from ..motion.trajectory import (
-    CENTRE,
-    Pose,
-    StaticPose,
-    Track,
-    Trajectory,
-    check_rotations,
-    pose_of,
-)
+from ..motion.rotations import check_rotations
+from ..motion.trajectory import CENTRE, Pose, StaticPose, Track, Trajectory, pose_of
 
 ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
 

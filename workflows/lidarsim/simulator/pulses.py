@@ -1,13 +1,14 @@
 """Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
-The way through a worker: `Rig.cast` finds the `Firings` of some scans and the `CastPoses` of their
-beams. `PulseCaster.scan` makes a `PulseBatch` of them and passes `PulseReturns` through the steps:
-first those that aim beams, then `CastStep`, which finds the hits of all rays, then those that make
-returns of hits, detect, lose and choose returns. What is kept of them is `Scanned`; the last steps
-change what is reported. `BatchPoints` makes positions and columns of it. Without steps between aim
-and report, each ray has one return: the caster itself counts and thins out its hits.
-
-Random numbers depend only on scan, ray and return, so batches do not change the result.
+The way through a worker: `Rig.cast` groups scans, and `Rig.returns` finds the `Firings` of a group
+and the `CastPoses` of its beams. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at
+a time and passes `PulseReturns` through the steps in the order of `step_list.py`: steps that aim
+beams; `CastStep`, which finds the hits of all rays; steps that add light of rain, spray and dirt;
+those that make returns of hits, detect, receive, lose and choose returns. What is kept of them is
+`Scanned`. Steps on reported returns get all beams at once, and returns out of range are removed.
+`BatchPoints` holds it, of which `columns_of` makes columns. If each ray can have one return only
+(`Setup.has_several_returns`), `SceneCaster` itself counts and thins out the hits; on CUDA without
+steps, `DeviceColumns` does all of it.
 """
 
 from __future__ import annotations

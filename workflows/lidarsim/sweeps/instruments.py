@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..base.input_files import open_input
-from ..motion.trajectory import Pose, quaternions_of
+from ..motion.rotations import quaternions_of
+from ..motion.trajectory import Pose
 from ..survey.survey import Survey
 
 IMU_FILE = "imu.csv"

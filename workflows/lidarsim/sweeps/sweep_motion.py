@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Floats, Floats32, Ints
-from ..motion.trajectory import Pose, Trajectory, full_poses, quaternions_of
+from ..motion.rotations import quaternions_of
+from ..motion.trajectory import Pose, Trajectory, full_poses
 from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
 

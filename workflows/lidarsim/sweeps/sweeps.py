@@ -19,14 +19,8 @@ from ..base.errors import LidarError
 from ..base.vectors import applied, cross
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
-from ..motion.trajectory import (
-    CLOCK_S,
-    full_poses,
-    matrices,
-    presence_ns,
-    quaternions_of,
-    velocities,
-)
+from ..motion.rotations import matrices, quaternions_of
+from ..motion.trajectory import CLOCK_S, full_poses, presence_ns, velocities
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Sensor

@@ -12,7 +12,7 @@ from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarError
 from ..base.vectors import applied, length, matmul, turned
 from ..base.words import name_hint, plural
-from ..motion.trajectory import matrices as rotations_of_quaternions
+from ..motion.rotations import matrices as rotations_of_quaternions
 from ..scene.colours import LINEAR, Colours, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked

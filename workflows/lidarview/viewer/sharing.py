@@ -30,10 +30,11 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ..picture_file import SensorPositions
 from ..render.colouring import TURBO
 from ..render.film import Film
+from .legends import legend_of
 from .packing import pack_column, pack_positions
 from .point_selection import PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
-from .view import View, legend_of
+from .view import View
 
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
 _MIN_FRAMES = 30

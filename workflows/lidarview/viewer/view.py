@@ -6,38 +6,29 @@ import math
 import shutil
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Event
 from typing import Any
 
-import click
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints, Ints32
+from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.errors import LidarError
-from lidarsim.base.notebook import cell_display
-from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.colours import as_bytes
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import simplified
-from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarsim.sweeps.sweeps import Sweeps
 from raybeam import RayCaster
 
 from ..picture_file import (
     MAX_POSITIONS,
-    PICTURE_FILE,
     PictureContent,
     SensorPositions,
     moving_positions,
@@ -45,19 +36,14 @@ from ..picture_file import (
 from ..render.closeup import floor_and_cut, surrounding_box
 from ..render.colouring import (
     MAX_UNNAMED_LABELS,
-    NORMALS,
-    RGB,
-    TURBO,
     Colouring,
     colours_of,
-    colours_of_normals,
     values_of,
     with_composed,
     word_of,
 )
-from ..render.hit_density import HITS_TITLE, hit_colours
-from ..render.surface import separate_objects
-from ..render.theme import mapped, object_colours
+from ..render.theme import object_colours
+from .legends import Legend, legend_of
 from .point_selection import (
     BLOCK_ROWS,
     RESULT,
@@ -65,7 +51,6 @@ from .point_selection import (
     Eye,
     Filter,
     HeldPoints,
-    JoinedPoints,
     OrderedPoints,
     PointFinder,
     Points,
@@ -74,7 +59,9 @@ from .point_selection import (
     positions,
     read_scans,
 )
-from .server import PORT, Answer, Arguments, PageServer, announced, page_server
+from .range_pictures import are_around, range_image
+from .server import Answer, Arguments
+from .shown_surface import HITS_SAMPLE, MAX_TRIANGLES, ShownSurface, colours_for
 
 MAX_POINTS = 20_000_000  # in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
@@ -82,25 +69,9 @@ _SAMPLE = 100_000  # points from which colour scales and limits are computed
 _MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
 _CORNERS = 1000  # points of a cloud that are in the first picture
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
-_HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
-_IMAGE_WIDTH = 1024  # most columns of a range image
-_IMAGE_ROWS = 128  # of a range image, unless its rows are channels
-_COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
-_MIN_CHANNELS = 4  # of a sensor whose channels are the rows of a range image
-_MAX_CHANNELS = 512  # likewise
-_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation; below, the sensor looks down
-_MAX_FIELD_RAD = math.radians(300)  # a wider field of view is shown as 360°
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
-MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colours
-MAX_PIECES = 60_000  # further triangles from dividing large triangles, to show hits
-# Surfaces are moved inwards by this share of the scene's diagonal, or of `_MAX_SIZE_M` if that is
-# smaller: two centimetres.
-_INWARD_SHARE = 1e-4
-_MAX_SIZE_M = 200.0
-MAX_LABELS = 1000  # in a legend
-Legend = dict[str, Any]  # JSON for the page: of `legend_of` or `scale_legend`
 CLOUD = "cloud.ply"
 
 
@@ -255,7 +226,7 @@ class View:
             level = corners[:, 2].min()
             corners = np.vstack([corners, [*planning.start, level], [*planning.target, level]])
         all_corners = np.vstack([corners, sensors])
-        if not _are_around(sensors, scene.bounds):
+        if not are_around(sensors, scene.bounds):
             corners = all_corners
         return scene.origin, np.stack([all_corners.min(axis=0), all_corners.max(axis=0)]), corners
 
@@ -613,7 +584,7 @@ class View:
             if not len(hit_counts):  # before a run
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
-            rows, _ = self._finder.find(_HITS_SAMPLE)
+            rows, _ = self._finder.find(HITS_SAMPLE)
             if "object" in self.columns:  # points on static objects only
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
@@ -665,70 +636,6 @@ class View:
         return {"low": limits[0], "high": limits[1], "sensor": sensor}, {"image": image}
 
 
-def range_image(
-    points: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
-) -> Bytes:
-    """Return a range image of points, RGBA (rows, columns, 4).
-
-    `points` (n, 3) are in the sensor frame, `ranges` (n,) their distances from the sensor, metres;
-    `channels` (n,) are None if unknown; `limits` are the ranges at the ends of the colour scale.
-
-    Of several points in a pixel the nearest is shown. Rows are channels, the highest above, or
-    steps of elevation if the sensor has few or very many channels. Columns are steps of azimuth
-    from left to right. A sensor that looks down has a single row, of angles across its trajectory.
-    Empty pixels are transparent.
-    """
-    looks_down = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
-    azimuth = np.arctan2(points[:, 1], -points[:, 2] if looks_down else points[:, 0])
-    left_rad = float(azimuth.max())
-    right_rad = float(azimuth.min())
-    if left_rad - right_rad > _MAX_FIELD_RAD:
-        left_rad = math.pi
-        right_rad = -math.pi
-    field_rad = left_rad - right_rad
-    if looks_down:
-        row_count = 1
-        row = np.zeros(len(points), np.int64)
-    else:
-        row, row_count = _image_rows(points, ranges, channels)
-    fullest_row_azimuth = azimuth[row == np.bincount(row).argmax()]
-    # Mean step of azimuth in the row with the most points; columns are a little wider.
-    spacing_rad = float(np.ptp(fullest_row_azimuth)) / len(fullest_row_azimuth)
-    width = int(np.clip(_COLUMN_SHARE * field_rad / max(spacing_rad, 1e-9), 32, _IMAGE_WIDTH))
-    column = ((left_rad - azimuth) * (width / max(field_rad, 1e-9))).astype(np.int64)
-    image = np.zeros((row_count, width, 4), np.uint8)
-    order = np.argsort(-ranges, kind="stable")  # the nearest is written last
-    image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]
-    return image
-
-
-def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
-    """Return the rows (n,) of points in a range image, 0 at the top, and the number of rows."""
-    if channels is not None:
-        count = int(channels.max()) + 1
-        if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
-            return count - 1 - channels, count
-    elevation = np.arcsin(points[:, 2] / np.maximum(ranges, 1e-9))
-    span = float(np.ptp(elevation)) or 1.0
-    row = ((elevation.max() - elevation) * ((_IMAGE_ROWS - 1) / span)).astype(np.int64)
-    return row, _IMAGE_ROWS
-
-
-def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
-    """Return the colours (n, 4) of ranges (n,) between limits."""
-    lower, upper = limits
-    shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
-    colours = np.full((len(ranges), 4), 255, np.uint8)
-    colours[:, :3] = as_bytes(mapped("viridis_r", shade))
-    return colours
-
-
-def _are_around(sensors: Floats, bounds: Floats) -> bool:
-    """Return True if all sensors (n, 3), n > 1, are beside or above an object's bounds (2, 3)."""
-    outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
-    return len(sensors) > 1 and bool(outside.all())
-
-
 def _read_limits(text: str) -> tuple[float, float]:
     """Read the ends of a colour scale, ``lowest,highest``; ValueError if they are in disorder."""
     lower, upper = map(float, text.split(","))
@@ -758,152 +665,6 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     inside = sample[((sample >= box[0]) & (sample <= box[1])).all(axis=1)]
     few = inside[:: len(inside) // _CORNERS + 1] if len(inside) else corners_of(box)
     return origin, box - origin, few - origin
-
-
-class ShownSurface:
-    """A scene's triangles in chosen colours, simplified to a maximum number.
-
-    Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
-    triangle that vanishes go to a neighbour. `reflectance` is the share of the light that each
-    object reflects, (objects,), if known; `face_materials` (f,) are indices into the names of
-    materials, -1 for none.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        reflectance: Floats | None = None,
-        max_triangles: int = MAX_TRIANGLES,
-        face_materials: Ints32 | None = None,
-        material_names: Sequence[str] = (),
-    ) -> None:
-        self.coarse = scene
-        self._reflectance = reflectance
-        # (f,): shown triangle that replaces each triangle of the scene; -1 if none does.
-        self._replacements = np.arange(len(scene.faces))
-        if len(scene.faces) > max_triangles:
-            self.coarse, self._replacements = simplified(scene, max_triangles)
-        self._material_names = material_names
-        self._materials: Ints | None = None  # (shown triangles,)
-        if face_materials is not None:
-            self._materials = np.full(len(self.coarse.faces), -1)
-            is_shown = self._replacements >= 0
-            self._materials[self._replacements[is_shown]] = face_materials[is_shown]
-        self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
-        size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
-        moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
-        self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
-
-    def coloured(
-        self, by: str, hit_counts: AnyArray, points: Floats32
-    ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and a legend.
-
-        Corners are local, metres; objects are indices of static objects.
-
-        `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        a sample of the hit points, (n, 3). There are no colours for "grey", which the page defines.
-        """
-        arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
-        legend: Legend | None = None
-        if by == "hits":
-            return self._coloured_by_hits(hit_counts, points)
-        if by == "object":
-            colouring = colours_of(self._objects, OBJECT, self.coarse.names)
-            colours = colouring.paint(self._objects)
-            legend = legend_of(colouring)
-        elif by == "reflectance" and self._reflectance is not None:
-            colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
-            greys = mapped("gray", np.linspace(0.1, 1.0, 9))
-            legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
-        elif by == "material" and self._materials is not None:
-            colouring = colours_of(self._materials, TABLE["material"], self._material_names)
-            colours = colouring.paint(self._materials)
-            legend = legend_of(colouring)
-        elif by == "normals":
-            a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            colours = colours_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
-            legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
-        elif by == "colour" and self.coarse.colours is not None:
-            colours = self.coarse.colours.means() / 255
-        else:
-            return arrays, None
-        corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
-        return arrays | {"colours": corners}, legend
-
-    def _coloured_by_hits(
-        self, hit_counts: AnyArray, points: Floats32
-    ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays and the legend of `coloured`, for hits per square metre.
-
-        `hit_counts` (f,) are of the original scene's triangles; `points` (n, 3) are a sample of
-        hits, local, metres. Large triangles are divided, so that pieces show where the hits are.
-        """
-        is_shown = self._replacements >= 0
-        hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
-        max_pieces = len(self.corners) + MAX_PIECES
-        corners, owner, colours, (lower, upper) = hit_colours(
-            self.coarse, self.corners, hits.astype(float), points, max_pieces
-        )
-        arrays: dict[str, AnyArray] = {
-            "corners": corners,
-            "objects": self._objects[owner],
-            "colours": as_bytes(colours),
-        }
-        densities = (lower, (lower * upper) ** 0.5, upper)
-        marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in densities]
-        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
-
-
-def colours_for(
-    scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
-) -> tuple[str, ...]:
-    """Return the names by which `ShownSurface.coloured` can colour a scene.
-
-    "reflectance" needs several values (objects,), "material" those of faces, "colour" a scene with
-    colours.
-    """
-    scene_colours = ("colour",) if scene.coloured else ()
-    reflectances = (
-        ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
-    )
-    materials = () if face_materials is None else ("material",)
-    return ("grey", "hits", "object", "normals", *reflectances, *materials, *scene_colours)
-
-
-def legend_of(colouring: Colouring) -> Legend:
-    """Return the legend of colours: a scale with numbers, or labels with their values."""
-    if colouring.name in (RGB.name, NORMALS.name):
-        return scale_legend(colouring.meaning, (), np.empty((0, 3)))
-    if colouring.limits is None:
-        labels = [
-            [name, as_bytes(colour).tolist(), value]
-            for (name, colour), value in zip(colouring.labels, colouring.values, strict=True)
-        ]
-        hidden = len(labels) - MAX_LABELS
-        return {"labels": labels[:MAX_LABELS], "more": max(hidden, 0), "column": colouring.name}
-    lower, upper = colouring.limits
-    title = f"{colouring.name}, {colouring.unit}" if colouring.unit else colouring.name
-    title += f": {colouring.meaning}" if colouring.meaning else ""
-    if colouring.logarithmic:
-        marks = [f"{number:.2g}" for number in (lower, (lower * upper) ** 0.5, upper)]
-    else:  # as many digits as a bar of this span needs, and never -0
-        digits = int(np.clip(np.ceil(1 - np.log10(upper - lower)), 0, 6)) if upper > lower else 2
-        marks = [
-            f"{round(number, digits) + 0.0:,.{digits}f}"
-            for number in (lower, (lower + upper) / 2, upper)
-        ]
-    return scale_legend(title, marks, colouring.scale[::15]) | {
-        "limits": [float(lower), float(upper)],
-        "logarithmic": colouring.logarithmic,
-    }
-
-
-def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
-    """Return the legend of a scale of colours (n, 3), 0 to 1, with evenly spread marks."""
-    return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
 
 
 class GrowingView:
@@ -953,110 +714,3 @@ class GrowingView:
         view.version += self._view.version
         self._view = view
         self._complete = True
-
-
-@contextmanager
-def result_page(
-    view: View | GrowingView, *, port: int = PORT, browser: bool = True
-) -> Iterator[PageServer]:
-    """Serve the page of a result while the body runs, and announce its address."""
-    count = view.total if isinstance(view, GrowingView) else len(view.points)
-    shows = f"shows {plural(count, 'point')}"
-    shows += "" if cell_display() else "; Ctrl-C ends it"
-    with (
-        page_server(view.answer, port) as page,
-        announced(page, f"{page.url} {shows}", browser, on_stdout=True),
-    ):
-        yield page
-
-
-def wait_for_interrupt(stopped: Event | None = None) -> None:
-    """Keep a page open until Ctrl-C, or until its user stops the page."""
-    stopped = stopped or Event()
-    with suppress(KeyboardInterrupt):
-        while not stopped.wait(0.2):  # Ctrl-C does not end an unlimited wait everywhere
-            pass
-
-
-def show_view(view: View | GrowingView, *, port: int, browser: bool = True) -> None:
-    """Show a view in the browser until Ctrl-C."""
-    if view.note:
-        click.echo(f"note: {view.note}", err=True)
-    with result_page(view, port=port, browser=browser):
-        wait_for_interrupt()
-
-
-def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
-    """Open results of surveys of the same scene as a view of all their points.
-
-    The scene, sensors and actors are those of the first result.
-
-    The view can be played if the sweeps of all results start at the same times. LidarError if a
-    result has no cloud, a damaged cloud, or points in the frames of the sensors.
-    """
-    return join_views(paths, [open_result(path, downloads) for path in paths], downloads)
-
-
-def join_views(
-    paths: Sequence[Path], views: Sequence[View], downloads: Downloads | None = None
-) -> View:
-    """Return a view of all points of the views of results, see `open_results`."""
-    first, *other_views = views
-    if not other_views:
-        return first
-    notes = [view.note for view in views]
-    in_sensor_axes = [
-        path for path, note in zip(paths, notes, strict=True) if IN_SENSOR_AXES in note
-    ]
-    if in_sensor_axes:
-        raise LidarError(
-            f"{in_sensor_axes[0]} has points in the axes of its sensors, which "
-            "fit no other result: show it alone, or run it with cloud.coordinates: world."
-        )
-    names = [path.resolve().name for path in paths]
-    names = names if len({*names}) == len(names) else [str(path) for path in paths]
-    starts = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
-    sweeps = first.sweeps if all(np.array_equal(starts[0], times) for times in starts) else None
-    points = JoinedPoints([view.points for view in views])
-    codes = {view.epsg for view in views}
-    title = f"{' and '.join(names)} - lidarpool"
-    return View(
-        points,
-        first.pictured,
-        sweeps,
-        " ".join(notes).strip(),
-        title,
-        results=names,
-        downloads=downloads,
-        stated_epsg=codes.pop() if len(codes) == 1 else None,
-    )
-
-
-def open_result(path: Path, downloads: Downloads | None = None) -> View:
-    """Open a cloud or the folder of a result, with its scene and sweeps if they are in the folder.
-
-    A scene or sweeps that cannot be read are noted only. LidarError if there is no cloud, or a
-    damaged cloud.
-    """
-    if not path.exists():
-        raise LidarError(f"{path} does not exist: give the folder of a result, or a cloud.")
-    title = f"{path.resolve().name} - lidarpool"
-    if not path.is_dir():
-        return View(CloudFile(path), title=title, downloads=downloads)
-    cloud = path / CLOUD
-    if not cloud.exists():
-        raise LidarError(
-            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
-        )
-    scene_file = path / PICTURE_FILE
-    sweeps_file = path / SWEEPS_FILE
-    pictured = None
-    sweeps = None
-    note = ""
-    try:
-        sweeps = Sweeps.load(sweeps_file) if sweeps_file.exists() else None
-        pictured = PictureContent.load(scene_file) if scene_file.exists() else None
-    except LidarError as error:
-        note = f"The cloud is shown without all that belongs to it. {error}"
-    file = CloudFile(cloud, pictured.extra_columns if pictured else ())
-    return View(file, pictured, sweeps, note, title, downloads=downloads)

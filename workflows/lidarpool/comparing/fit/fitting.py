@@ -29,7 +29,7 @@ from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_m
 
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
-from ...recordings.recordings import open_recording
+from ...recordings.opening import open_recording
 from ...report.page.rendering import rendered
 from .charts import draw_charts
 from .estimates import Estimate

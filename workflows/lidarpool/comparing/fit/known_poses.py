@@ -13,7 +13,8 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.sampling import even_indices
 from lidarsim.base.words import plural
-from lidarsim.motion.trajectory import Pose, check_rotations, pose_of
+from lidarsim.motion.rotations import check_rotations
+from lidarsim.motion.trajectory import Pose, pose_of
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweep_motion import FiringPoses

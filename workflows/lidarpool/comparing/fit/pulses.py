@@ -15,7 +15,8 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 from lidarsim.base.sampling import even_indices
 from lidarsim.columns.table import NORMAL
-from lidarsim.motion.trajectory import Pose, matrices
+from lidarsim.motion.rotations import matrices
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor

@@ -31,8 +31,8 @@ from lidarsim.sensor import Noise, Returns
 from lidarview.render.stage import nice_step
 
 from ...clouds.format_table import data_set_title
-from ...run.pipeline.placement import TaskRecord
 from ...run.pipeline.task_book import StageTotals, union
+from ...run.pipeline.task_records import TaskRecord
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
 from ..cloud_counts import CloudCounts

@@ -21,7 +21,7 @@ from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
-from ...clouds.formats import Format
+from ...clouds.writing import Format
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError

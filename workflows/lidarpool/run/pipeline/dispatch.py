@@ -24,7 +24,7 @@ from .failures import JobError
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .pipeline_job import PipelineJob
-from .placement import TaskRecord
+from .task_records import TaskRecord
 
 MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a request to stage 1
 PIECES = 16  # batches, at most, that a batch is divided into when its worker has died with it alone

@@ -5,7 +5,7 @@ run, in the keys of its tasks as well; N grows each time that a stage is started
 
 ===============================  ============================================
 lidarpool-RUN-scans              ranges of scans, from stage 1 to the driver
-lidarpool-RUN-news               frames, receipts and errors, from stages 3 and 4 to the driver
+lidarpool-RUN-news               summaries in order, receipts and errors, from stages 3 and 4
 lidarpool-RUN-generate-N         surveys to describe, from the driver to stage 1
 lidarpool-RUN-sort-N             summaries, from the driver to stage 3
 lidarpool-RUN-collect-C-N        batches to collect, from the driver to collector C of stage 4
@@ -33,10 +33,10 @@ from poolpart.task_locations import TaskLocations, look_for_tasks
 from ...base.software import call_with_same_sources
 from ...columns.parts import probe_name
 from .failures import memory_clause, raise_if_failed, storing, was_killed
+from .long_stage_tasks import collect, generate, sort_frames
 from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .names import COLLECT, GENERATE, SORT
-from .placement import TaskRecord
-from .stages import collect, generate, sort_frames
+from .task_records import TaskRecord
 
 LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # time for a submitted task to start

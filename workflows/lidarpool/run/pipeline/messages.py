@@ -20,7 +20,7 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.survey.survey import Survey
 
 from ...base.tracing import trace
-from .placement import TaskRecord
+from .task_records import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end
 
@@ -159,7 +159,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """A scan from stage 3, in scan order, whose points are in storage.
+    """A scan in the order of stage 3, whose points are in storage.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ from ...base.tracing import trace
 from .failures import DeviceLost, ScanError, naming_scans
 from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
-from .placement import Recorder, TaskRecord
+from .task_records import Recorder, TaskRecord
 
 logger = logging.getLogger(__name__)
 

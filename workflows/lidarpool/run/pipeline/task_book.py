@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from .placement import TaskRecord
+from .task_records import TaskRecord
 
 MAX_RECORDS = 4096  # of a stage; beyond that every second record is dropped, repeatedly
 MAX_MISPLACED = 20  # records of a stage; all are counted

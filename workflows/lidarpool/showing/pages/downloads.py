@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lidarview.viewer.view import Downloads
 
-from ...clouds.formats import Format, save_cloud
+from ...clouds.writing import Format, save_cloud
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 

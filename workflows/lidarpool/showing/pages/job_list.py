@@ -18,8 +18,9 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
+from lidarview.viewer.result_views import wait_for_interrupt
 from lidarview.viewer.server import Answer, Arguments, announced, page_server
-from lidarview.viewer.view import View, wait_for_interrupt
+from lidarview.viewer.view import View
 
 from ...clouds.format_table import data_set_title
 from ...datasets.dataset import job_file

@@ -29,6 +29,7 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.picture_file import PictureContent
 from lidarview.viewer.point_selection import HeldPoints
+from lidarview.viewer.result_views import open_result, wait_for_interrupt
 from lidarview.viewer.server import (
     PORT,
     VIEWER,
@@ -38,7 +39,7 @@ from lidarview.viewer.server import (
     announced,
     page_server,
 )
-from lidarview.viewer.view import View, open_result, wait_for_interrupt
+from lidarview.viewer.view import View
 from poolpart import Partition, PartitionStats
 
 from ...columns.parts import read_part

@@ -18,7 +18,8 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.text_cloud import is_text_raster
-from lidarview.viewer.view import CLOUD, GrowingView, View, join_views, open_result
+from lidarview.viewer.result_views import join_views, open_result
+from lidarview.viewer.view import CLOUD, GrowingView, View
 
 from ...datasets.dataset import INDEX_FILE
 from .downloads import downloads
@@ -112,7 +113,7 @@ def _is_previewed(path: Path) -> bool:
 
 def _recorded(path: Path, title: str, keep_noise: bool) -> View:
     """Return the view of a recording."""
-    from ...recordings.recordings import UnknownFormatError, open_sensors
+    from ...recordings.opening import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
     may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
@@ -137,7 +138,7 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> GrowingView | None:
     """
     if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
         return None
-    from ...recordings.recordings import open_recording
+    from ...recordings.opening import open_recording
     from .recorded import LARGE_POINTS, sampled_view
 
     recording = open_recording(path, keep_noise=keep_noise)

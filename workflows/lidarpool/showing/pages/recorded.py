@@ -14,7 +14,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import TABLE, Column, Kind, Scale
-from lidarsim.motion.trajectory import quaternions_of
+from lidarsim.motion.rotations import quaternions_of
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
 from lidarview.viewer.view import Downloads, View

@@ -25,7 +25,8 @@ from lidarsim.base.notebook import cell_display
 from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
-from lidarsim.motion.trajectory import Pose, quaternions_of
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator import Scanner
 from lidarview.picture_file import PictureContent, SensorPositions

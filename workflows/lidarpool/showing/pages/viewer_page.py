@@ -20,7 +20,7 @@ import numpy as np
 
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
-from lidarview.viewer.view import wait_for_interrupt
+from lidarview.viewer.result_views import wait_for_interrupt
 
 from ...clouds.frames import WORLD
 from ...clouds.shown_sweeps import (

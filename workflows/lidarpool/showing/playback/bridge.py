@@ -15,7 +15,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
-from ...clouds.formats import Format
+from ...clouds.writing import Format
 from .bridge_table import BRIDGES
 from .schedule import Schedule
 

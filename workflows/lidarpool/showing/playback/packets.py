@@ -12,7 +12,7 @@ from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...clouds.formats import Format
+from ...clouds.writing import Format
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 from .transmitter import Transmitter, sensor_streams

@@ -13,10 +13,10 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...clouds.formats import Format
 from ...clouds.frames import survey_start_ns
 from ...clouds.ros.layouts import LaidOut
 from ...clouds.ros.messages import RosMessage, SurveyMessages
+from ...clouds.writing import Format
 from .bridge import Bridge, BridgeOptions
 from .dds import Network, RosPublisher
 from .schedule import Schedule

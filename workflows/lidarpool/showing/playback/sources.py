@@ -24,8 +24,8 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent
 
 from ...clouds.folder import local_result
-from ...clouds.formats import Format
 from ...clouds.navigation_files import write_instruments
+from ...clouds.writing import Format
 from ...scenario.advice import advice
 from ...scenario.build import Job, build
 from ...scenario.campaign import CampaignSpec

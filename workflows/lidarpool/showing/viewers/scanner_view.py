@@ -14,7 +14,8 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
-from lidarsim.motion.trajectory import Pose, Trajectory, pose_of, presence_ns, quaternions_of
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.motion.trajectory import Pose, Trajectory, pose_of, presence_ns
 from lidarsim.scene.actors import Actor
 from lidarsim.simulator import Scanner
 from lidarsim.sweeps.sweeps import type_of

@@ -28,7 +28,7 @@ from ...base.elementary_scalars import sin_cos_of
 from ...base.input_files import read_input
 from ...base.vectors import applied, length, matmul
 from ...base.words import listed, plural, printable
-from ...motion.trajectory import matrices
+from ...motion.rotations import matrices
 from ..animation import RATE_HZ
 from ..colours import LINEAR, Colours, as_srgb
 from ..masks import (

@@ -23,7 +23,8 @@ from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
 from ...base.words import as_python, listed, plural, printable
-from ...motion.trajectory import Track, quaternions_of
+from ...motion.rotations import quaternions_of
+from ...motion.trajectory import Track
 from ..actors import Actor, join_meshes
 from ..colours import colours_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance

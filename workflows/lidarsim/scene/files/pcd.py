@@ -23,7 +23,7 @@ from ...base.arrays import AnyArray, Bytes, Floats
 from ...base.errors import CutShortError
 from ...base.input_files import read_input
 from ...base.words import printable
-from ...motion.trajectory import matrices
+from ...motion.rotations import matrices
 from ..transform import affine
 from .cloud_scan import CloudScan, usual_names
 from .text_rows import RowReader

@@ -26,8 +26,8 @@ from ..casting.motion import CastPoses, Firings
 from ..casting.surfaces import Surfaces, light_of
 from ..pulses import Scanned
 from ..returns import required
+from ..steps.cast import GHOST
 from ..steps.doppler import VELOCITY, radial_velocities
-from ..steps.paths import GHOST
 from ..steps.step_list import received_causes
 
 BLOCK_HITS = 1 << 16  # hits whose normals are computed at a time

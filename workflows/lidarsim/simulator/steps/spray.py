@@ -24,7 +24,14 @@ from ..casting.motion import along_rings
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
 from ..returns import RETURN_COLUMNS, PulseReturns, joined, required, returns_without_surface
-from .air import add_air_hits, exponential, light_reach, random_keys, room_for_hits, seen_by_range
+from .particles import (
+    add_air_hits,
+    exponential,
+    light_reach,
+    random_keys,
+    room_for_hits,
+    seen_by_range,
+)
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:

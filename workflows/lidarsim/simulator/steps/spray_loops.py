@@ -12,7 +12,7 @@ from raybeam.compiled import compiled, inlined, stage
 
 from ...base.arrays import Floats, Ints
 from ...base.elementary_loops import exp
-from .air_loops import write_particle
+from .particle_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 

@@ -7,28 +7,28 @@ from operator import or_
 
 from ...scene.scene import Scene
 from ...survey.survey import Survey
-from .air import WeatherStep
 from .angle_noise import AngleNoiseStep, RippleStep
+from .cast import CastStep
 from .crosstalk import CrosstalkStep
 from .detection import DetectionStep
 from .false_alarms import FalseAlarmStep
 from .losses import DirtStep, LossStep
-from .paths import CastStep
+from .particles import WeatherStep
 from .range_noise import RangeNoiseStep
-from .recording import RecordingStep
 from .saturation import SaturationStep
 from .separation import SelectionStep, SeparationStep
 from .spray import SprayStep
 from .step import PulseStep, Role, Setup
 from .stray_light import StrayLightStep
 from .waveform import WaveformStep
+from .waveform_samples import RecordingStep
 
 # If no step applies, each ray has one return, its hit.
 STEPS: list[type[PulseStep]] = [
     AngleNoiseStep,
     RippleStep,
     CastStep,  # with mirrors, glass, water and leaves
-    WeatherStep,  # rain, snow, fog and dust
+    WeatherStep,  # rain, snow, fog and dust; light that is lost on its way: casting/surfaces.py
     SprayStep,
     DirtStep,  # on the window
     SeparationStep,  # makes returns of hits, if there are no waveforms

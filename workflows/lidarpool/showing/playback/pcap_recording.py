@@ -48,7 +48,7 @@ class RecordedDatagram(NamedTuple):
     payload: bytes
 
 
-class Recording:
+class PcapRecording:
     """The UDP datagrams of a pcap file, in the order of the file.
 
     Datagrams in several fragments are joined. LidarError if the file is no pcap file, is cut off
@@ -116,7 +116,9 @@ _LEAD_NS = 300_000_000  # of datagrams that the process that sends holds
 _START_NS = 50e6  # from the start of the schedule to the first datagram
 
 
-def recorded_streams(recording: Recording, to: Sequence[str], api: Sequence[str]) -> list[Stream]:
+def recorded_streams(
+    recording: PcapRecording, to: Sequence[str], api: Sequence[str]
+) -> list[Stream]:
     """Return a stream for each sensor of a recording, named by its address; see `streams_of`.
 
     An Ouster's interface answers if the metadata are beside the recording, as a .json.
@@ -134,7 +136,7 @@ def recorded_streams(recording: Recording, to: Sequence[str], api: Sequence[str]
     return streams_to(streams, to, api)
 
 
-def _service_of(recording: Recording) -> Callable[..., Service | None]:
+def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
     """Return a function that makes the service of the sensor of a recording, or returns None."""
     path = recording.path.with_suffix(".json")
     if len(recording.sources) > 1 or not path.exists():
@@ -158,7 +160,7 @@ def _service_of(recording: Recording) -> Callable[..., Service | None]:
 
 
 def play_recording(
-    recording: Recording, transmitter: Transmitter, schedule: Schedule, *, loop: bool = False
+    recording: PcapRecording, transmitter: Transmitter, schedule: Schedule, *, loop: bool = False
 ) -> None:
     """Send the datagrams of a recording at their times; with `loop`, again and again."""
     schedule.start(0, _START_NS)

@@ -295,7 +295,7 @@ def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
     """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), metres."""
-    from . import air_loops  # not before: numba takes half a second to import
+    from . import particle_loops as air_loops  # not before: numba takes half a second to import
 
     beams = len(reach) // subrays
     tables = air_loops.ParticleTables(
@@ -313,7 +313,7 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
 
     `reach` (rays,) is where fog ends on each sub-ray, metres.
     """
-    from . import air_loops
+    from . import particle_loops as air_loops
 
     hits = room_for_hits(len(reach) // subrays)
     tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)

@@ -37,8 +37,8 @@ from .messages import (
     Summaries,
 )
 from .names import COLLECT, GENERATE, LIDAR
-from .placement import Recorder, TaskRecord
 from .rigs import CastBatch
+from .task_records import Recorder, TaskRecord
 
 SEND_EVERY_S = 0.05  # messages that follow each other faster are sent together
 LINGER_S = 0.02  # wait of the sorter for more messages

@@ -25,7 +25,7 @@ from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces, light_of
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .doppler import range_rates_of_origins, velocities_of_ends
-from .media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
+from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")

@@ -1,0 +1,428 @@
+"""Compares two clouds or recordings of one place: pairs of sweeps, cells and nearest points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from lidarsim._version import __version__
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.sampling import even_indices
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import UNITS_M
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+
+from ..base.neighbours import nearest
+from ..clouds.recording import RecordedPoints, Recording
+from ..columns.parts import StoredCloud
+from ..datasets.figures import rank_correlation
+from ..recordings.opening import open_recording
+from .comparison import CELLS, RESIDUALS, Comparison, MeasuredPoints
+from .range_image import RangeImages, paired_images, range_images
+
+MAX_POINTS = 10_000_000  # of each cloud in memory
+
+MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken
+
+
+@checked
+def compare(
+    a: str | Path | Cloud | StoredCloud,
+    b: str | Path | Cloud | StoredCloud,
+    *,
+    sweeps: Sequence[int] | None = None,
+    match: Literal["order", "time"] = "order",
+    sensor_a: str | None = None,
+    sensor_b: str | None = None,
+    intensity_a: str | None = None,
+    intensity_b: str | None = None,
+    unit_a: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    unit_b: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    keep_noise: bool = False,
+    azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
+    distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
+    most_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
+) -> Comparison:
+    """Compare two clouds or recordings of the same place; B is the reference.
+
+    Recordings of one sensor are compared sweep by sweep in the sensor's axes: the range image,
+    returns that only A or B has, intensities, and distances to nearest neighbours. A cloud without
+    rings or sweeps has distances alone, in the world frame. Clouds are compared as they are,
+    without alignment.
+
+    Parameters
+    ----------
+    a, b
+        A result's folder or .ply, a data set, .pcd or a folder of them, .las, .laz, .e57, text
+        (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin, a bag of ROS 2 (.mcap or a folder), or a
+        cloud in memory.
+    sweeps
+        Only these pairs of sweeps, from 0.
+    match
+        Whether sweeps of the same number or of the same time belong together.
+    sensor_a, sensor_b
+        Of a recording of several: name of the sensor, or topic of a bag.
+    intensity_a, intensity_b
+        Columns to compare as intensity, if not ``intensity``.
+    unit_a, unit_b
+        Unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text (um, mm, cm, dm, m, km, in, ft,
+        yd or mi), in place of metres or of the units that a .las, a .laz or a header states.
+    keep_noise
+        Whether points are compared that a .las or .laz withholds or classifies as noise (classes 7
+        and 18), and those of such columns of other clouds; by default they are left out.
+    azimuth_deg
+        Width of a cell; by default the step from pulse to pulse, the coarser one.
+    distances_m
+        Distances within which a point counts as present in the compared cloud, for precision and
+        recall.
+    most_points
+        Points of each cloud in memory; of more, a share is chosen evenly.
+
+    Raises
+    ------
+    LidarError
+        If A or B cannot be read or is empty, has lengths that are not true, as in Web Mercator, or
+        A and B share no quantity to compare.
+    """
+    if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
+        raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
+    first = open_recording(
+        a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
+    )
+    second = open_recording(
+        b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
+    )
+    comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
+    if not first.is_cloud and not second.is_cloud:
+        pairs = _pair_sweeps(first, second, match, comparing.notes)
+        if sweeps:
+            pairs = _choose_pairs(pairs, sweeps)
+        budget = MAX_VALUES // len(pairs)
+        for number_a, number_b in pairs:
+            comparing.add(first.read_points(number_a), second.read_points(number_b), budget)
+        return comparing.result(len(pairs))
+    cloud = first if first.is_cloud else second
+    if sweeps or match == "time":
+        raise LidarError(f"{cloud.name} has no sweeps: leave out --sweep and --match.")
+    if not first.is_cloud or not second.is_cloud:
+        comparing.notes.append(
+            f"{cloud.name} has no sweeps: all points of both are compared at once"
+        )
+    points_a = comparing.read_cloud(first, most_points)
+    points_b = comparing.read_cloud(second, most_points)
+    comparing.add(points_a, points_b, MAX_VALUES)
+    return comparing.result(0)
+
+
+def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the pairs at indices `sweeps`, in order; LidarError for an index out of range."""
+    for number in sweeps:
+        if not 0 <= number < len(pairs):
+            raise LidarError(
+                f"there is no sweep {number}: {plural(len(pairs), 'pair')} of sweeps, from 0."
+            )
+    return [pairs[number] for number in sorted({*sweeps})]
+
+
+def _pair_sweeps(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tuple[int, int]]:
+    """Return the numbers of sweeps of A and B that belong together.
+
+    Appends a note if sweeps are left over. LidarError if no sweeps belong together.
+    """
+    pairs = [(number, number) for number in range(min(a.count, b.count))]
+    if match == "time":
+        times_a = _sweep_times(a)
+        times_b = _sweep_times(b)
+        if pairs:
+            order = np.argsort(times_a)
+            sorted_times = times_a[order]
+            middles = (sorted_times[1:] + sorted_times[:-1]) / 2
+            nearest_a = order[np.searchsorted(middles, times_b)]
+            period = np.median(np.diff(times_b)) if len(times_b) > 1 else 1e8
+            close = np.flatnonzero(np.abs(times_a[nearest_a] - times_b) <= period / 2)
+            pairs = [(int(nearest_a[number]), int(number)) for number in close]
+    if not pairs:
+        raise LidarError(
+            f"{a.name} with {plural(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
+            f"the same {match}."
+        )
+    if len(pairs) < max(a.count, b.count):
+        notes.append(
+            f"A has {plural(a.count, 'sweep')}, B {b.count:,}: "
+            f"{plural(len(pairs), 'pair')} by {match}"
+        )
+    return pairs
+
+
+def _sweep_times(recording: Recording) -> Floats:
+    """Return the start of each sweep, ns; LidarError if the recording has no times."""
+    if recording.times is None:
+        raise LidarError(f"{recording.name} has no times of sweeps: leave out --match time.")
+    return np.fromiter(recording.times(), np.float64)
+
+
+class _CellPairs(NamedTuple):
+    """Cells with a return in both sweeps, (k,) each."""
+
+    residual: Floats  # metres
+    ring: Ints
+    intensity_a: Floats
+    intensity_b: Floats
+
+
+class _NearestPairs(NamedTuple):
+    """Points of a cloud, each with its nearest neighbour in the compared cloud, (n,) each."""
+
+    distance: Floats  # metres
+    intensity: Floats  # of the point
+    nearest_intensity: Floats
+
+
+@dataclass(eq=False)
+class _Comparing:
+    """Running totals of a comparison, pair of sweeps by pair of sweeps."""
+
+    recordings: tuple[Recording, Recording]
+    distances_m: tuple[float, ...]
+    azimuth_deg: float | None
+
+    def __post_init__(self) -> None:
+        self.notes = [note for recording in self.recordings for note in recording.notes]
+        self.point_counts = np.zeros(2, np.int64)
+        self.images: RangeImages | None = None
+        self.measured_points: list[MeasuredPoints] = []
+        self.cells: list[_CellPairs] = []
+        self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])  # from A, from B
+        # {ring: its elevation, and the number of its cells in each state of `CELLS`}
+        self.rings: dict[int, tuple[float, Ints]] = {}
+
+    def note(self, text: str) -> None:
+        """Add a note, unless the same note was added before."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def read_cloud(self, recording: Recording, max_points: int) -> RecordedPoints:
+        """Read points in the world frame: all, or about `max_points`, chosen evenly."""
+        count = recording.point_count
+        share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
+        parts = []
+        for number in range(recording.count):
+            part = recording.read_points(number, in_world=True)
+            parts.append(part.part(even_indices(len(part), round(share * len(part)))))
+        if share == 1 or not parts:
+            return RecordedPoints.joined(parts)
+        self.note(
+            f"{recording.name} has {count:,} points, of which {100 * share:.3g} % are compared, "
+            "chosen evenly: distances to it are too long"
+        )
+        return replace(RecordedPoints.joined(parts), rings=None)
+
+    def add(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare two sweeps or clouds, at most `budget` cells and points of each."""
+        self.point_counts += len(a), len(b)
+        if max(len(a), len(b)) > budget:
+            self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
+        if not len(a) or not len(b):
+            self.note("pairs of which one has no points are left out")
+            return
+        self._add_images(a, b, budget)
+        for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
+            chosen = cloud.part(even_indices(len(cloud), budget))
+            distance, index = nearest(chosen.points, reference.points)
+            if len(self.measured_points) < 2:
+                self.measured_points.append(MeasuredPoints(chosen.points, distance))
+            intensity = chosen.intensities
+            if intensity is None or reference.intensities is None:
+                pairs.append(_NearestPairs(distance, *np.full((2, len(distance)), np.nan)))
+            else:
+                pairs.append(_NearestPairs(distance, intensity, reference.intensities[index]))
+
+    def _add_images(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare the range images of two sweeps; add a note instead if there are none."""
+        first, second = self.recordings
+        same_rays = first.firing_key and first.firing_key == second.firing_key
+        make_images = paired_images if same_rays else range_images
+        try:
+            images = make_images(a, b, (first.name, second.name), self.azimuth_deg)
+        except LidarError as error:
+            self.note(f"no range image: {error}")
+            return
+        for note in images.notes:
+            self.note(note)
+        self.images = self.images or images
+        in_a, in_b = np.isfinite(images.compared[:, 0])
+        self._count_cells(images, in_a, in_b)
+        in_both = np.flatnonzero(in_a & in_b)
+        in_both = in_both[even_indices(len(in_both), budget)]
+        (range_a, intensity_a), (range_b, intensity_b) = images.compared[..., in_both]
+        ring = images.rings[images.rows[in_both]]
+        self.cells.append(_CellPairs(range_a - range_b, ring, intensity_a, intensity_b))
+
+    def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
+        """Add the cells of each ring to its states; `in_a` and `in_b` (k,) mark returns."""
+        rows = images.rows
+        returned_a, returned_b = images.returned
+        rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
+        rows_of_states = (
+            rows_of_neither,
+            rows[~in_a & in_b],
+            rows[in_a & ~in_b],
+            rows[in_a & in_b],
+        )
+        counts = np.stack(
+            [np.bincount(state, minlength=len(images.rings)) for state in rows_of_states], axis=1
+        )
+        for ring, elevation, count in zip(
+            images.rings.tolist(), images.elevation_deg.tolist(), counts, strict=True
+        ):
+            _, total = self.rings.get(ring, (0.0, np.zeros(4, np.int64)))
+            self.rings[ring] = elevation, total + count
+
+    def result(self, pair_count: int) -> Comparison:
+        """Return all figures of a number of pairs of sweeps; 0 for clouds without sweeps."""
+        counts = self.point_counts.tolist()
+        for recording, count in zip(self.recordings, counts, strict=True):
+            if not count:
+                listed = "".join(f" {note}." for note in recording.left_out_notes)
+                raise LidarError(
+                    f"{recording.name} has no points: there is nothing to compare.{listed}"
+                )
+        if not self.measured_points:
+            raise LidarError("No pair of sweeps has points in both: choose others.")
+        from_a, from_b = (
+            _NearestPairs(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in self.nearest
+        )
+        residuals = np.empty(0)
+        image_figures = None
+        paired_by = "nearest points"
+        is_close = from_a.distance <= self.distances_m[0]
+        intensity_a = from_a.intensity[is_close]
+        intensity_b = from_a.nearest_intensity[is_close]
+        if self.images is not None:
+            cells = _CellPairs(*map(np.concatenate, zip(*self.cells, strict=True)))
+            residuals = cells.residual
+            intensity_a = cells.intensity_a
+            intensity_b = cells.intensity_b
+            image_figures = self._image_figures(cells)
+            paired_by = self.images.paired_by
+        is_known = np.isfinite(intensity_a) & np.isfinite(intensity_b)
+        intensities = intensity_a[is_known], intensity_b[is_known]
+        figures: dict[str, Any] = {
+            "versions": {"lidarpool": __version__},
+            **self._source_figures(),
+            "pairs": pair_count,
+            "notes": self.notes + [note for r in self.recordings for note in r.left_out_notes],
+            "range_image": image_figures,
+            "intensity": _intensity_figures(*intensities, paired_by),
+            "distances": self._distance_figures(from_a.distance, from_b.distance),
+        }
+        distances = from_a.distance, from_b.distance
+        return Comparison(
+            figures, self.images, residuals, distances, intensities, self.measured_points
+        )
+
+    def _source_figures(self) -> dict[str, Any]:
+        """Return the name and the sizes of A and B."""
+        counts = self.point_counts.tolist()
+        return {
+            key: {
+                "name": recording.name,
+                "sweeps": None if recording.is_cloud else recording.count,
+                "points": count,
+            }
+            for key, recording, count in zip("ab", self.recordings, counts, strict=True)
+        }
+
+    def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
+        """Return figures of the distances of A's points to B, and of B's to A, metres."""
+        f_scores: list[dict[str, float | None]] = []
+        for distance in self.distances_m:
+            scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
+            f_scores.append({"distance_m": distance, **scores})
+        return {
+            "a_to_b": _distance_quantiles(to_b),
+            "b_to_a": _distance_quantiles(to_a),
+            "chamfer_m": float(to_b.mean() + to_a.mean()),
+            "f_scores": f_scores,
+        }
+
+    def _image_figures(self, cells: _CellPairs) -> dict[str, Any]:
+        """Return figures of the range images and of each ring, the highest first."""
+        images = self.images
+        assert images is not None
+        has_gaps = not any(recording.thinned for recording in self.recordings)
+        rings = sorted(self.rings.items(), key=lambda item: -item[1][0])
+        all_counts = sum(count for _, count in self.rings.values())
+        return {
+            "paired_by": images.paired_by,
+            "columns": images.ranges[0].shape[1],
+            "azimuth_step_deg": images.step_deg,
+            "hidden_points": dict(zip("ab", images.hidden_shares, strict=True)),
+            "residual": _residual_figures(cells.residual),
+            "no_return": _no_return_figures(all_counts) if has_gaps else None,
+            "rings": [
+                {
+                    "ring": ring,
+                    "elevation_deg": elevation,
+                    **_residual_figures(cells.residual[cells.ring == ring]),
+                    "no_return": _no_return_figures(count) if has_gaps else None,
+                }
+                for ring, (elevation, count) in rings
+            ],
+        }
+
+
+def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
+    """Return figures of pairs of intensities (n,); None without a rank correlation."""
+    correlation = rank_correlation(a, b)
+    if correlation is None:
+        return None
+    return {"rank_correlation": correlation, "pairs": len(a), "of": paired_by}
+
+
+def _residual_figures(values: Floats) -> dict[str, Any]:
+    """Return figures of residuals A - B (n,), metres; None for each figure without residuals."""
+    if not len(values):
+        return {"cells": 0, **dict.fromkeys(RESIDUALS)}
+    p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
+    mad = np.median(np.abs(values - median))
+    rmse = np.sqrt(np.mean(values**2))
+    figures = map(float, (values.mean(), rmse, median, mad, p05, p95))
+    return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
+
+
+def _no_return_figures(counts: Any) -> dict[str, Any]:
+    """Return figures of cells without a return in A, with cells of B as the truth.
+
+    `counts` (4,) are the cells of each state of `CELLS`.
+    """
+    in_both, in_a_only, in_b_only, _ = counts.tolist()
+    precision = in_both / (in_both + in_a_only) if in_both + in_a_only else None
+    recall = in_both / (in_both + in_b_only) if in_both + in_b_only else None
+    return dict(zip(CELLS, counts.tolist(), strict=True)) | _scores(precision, recall)
+
+
+def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
+    """Return precision, recall and their harmonic mean; None where undefined."""
+    f1 = None
+    if precision is not None and recall is not None:
+        f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+    return {"precision": precision, "recall": recall, "f1": f1}
+
+
+def _distance_quantiles(values: Floats) -> dict[str, Any]:
+    """Return the mean and quantiles of distances (n,), metres."""
+    shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
+    quantiles = np.quantile(values, list(shares.values())).tolist()
+    return {
+        "points": len(values),
+        "mean_m": float(values.mean()),
+        **dict(zip(shares, quantiles, strict=True)),
+    }
