@@ -11,6 +11,7 @@ from .partition_stats import PartitionStats, StageStats
 from .pipe import Pipe
 from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
+from .task_table import TaskRow, TaskTable
 from .workers import WorkerInfo
 
 __all__ = [
@@ -25,6 +26,8 @@ __all__ = [
     "Results",
     "Rule",
     "StageStats",
+    "TaskRow",
+    "TaskTable",
     "WorkerInfo",
     "after_all",
     "cancelled",

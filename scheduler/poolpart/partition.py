@@ -26,8 +26,9 @@ from .notebook import table_of_partition
 from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .rules import check_count
-from .stats import stats_of
+from .stats import stats_of, tasks_of
 from .task_context import own_client
+from .task_table import TaskRow, TaskTable
 from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, on_scheduler
 
@@ -116,6 +117,20 @@ class Partition:
         """
         stats: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
         return stats[0]
+
+    def tasks(self) -> TaskTable:
+        """Return the tasks of the partition one by one, of all clients.
+
+        There are those that wait or run, and the last 1,000 that have ended since tasks are
+        counted, see `stats`.
+
+        Raises
+        ------
+        PoolError
+            If the scheduler lacks this package.
+        """
+        rows: list[TaskRow] = on_scheduler(self.client, tasks_of, name=self.name)
+        return TaskTable.of_rows(rows)
 
     # -- tasks -------------------------------------------------------------------------
 

@@ -9,8 +9,8 @@ request.
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -19,8 +19,10 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .fence import fences_of
 from .metrics import PartitionCollector, publish, withdraw
 from .partition_stats import PartitionStats, StageStats
+from .task_table import KEPT, TaskRow, moment
 
 NAME = "poolpart-stats"
+_ERROR_LETTERS = 200  # of the error of a task
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
 # {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
@@ -41,6 +43,8 @@ class Statistics(SchedulerPlugin):
         self.scheduler = scheduler
         # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+        # {partition: its tasks that have ended, newest first}
+        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=KEPT))
         self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
         self._collector: PartitionCollector | None = publish(self._all_stats)
 
@@ -60,8 +64,38 @@ class Statistics(SchedulerPlugin):
         counts["done" if finish == "memory" else "failed"] += 1
         computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
         counts["seconds"] += sum(span["stop"] - span["start"] for span in computing)
+        self._keep(task, finish, runnable, computing, kwargs)
         if computing and runnable is not None:  # by the scheduler's clock, as Dask corrects both
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
+
+    def queued_since(self, key: Any) -> float | None:
+        """Return the time since when a task could run, seconds since 1970; None if unknown."""
+        return self._runnable.get(key)
+
+    def _keep(
+        self,
+        task: Any,
+        finish: str,
+        runnable: float | None,
+        computing: list[Any],
+        report: Mapping[str, Any],
+    ) -> None:
+        """Keep a task that has ended: `report` is what its worker told of it."""
+        partition = partition_of(task)
+        worker = self.scheduler.workers.get(report.get("worker"))
+        self.recent[partition].appendleft(
+            TaskRow(
+                "done" if finish == "memory" else "failed",
+                str(task.key),
+                task.prefix.name,
+                "" if worker is None else str(worker.name),
+                _slots_taken(task, partition),
+                moment(runnable),
+                moment(computing[0]["start"] if computing else None),
+                moment(computing[-1]["stop"] if computing else None),
+                " ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
+            )
+        )
 
     def _all_stats(self) -> list[PartitionStats]:
         """Return the statistics of each partition, and of tasks without a partition."""
@@ -105,18 +139,56 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
     The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
     has slots. So of a task that waits and the nested tasks in its slots, some do not count.
     """
-    slots = slots_of(worker, partition)
     held = 0
     stages: Counter[str] = Counter()
-    for task in islice(worker.processing, _LOOK_AT_MOST):
-        if partition_of(task) != partition:
-            continue
-        takes = int(task.resource_restrictions[partition]) if partition else 1
-        if held + takes > slots:
-            continue
-        held += takes
+    for task in _running_tasks(worker, partition):
+        held += _slots_taken(task, partition)
         stages[task.prefix.name] += 1
     return stages, held
+
+
+def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
+    """Yield the tasks of a partition that a worker runs; see `running_on`."""
+    free = slots_of(worker, partition)
+    for task in islice(worker.processing, _LOOK_AT_MOST):
+        if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
+            free -= takes
+            yield task
+
+
+def _slots_taken(task: Any, partition: str) -> int:
+    """Return the slots of a partition that a task holds while it runs."""
+    return int(task.resource_restrictions[partition]) if partition else 1
+
+
+def tasks_of(name: str, dask_scheduler: Any = None) -> list[TaskRow]:
+    """Return the tasks of a partition under way, and those kept that ended; on the scheduler."""
+    scheduler = dask_scheduler
+    statistics = statistics_of(scheduler)
+    running = {
+        key
+        for worker in members(scheduler, name)
+        for key in [task.key for task in _running_tasks(worker, name)]
+    }
+    rows = []
+    for task in scheduler.tasks.values():
+        state = _WAITING.get(task.state)
+        if state is None or partition_of(task) != name:
+            continue
+        if state == "assigned":
+            state = "running" if task.key in running else "queued"
+        worker = task.processing_on
+        rows.append(
+            TaskRow(
+                state,
+                str(task.key),
+                task.prefix.name,
+                "" if worker is None else str(worker.name),
+                _slots_taken(task, name),
+                moment(statistics.queued_since(task.key)),
+            )
+        )
+    return [*rows, *statistics.recent.get(name, ())]
 
 
 def statistics_of(scheduler: Any) -> Statistics:

@@ -1,0 +1,89 @@
+"""Tasks of a partition one by one: those that wait and run, and the last that have ended."""
+
+import threading
+import time
+from datetime import UTC, datetime
+
+import pytest
+from distributed import wait
+from tests.poolpart.helpers import LONG_S
+
+from poolpart import Partition
+from poolpart.task_table import KEPT
+
+CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
+
+go = threading.Event()  # the workers are threads of this process
+
+
+def held(_):
+    go.wait(LONG_S)
+
+
+def after(*_):
+    return 1
+
+
+def broken(_):
+    raise ValueError("two\nlines")
+
+
+@pytest.fixture
+def part(start):
+    go.clear()
+    yield Partition("A", start(CLUSTER))
+    go.set()
+
+
+def test_tasks_that_wait_run_and_end(part, wait_until):
+    assert part.tasks() == ()  # counting begins
+    before = datetime.now(UTC)
+    Partition("B", part.client).submit(after, 0).result(LONG_S)
+    running = [part.submit(held, i, slots=1) for i in range(3)]
+    last = part.submit(after, running, slots=2)
+    wait_until(lambda: part.stats().waiting == 1 and part.stats().running == 2)
+    rows = part.tasks()
+    assert [row.state for row in rows] == ["waiting", "queued", "running", "running"]
+    assert {row.key for row in rows[1:]} == {future.key for future in running}
+    waiting = rows[0]
+    assert (waiting.key, waiting.function, waiting.worker, waiting.slots) == (
+        last.key, "after", "", 2
+    )  # fmt: skip
+    assert waiting.queued is None and {row.worker for row in rows[2:]} == {"A-0"}
+    assert all(before < row.queued and row.finished is None for row in rows[1:])
+
+    time.sleep(0.01)  # the running time is above this
+    go.set()
+    failed = part.submit(broken, 1)
+    wait([last, failed], LONG_S)
+    wait_until(lambda: len(part.tasks()) == 5 and not part.stats().running)
+    rows = part.tasks()
+    assert sorted(row.state for row in rows) == ["done"] * 4 + ["failed"]
+    done = next(row for row in rows if row.key == running[0].key)
+    assert before < done.queued <= done.started < done.finished < datetime.now(UTC)
+    assert 0.01 < done.seconds == (done.finished - done.started).total_seconds()
+    (error,) = [row.error for row in rows if row.error]
+    assert error == "ValueError('two\\nlines')"
+
+
+def test_only_the_last_that_have_ended_are_kept(part):
+    part.tasks()
+    futures = part.client.map(after, range(KEPT + 5), resources={"A": 1}, key="many", batch_size=50)
+    wait(futures, LONG_S)
+    rows = part.tasks()
+    assert len(rows) == KEPT and {row.state for row in rows} == {"done"}
+
+
+def test_the_table_is_printed_in_notebooks_and_as_a_frame(part):
+    part.tasks()
+    part.submit(broken, "<b>").exception(LONG_S)
+    table = part.tasks()
+    head, row = repr(table).splitlines()
+    assert head.split() == [
+        "state", "key", "function", "worker", "slots", "queued", "started", "seconds", "error"
+    ]  # fmt: skip
+    assert row.startswith("failed  broken-") and row.endswith("ValueError('two\\nlines')")
+    page = table._repr_html_()
+    assert "Tasks" in page and "failed" in page and "<b>" not in page
+    frame = table.to_pandas()
+    assert list(frame["state"]) == ["failed"] and frame["seconds"][0] >= 0
