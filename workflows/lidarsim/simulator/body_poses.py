@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats
 from ..base.errors import LidarError, prefixed
-from ..base.validation import shown
+from ..base.value_texts import shown
 from ..sensor import Pose, StaticPose, Track, Trajectory
 from ..sensor.trajectory import CENTRE, check_rotations, pose_of
 
