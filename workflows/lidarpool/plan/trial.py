@@ -11,7 +11,7 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import one_line
+from lidarsim.base.value_texts import one_line
 
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances

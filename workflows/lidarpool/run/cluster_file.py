@@ -12,10 +12,10 @@ from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
+from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
 from lidarsim.base.interrupts import deferred_interrupts
-from lidarsim.base.validation import sentences
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions

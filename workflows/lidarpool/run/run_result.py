@@ -9,7 +9,7 @@ from typing import Any
 
 from lidarsim.base.arrays import Floats32, Ints
 from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import one_line
+from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
 from lidarsim.survey.survey import Survey

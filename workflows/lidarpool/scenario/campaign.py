@@ -17,9 +17,10 @@ import numpy as np
 from pydantic import Field
 
 from lidarsim.base.declared import Seed
+from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.input_files import not_found, read_input_text
-from lidarsim.base.validation import checked, sentences
+from lidarsim.base.validation import checked
 from lidarsim.base.yamlfile import read_yaml
 
 from ..base.field_words import fields_in_words

@@ -20,7 +20,7 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.input_files import open_input
 from lidarsim.base.sections import dotted
 from lidarsim.base.textfile import read_text
-from lidarsim.base.validation import shown
+from lidarsim.base.value_texts import shown
 from lidarsim.base.words import plural
 from lidarsim.scene.files.mesh_formats import plugin_of
 

@@ -43,12 +43,13 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
+from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes, message_of
 from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.sections import sections_in
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
-from lidarsim.base.validation import checked_fields, sentences
+from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import did_you_mean_each, in_yaml, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 

@@ -13,9 +13,9 @@ from typing import Annotated, Any
 from pydantic import PrivateAttr, ValidationError
 
 from lidarsim.base.declared import Several, Text, about, by_text
+from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.input_files import not_found
-from lidarsim.base.validation import sentences
 from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLOURS
 from lidarsim.media.materials import ClassNames, Material

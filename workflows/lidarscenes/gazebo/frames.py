@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import shown
+from lidarsim.base.value_texts import shown
 from lidarsim.base.vectors import length, matmul
 from lidarsim.base.words import did_you_mean, printable
 from lidarsim.motion.rotations import matrices, rotations_of

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from xml.etree.ElementTree import Element
 
 from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.validation import shown
+from lidarsim.base.value_texts import shown
 from lidarsim.base.words import printable
 
 LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # types of sensors

@@ -20,7 +20,8 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Bytes, Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input
-from lidarsim.base.validation import checked, shown
+from lidarsim.base.validation import checked
+from lidarsim.base.value_texts import shown
 from lidarsim.base.vectors import length
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root

@@ -1,6 +1,6 @@
 """Declarations of quantities that users set, with descriptions and limits for scenario files.
 
-A quantity is a field of a dataclass: `Annotated[type, told(description, limits)] = default`.
+A quantity is a field of a dataclass: `Annotated[type, about(description, limits)] = default`.
 `checked_fields` lets the dataclass refuse values outside the limits, and be a section of a
 scenario; other sections inherit its fields (`lidarpool.scenario.sections`).
 """

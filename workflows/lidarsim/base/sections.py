@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
 from functools import cache
-from typing import Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from pydantic.fields import FieldInfo
 
 Fields = Mapping[str, FieldInfo]
 FieldPath = tuple[int | str, ...]
+
+LIMITS = ("ge", "gt", "le", "lt")  # of numbers, named as in pydantic's `Field`
 
 
 def fields_by_name(hint: Any) -> Fields:
@@ -58,6 +60,16 @@ def classes_in(annotation: Any) -> Iterator[type]:
         yield annotation
     for inner in get_args(annotation):
         yield from classes_in(inner)
+
+
+def limits_of(hint: Any, names: Iterable[str] = LIMITS) -> dict[str, Any]:
+    """Return the limits in an annotation, named as in pydantic's `Field`: {name: limit}."""
+    inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
+    limits = {name: limit for arg in inner for name, limit in limits_of(arg, names).items()}
+    for note in getattr(hint, "__metadata__", ()):
+        for limit in (note, *getattr(note, "metadata", ())):
+            limits |= {name: getattr(limit, name) for name in names if hasattr(limit, name)}
+    return limits
 
 
 def dotted(path: Sequence[int | str]) -> str:

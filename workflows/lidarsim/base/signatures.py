@@ -10,13 +10,12 @@ from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MAX_CHOICES = 60  # letters of the values of a Literal
-# Unions of a dozen types, which a union with further types would hold one by one.
-_KEPT = {"ArrayLike": ArrayLike, "DTypeLike": DTypeLike}
+# Unions of a dozen types, which a union with further types would hold one by one: a class instead.
+_KEPT = {name: type(name, (), {}) for name in ("ArrayLike", "DTypeLike")}
 _COMPUTED = "…"  # a default that is computed for each call
 
 
@@ -36,18 +35,19 @@ class _Annotation(str):
     is_optional: bool  # whether None is the default
 
     @classmethod
-    def of(cls, parameter: inspect.Parameter, names: Mapping[str, Any]) -> Any:
-        """Return the annotation of a parameter; annotations that are no text stay."""
-        if not isinstance(parameter.annotation, str):
-            return parameter.annotation
-        annotation = cls(parameter.annotation)
-        annotation.names = names
-        annotation.is_optional = parameter.default is None
-        return annotation
+    def of(cls, annotation: Any, names: Mapping[str, Any], is_optional: bool = False) -> Any:
+        """Return an annotation of source code; an annotation that is no text stays."""
+        if not isinstance(annotation, str):
+            return annotation
+        written = cls(annotation)
+        written.names = names
+        written.is_optional = is_optional
+        return written
 
     def __repr__(self) -> str:
+        names = _Names({**self.names, **_KEPT})
         try:
-            words = words_of(eval(self, {}, _Names(self.names)))  # noqa: S307 - of our own source
+            words = words_of(eval(self, {}, names))  # noqa: S307 - of our own source
         except (TypeError, AttributeError):
             words = str(self)
         return f"{words} | None" if self.is_optional and not _allows_none(words) else words
@@ -55,12 +55,6 @@ class _Annotation(str):
 
 class _Names(dict[str, Any]):
     """Names of modules; a name that is imported for type checkers only is an empty class."""
-
-    def __init__(self, names: Mapping[str, Any]) -> None:
-        super().__init__(names)
-        for name, kind in _KEPT.items():
-            if self.get(name) is kind:
-                del self[name]
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, None) or type(name, (), {})
@@ -135,14 +129,13 @@ def readable(signature: inspect.Signature, names: Mapping[str, Any]) -> inspect.
     """
     parameters = [
         parameter.replace(
-            annotation=_Annotation.of(parameter, names), default=_shown(parameter.default)
+            annotation=_Annotation.of(parameter.annotation, names, parameter.default is None),
+            default=_shown(parameter.default),
         )
         for parameter in signature.parameters.values()
     ]
-    result = inspect.Parameter(
-        "result", inspect.Parameter.KEYWORD_ONLY, annotation=signature.return_annotation
-    )
-    return signature.replace(parameters=parameters, return_annotation=_Annotation.of(result, names))
+    result = _Annotation.of(signature.return_annotation, names)
+    return signature.replace(parameters=parameters, return_annotation=result)
 
 
 def shown_readably(function: F) -> F:

@@ -18,7 +18,8 @@ from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarError
 from ..base.extras import install_command
 from ..base.notebook import picture_of
-from ..base.validation import as_array, checked, checked_fields, shown
+from ..base.validation import as_array, checked, checked_fields
+from ..base.value_texts import shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 

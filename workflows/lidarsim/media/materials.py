@@ -20,7 +20,8 @@ from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarError
-from ..base.validation import checked_fields, shown
+from ..base.validation import checked_fields
+from ..base.value_texts import shown
 from ..base.words import did_you_mean, name_hint
 from .leaves import LeafAngle
 

@@ -14,7 +14,8 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarError
-from ..base.validation import as_array, checked_fields, one_line, shown
+from ..base.validation import as_array, checked_fields
+from ..base.value_texts import one_line, shown
 from ..base.vectors import (
     applied,
     hypot,

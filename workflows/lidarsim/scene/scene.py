@@ -18,7 +18,8 @@ from ..base.arrays import Bools, Floats, Indices, Ints32
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.signatures import shown_readably, with_fields_of
-from ..base.validation import as_array, checked, checked_fields, shown
+from ..base.validation import as_array, checked, checked_fields
+from ..base.value_texts import shown
 from ..base.vectors import hypot
 from ..base.words import listed, plural
 from ..media.materials import SurfaceKinds

@@ -17,11 +17,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
 from ..base.elementary import log1p, sin_cos
+from ..base.error_sentences import sentences
 from ..base.errors import LidarError, message_of
 from ..base.input_files import read_input_text
 from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..base.plugins import Plugin, find_plugin
-from ..base.validation import checked, sentences
+from ..base.validation import checked
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width

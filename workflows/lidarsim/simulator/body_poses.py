@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats
 from ..base.errors import LidarError, prefixed
-from ..base.validation import shown
+from ..base.value_texts import shown
 from ..motion.rotations import check_rotations
 from ..motion.trajectory import CENTRE, Pose, StaticPose, Track, Trajectory, pose_of
 

@@ -18,7 +18,8 @@ from raybeam.poses import check_poses
 from ..base.arrays import Floats, Floats32, Indices
 from ..base.declared import Names
 from ..base.errors import LidarError
-from ..base.validation import checked, shown
+from ..base.validation import checked
+from ..base.value_texts import shown
 from ..base.words import name_hint
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column

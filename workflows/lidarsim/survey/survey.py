@@ -19,7 +19,8 @@ from ..base.declared import FILLED_IN, Names, Several, about, written_as
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.signatures import ReadableSignature
-from ..base.validation import checked_fields, shown
+from ..base.validation import checked_fields
+from ..base.value_texts import shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..base.words import listed, plural, scans_in_words
 from ..columns.table import (

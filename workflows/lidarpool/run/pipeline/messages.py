@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats32
 from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import one_line
+from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.motion.trajectory import Pose
