@@ -159,12 +159,11 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     built, notes = _built_with_notes(scenario, terminal)
     with terminal.status("looking from all places"):
         plan = plan_stations(built.scene, sensor, **settings)
-    with terminal.status("drawing the picture"):
-        page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
-    page.save(folder / PICTURE_FILE)
+    with terminal.status("drawing the picture"):
+        draw_stations(built.scene, plan).save(folder / PICTURE_FILE)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
     figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
