@@ -16,6 +16,7 @@ from ..background import in_background
 from ..errors import PoolError
 from ..internals.scheduler import number_of_transitions
 from ..pipe_states import names_of_pipes
+from ..stats import statistics_of
 from ..workers import on_scheduler
 from .local import local_cluster
 
@@ -35,6 +36,7 @@ class LocalPool:
         with ExitStack() as stack:
             cluster = stack.enter_context(local_cluster(partitions, **options))
             self.client = stack.enter_context(Client(cluster))
+            on_scheduler(self.client, _begin_to_count)
             self._stack = stack.pop_all()
         self._closing = threading.Lock()
         self._closed = threading.Event()
@@ -59,6 +61,11 @@ class LocalPool:
             elif time.monotonic() - used_at >= idle_s:
                 logger.warning("The local pool has ended: it had no task for %g s.", idle_s)
                 self.close()
+
+
+def _begin_to_count(dask_scheduler: Any = None) -> None:
+    """Count the tasks of the cluster from now on, for `Partition.stats` and `Partition.tasks`."""
+    statistics_of(dask_scheduler)
 
 
 def _use(dask_scheduler: Any = None) -> tuple[bool, int]:

@@ -22,7 +22,7 @@ import poolpart.deploy.local  # noqa: F401
 from ...base import logs, software  # noqa: F401
 from ...base.fork_server import keep_freed_memory
 from ...plan import trial  # noqa: F401
-from . import casting_workers  # noqa: F401
+from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()
 # A starting worker removes the folders of ended workers, at the same time as their nannies, and
