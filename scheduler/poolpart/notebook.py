@@ -43,26 +43,35 @@ def table_of_partitions(client: Client, title: str) -> str:
 
 def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
     """Return the HTML of the figures of a partition; of a dissolved partition, a sentence."""
-    try:
-        row, link = _ask(get_client(), _one_partition, name=name)
-    except (PoolError, OSError, ValueError):  # ValueError: this process has no client
-        return _plain(title)
-    if row is None:
-        return _plain(title) + html_paragraph(
-            "The partition was dissolved, or its workers have left: no worker declares it."
-        )
-    return html_table(title, _HEAD, [row]) + _link(link, _OPENER)
+    gone = "The partition was dissolved, or its workers have left: no worker declares it."
+    return _table_of_one(get_client, _one_partition, name, (title, _HEAD, gone))
 
 
 def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
     """Return the HTML of the state of a pipe; of a deleted pipe, a sentence."""
+    gone = "The pipe was deleted, or never created."
+    return _table_of_one(get_client, _one_pipe, name, (title, _HEAD_OF_A_PIPE, gone))
+
+
+def _table_of_one(
+    get_client: Callable[[], Client],
+    look: Callable[..., Any],
+    name: str,
+    words: tuple[str, Sequence[str], str],
+) -> str:
+    """Return the HTML of what a function finds of a name on the scheduler.
+
+    `words` are the title, the names of the columns, and the sentence if nothing of that name is
+    there. Only the title is shown where the scheduler does not answer.
+    """
+    title, head, gone = words
     try:
-        row, link = _ask(get_client(), _one_pipe, name=name)
+        row, link = _ask(get_client(), look, name=name)
     except (PoolError, OSError, ValueError):  # ValueError: this process has no client
         return _plain(title)
     if row is None:
-        return _plain(title) + html_paragraph("The pipe was deleted, or never created.")
-    return html_table(title, _HEAD_OF_A_PIPE, [row]) + _link(link, _OPENER)
+        return _plain(title) + html_paragraph(gone)
+    return html_table(title, head, [row]) + _link(link, _OPENER)
 
 
 def _plain(text: str) -> str:

@@ -166,9 +166,7 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> list[TaskRow]:
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     running = {
-        key
-        for worker in members(scheduler, name)
-        for key in [task.key for task in _running_tasks(worker, name)]
+        task.key for worker in members(scheduler, name) for task in _running_tasks(worker, name)
     }
     rows = []
     for task in scheduler.tasks.values():

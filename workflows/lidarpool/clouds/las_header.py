@@ -6,14 +6,13 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import laspy
+
 from lidarsim.base.allowance import Allowance
-from lidarsim.base.errors import CutShortError, LidarError
-from lidarsim.base.extras import install_command
+from lidarsim.base.errors import CutShortError
 from lidarsim.base.input_files import open_input
 from lidarsim.scene.files.noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
 from lidarsim.scene.files.stated_system import StatedSystem
@@ -41,16 +40,12 @@ def open_las(path: Path) -> Iterator[Any]:
     Raises
     ------
     LidarError
-        If laspy is not installed, or if the points would take far more memory than the file has
-        bytes.
+        If the points would take far more memory than the file has bytes.
     ValueError
         If the header announces more than the file holds; laspy raises further errors.
     OSError
         If the file cannot be read.
     """
-    if find_spec("laspy") is None:
-        raise LidarError(f"it is read by laspy: {install_command('lidarpool[las]')}")
-    laspy: Any = import_module("laspy")  # an extra
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         _, points_start, _ = _layout(file)

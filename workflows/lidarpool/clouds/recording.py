@@ -405,6 +405,7 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
 
 def take_positions(columns: dict[str, AnyArray]) -> Floats:
     """Take columns x, y and z out, and return positions (n, 3); ValueError without these."""
-    if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(f"its points have no {', '.join(missing)}")
-    return np.stack([np.asarray(columns.pop(axis), np.float64) for axis in "xyz"], axis=1)
+    positions = positions_of(columns)
+    for axis in "xyz":
+        del columns[axis]
+    return positions
