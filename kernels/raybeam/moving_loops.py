@@ -15,7 +15,7 @@ from numba import types
 from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined, stage
 from .crossing import Crossing, Nearest
-from .embree_memory import float64s, int64s
+from .cast_memory import float64s, int64s
 
 CELL = 64  # rays of a cell
 WIDE = 16  # cells of a wide cell

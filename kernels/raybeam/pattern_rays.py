@@ -83,9 +83,9 @@ def checked_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple
     """
     if not (_numba_is_installed() and len(ray)):
         return plain_rays(pattern, first, ray, poses)
-    from . import embree_rays  # numba takes half a second to import
+    from . import ray_loops  # numba takes half a second to import
 
-    origins, directions = embree_rays.compiled_rays(pattern, first, ray, poses)
+    origins, directions = ray_loops.compiled_rays(pattern, first, ray, poses)
     return (poses.positions if origins is None else origins.T), directions.T
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from .backend import Backend, BackendUnavailable
 from .cuda_backend import CudaBackend
-from .embree_backend import EmbreeBackend
 from .numpy_backend import NumpyBackend
+from .tile_backend import TileBackend
 
 # In the order in which "auto" tries them. Add new backends here.
-BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend)
+BACKENDS: tuple[type[Backend], ...] = (CudaBackend, TileBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:

@@ -47,7 +47,9 @@ class SubRays:
         return straight, across * straight, up * straight
 
     def loop_table(self, offsets: Floats | None) -> Floats:
-        """Return the table (5, k) that compiled loops read: shares, or angles, and starts.
+        """Return the table that compiled loops read: shares, or angles, and starts.
+
+        It has 5 rows of whole vectors of 8 sub-rays, of which the last repeats.
 
         Rows are shares ahead, across and up, and starts across and up. With `offsets` the shares
         differ by beam: rows 1 and 2 are then angles.
@@ -58,7 +60,8 @@ class SubRays:
             rows[1:3] = self.angles.T
         if self.starts is not None:
             rows[3:] = self.starts.T
-        return rows
+        padded = np.minimum(np.arange(-(-len(self) // 8) * 8), len(self) - 1)
+        return rows[:, padded]
 
 
 def spread(

@@ -45,7 +45,9 @@ class WideTree:
     order: Ints32
 
 
-def build_tree(corners: Floats, width: int, leaf_size: int) -> WideTree:
+def build_tree(
+    corners: Floats, width: int, leaf_size: int, triangle_cost: float | None = None
+) -> WideTree:
     """Build a tree over triangles, or over boxes.
 
     Parameters
@@ -56,11 +58,14 @@ def build_tree(corners: Floats, width: int, leaf_size: int) -> WideTree:
         Maximum children of a node.
     leaf_size
         Maximum triangles of a leaf, up to ``1 << LEAF_BITS``.
+    triangle_cost
+        Cost of each triangle of a leaf, as a share of the cost of a node; the leaf itself costs as
+        much as a node. None for leaves that cost as much as a node for each triangle.
     """
     lower = np.ascontiguousarray((corners.min(axis=1) - PAD).T, dtype=np.float32)
     upper = np.ascontiguousarray((corners.max(axis=1) + PAD).T, dtype=np.float32)
     binary = ploc.build(lower, upper)
-    count, leaf = _leaves(binary, leaf_size)
+    count, leaf = _leaves(binary, leaf_size, triangle_cost)
     first = _positions(binary, count)
     n = len(corners)
     order = np.empty(n, np.int32)
@@ -104,21 +109,27 @@ def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     ), roots[:-1]
 
 
-def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[Ints32, Bools]:
+def _leaves(
+    tree: ploc.BinaryTree, leaf_size: int, triangle_cost: float | None
+) -> tuple[Ints32, Bools]:
     """Return the number of triangles under each node, and whether a leaf is cheaper.
 
-    By the surface area heuristic, with equal costs of triangle and box tests.
+    By the surface area heuristic, with the costs that `build_tree` describes.
     """
     area = tree.area
+    import os
+    nodec=float(os.environ.get('NC','0.5')) if triangle_cost is not None else 1.0
+    if triangle_cost is not None: triangle_cost=float(os.environ.get('TC','0.05'))
+    fixed, slope = (0.0, 1.0) if triangle_cost is None else (1.0, triangle_cost)
     count = np.ones(len(area), np.int32)
-    cost = area.copy()
+    cost = area * np.float32(fixed + slope)
     leaf = np.ones(len(area), np.bool_)
     for start, stop in tree.rounds:
         first_child = tree.first_child[start:stop]
         second_child = tree.second_child[start:stop]
         count[start:stop] = count[first_child] + count[second_child]
-        leaf_cost = area[start:stop] * count[start:stop]
-        split_cost = area[start:stop] + cost[first_child] + cost[second_child]
+        leaf_cost = area[start:stop] * (fixed + slope * count[start:stop]).astype(np.float32)
+        split_cost = area[start:stop]*np.float32(nodec) + cost[first_child] + cost[second_child]
         is_cheaper = (count[start:stop] <= leaf_size) & (leaf_cost <= split_cost)
         leaf[start:stop] = is_cheaper
         cost[start:stop] = np.where(is_cheaper, leaf_cost, split_cost)

@@ -26,7 +26,7 @@ def usable(name, request):
     return name
 
 
-@pytest.fixture(params=["numpy", "source", "embree", CUDA])
+@pytest.fixture(params=["numpy", "tiles", "source", "embree", CUDA])
 def backend(request):
     """Name of a backend that can be used here, for ``RayCaster(..., backend=backend)``."""
     return usable(request.param, request)
@@ -38,7 +38,7 @@ def kernels(request):
     return usable(request.param, request)
 
 
-@pytest.fixture(params=["numpy", "source", CUDA])
+@pytest.fixture(params=["numpy", "tiles", "source", CUDA])
 def exact_backend(request):
     """Name of a backend that decides in float64: all but embree."""
     return usable(request.param, request)

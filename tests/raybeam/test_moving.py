@@ -224,7 +224,7 @@ def test_most_rays_are_not_looked_at(monkeypatch):
 
 
 @pytest.mark.parametrize("there", [(2.0, 5.0), (0.0, 1.0)])
-@pytest.mark.parametrize("backend", ["embree", "numpy"])
+@pytest.mark.parametrize("backend", ["tiles", "embree", "numpy"])
 def test_rays_beside_the_moment_when_a_body_is_there_miss_it(backend, there):
     """Also where they are compared together with rays of that very moment."""
 

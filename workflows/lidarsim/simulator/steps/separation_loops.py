@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
-from raybeam.embree_memory import float64s, int64s, uint8s
+from raybeam.cast_memory import float64s, int64s, uint8s
 
 from ...base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raybeam.compiled import compiled, inlined, stage
-from raybeam.embree_rays import any_axes
+from raybeam.ray_loops import any_axes
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.elementary_loops import arctan2, sin_cos

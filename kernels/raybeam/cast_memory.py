@@ -1,8 +1,7 @@
-"""Memory of the compiled loops around Embree: the record of a cast, and scratch of a thread."""
+"""The record of a cast, of its meshes and of their instances, as compiled loops read them."""
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numba
@@ -14,22 +13,13 @@ from .arrays import AnyArray, Floats
 from .pattern import Pattern
 from .poses import Poses
 
-LANES = 16  # rays of a group; Embree takes a group at once, or in two or four packets
-
 # A cast: addresses of arrays that the loops read or write, and numbers. Address 0: no array. A ray
 # belongs to a row of the pattern, which is a beam, or a sub-ray of a beam. Local: centred and
 # scaled, as `Frame` describes.
 CAST = np.dtype(
     [
-        ("scene", "i8"),  # the RTCScene
-        ("scratch", "i8"),  # `SCRATCH`, at a multiple of 64
         ("mesh", "i8"),  # `MESH` records
         ("instances", "i8"),  # `INSTANCE` records; 0 for a single mesh without a transform
-        ("masked", "i8"),  # whether any mesh has an opacity
-        ("packets", "i8", 4),  # addresses of the filter functions for the packets of a group
-        ("single", "i8"),  # address of the filter function for single rays
-        ("decide", "i8"),  # addresses of the functions of these names in embree_exact.py
-        ("nearby", "i8"),
         ("directions", "i8"),  # of beams: float64 (3, rows), unit vectors
         ("origins", "i8"),  # of beams, relative to the sensor: float64 (3, rows), metres
         ("positions", "i8"),  # float64 (3, poses), metres
@@ -42,27 +32,27 @@ CAST = np.dtype(
         ("rays_per_pose", "i8"),
         ("first", "i8"),  # row of ray 0 in the pattern, counted in sub-rays
         ("subrays", "i8"),  # sub-rays of each beam
-        ("shares", "i8"),  # float64 (5, subrays): `SubRays.loop_table`
+        ("shares", "i8"),  # float64 (5, lanes_per_beam): `SubRays.loop_table`
+        ("lanes_per_beam", "i8"),  # of a tile: `subrays` in whole vectors
         ("offsets", "i8"),  # float64 (2, rows): angles of beams, added to the angles in `shares`
         ("has_axis", "i8"),  # whether `axis` defines the directions across and up of sub-rays
         ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
         ("axis", "f8", 3),
-        ("centre", "f8", 3),  # the next four fields are the scene's `Frame`
+        ("centre", "f8", 3),  # the next two fields are of the scene's `Frame`
         ("scale", "f8"),
-        ("lower", "f8", 3),
-        ("upper", "f8", 3),
-        ("starts_near", "i8"),  # whether all rays start at most `mesh.NEAR` from the centre
         ("shares_origin", "i8"),  # whether all rays start at the position of a single pose
-        ("step", "i8"),  # difference of the numbers of neighbouring rays of a ring
-        ("rays_along", "i8"),  # rays of each ring in a group
-        ("rays_across", "i8"),  # rings of a group
-        ("width", "i8"),  # rays of a packet of Embree, 1 for no packets
-        ("rounding", "f8"),  # directions in packets are rounded to the spacing of numbers about it
-        ("coherence", "f8"),  # a group with a smaller cosine between two rays is cast ray by ray
+        ("tile", "i8"),  # memory of a tile, at a multiple of 64
+        ("tile_rays", "i8"),
+        ("lanes", "i8"),  # of a `TilePlan`: int64 (groups, tile_rays)
+        ("shifts", "i8"),  # of a `TilePlan`: int64 (groups,)
+        ("groups", "i8"),
+        ("firing", "i8"),  # rays of a firing
+        ("firings", "i8"),  # of a tile
+        ("top", "i8"),  # address of the nodes of the tree over the instances
         ("t_min", "f8"),  # closest and farthest distance of a hit, local
         ("t_max", "f8"),
         ("index", "i8"),  # int32: row in the caller's faces, by row of the corners; 0 to write rows
-        ("block_memory", "i8"),  # float64, then twice int32: hits of the rays of a block
+        ("hits", "i8"),  # float64, then int64: distances and keys of the rays of a call, and one more
         ("first_ray", "i8"),  # the ray whose number is written as 0
         ("ray", "i8"),  # output of hits: uint32
         ("distance", "i8"),  # float64, metres
@@ -75,10 +65,13 @@ CAST = np.dtype(
 )  # fmt: skip
 
 # A mesh: addresses of its corners, and of the uv and the mask of its opacity; the mask's height,
-# 0 if the mesh is opaque, and width.
+# 0 if the mesh is opaque, and width; addresses of the arrays of its `TileTree`.
 MESH = np.dtype(
-    [("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("mask_height", "i8"), ("mask_width", "i8")]
-)
+    [
+        ("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("mask_height", "i8"), ("mask_width", "i8"),
+        ("nodes", "i8"), ("blocks", "i8"), ("leaf_corners", "i8"), ("order", "i8"),
+    ]
+)  # fmt: skip
 INSTANCE = np.dtype(
     [
         ("matrix", "f8", 12),  # to the mesh's coordinates
@@ -91,69 +84,7 @@ MESH_FIELD = 12
 FIRST_ROW_FIELD = 13
 INSTANCE_BYTES = INSTANCE.itemsize
 
-# Scratch memory of a thread. Fields with `LANES` numbers have a number for each ray of a group.
-SCRATCH = np.dtype(
-    [
-        ("context", "i8", 8),  # RTCRayQueryContext: Embree hands its address to the filters
-        ("mesh", "i8"),
-        ("instances", "i8"),
-        ("masked", "i8"),
-        ("t_min", "f8"),
-        ("t_max", "f8"),
-        ("lane", "i8"),  # lane of the first ray of a packet, or of the single ray
-        ("scene", "i8"),
-        ("nearby", "i8"),
-        ("arguments", "i8", 8),  # RTCIntersectArguments
-        ("valid", "i4", LANES),  # -1 for rays that Embree casts, 0 for copies
-        ("single", "f4", 32),  # RTCRayHit
-        ("packet", "f4", 22 * LANES),  # RTCRayHit16, two RTCRayHit8 or four RTCRayHit4
-        ("query", "f4", 8),  # RTCPointQuery, and its context: zeros
-        ("query_context", "i8", 28),
-        ("ray_in_group", "i8", LANES),  # number of the lane's ray, from the first of the group
-        ("ray", "i8", LANES),  # number of the lane's ray, from the first of the block
-        ("real", "i8", LANES),  # whether the lane has a ray of the cast, not a copy of another ray
-        ("ox", "f8", LANES), ("oy", "f8", LANES), ("oz", "f8", LANES),  # local
-        ("dx", "f8", LANES), ("dy", "f8", LANES), ("dz", "f8", LANES),
-        ("entry", "f8", LANES),  # distance of the start that Embree sees from the origin
-        # The longest axis of the direction, the origin with that axis last, and the shear, see
-        # triangle.py; the instance of these coordinates, -1 for none yet; and the length of the
-        # direction in the instance's coordinates.
-        ("axis", "i8", LANES),
-        ("u", "f8", LANES), ("v", "f8", LANES), ("w", "f8", LANES),
-        ("sx", "f8", LANES), ("sy", "f8", LANES), ("sz", "f8", LANES),
-        ("inside", "i8", LANES), ("length", "f8", LANES),
-        # Candidates of the filters: the shortest distance in float32, its triangle, and a second
-        # triangle that is as near; -1 for none, -2 for several. The fields in 32 bits are for
-        # scenes without masks: triangles, and in a scene of instances the instances of these.
-        ("rough", "f8", LANES), ("first_candidate", "i8", LANES), ("second_candidate", "i8", LANES),
-        ("rough_32", "f4", LANES), ("first_32", "i4", LANES), ("second_32", "i4", LANES),
-        ("first_instance_32", "i4", LANES), ("second_instance_32", "i4", LANES),
-        # The closest triangle that the ray hits: local distance; key, the row of the mesh's corners
-        # plus `KEYS_PER_INSTANCE` times the instance's number; whether the hit needs no second
-        # cast. Of equally close triangles, the lowest key.
-        ("t", "f8", LANES), ("key", "i8", LANES), ("sure", "i8", LANES),
-        # Of a triangle of each ray, and of the triangle's instance: (9, `LANES`), (12, `LANES`).
-        ("corners", "f8", 9 * LANES), ("matrix", "f8", 12 * LANES),
-        # Row in the pattern, number of the pose, and number of the ray within the pose.
-        ("row", "i8", LANES), ("pose", "i8", LANES), ("within", "i8", LANES),
-        # Components of a sub-ray's direction along its beam, across and up.
-        ("straight", "f8", LANES), ("across", "f8", LANES), ("up", "f8", LANES),
-        ("aside", "f8", LANES), ("above", "f8", LANES),  # starts of sub-rays, across and up, metres
-    ]
-)  # fmt: skip
-
 KEYS_PER_INSTANCE = np.int64(1) << 32
-
-
-def byte_offset(name: str) -> int:
-    """Return the offset of a field of the scratch memory, in bytes."""
-    return int(SCRATCH.fields[name][1])  # type: ignore[index]
-
-
-def field_index(name: str) -> int:
-    """Return the index of a field of the scratch memory seen as an array of the field's type."""
-    field = SCRATCH[name]
-    return byte_offset(name) // (field.subdtype[0] if field.subdtype else field).itemsize
 
 
 def pointer(kind: Any) -> Any:
@@ -178,6 +109,11 @@ uint32s = pointer(types.uint32)
 
 CASTS = types.Array(numba.from_dtype(CAST), 1, "C")
 casts_at = pointer(CASTS.dtype)
+
+
+def whole_vectors(subrays: int) -> int:
+    """Return how many lanes the sub-rays of a beam take: whole vectors of 8, but 1 for a beam."""
+    return 1 if subrays == 1 else -(-subrays // 8) * 8
 
 
 class Cast:
@@ -219,7 +155,7 @@ class Cast:
         record["poses"] = len(poses)
         record["rays_per_pose"] = poses.rays_per_pose
         record["first"] = first
-        record["subrays"] = 1
+        record["subrays"] = record["lanes_per_beam"] = 1
         record["shares_origin"] = len(poses) == 1 and origins is None and motion is None
 
     def set_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
@@ -235,6 +171,7 @@ class Cast:
             return 0.0
         record["subrays"] = len(sub_rays)
         record["shares"] = self.address_of(sub_rays.loop_table(pattern.offsets))
+        record["lanes_per_beam"] = whole_vectors(len(sub_rays))
         record["has_starts"] = sub_rays.starts is not None
         record["offsets"] = self.address_of(pattern.offsets)
         if sub_rays.axis is not None:
@@ -244,24 +181,3 @@ class Cast:
             return 0.0
         record["shares_origin"] = 0
         return float(np.abs(sub_rays.starts).max())
-
-
-class _ThreadMemory(threading.local):
-    """Scratch memory of each thread, since threads of a worker may cast at the same time."""
-
-    def __init__(self) -> None:
-        self._scratch = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64)
-        self._block_memory = np.zeros(0)
-
-    def addresses(self, rays: int) -> tuple[int, int]:
-        """Return addresses of the scratch memory, a multiple of 64, and of memory for a block.
-
-        `rays` is the number of rays of the block.
-        """
-        if len(self._block_memory) < 2 * rays:
-            self._block_memory = np.zeros(2 * rays)
-        address = self._scratch.ctypes.data
-        return address + -address % 64, self._block_memory.ctypes.data
-
-
-thread_memory = _ThreadMemory()

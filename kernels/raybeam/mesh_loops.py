@@ -1,0 +1,115 @@
+"""Rays at meshes, their instances and masks, as parts of compiled loops.
+
+`mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_memory.py).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from . import cast_memory as memory
+from .compiled import compiled, inlined, stage
+from .cast_memory import float32s, float64s, int64s, uint8s
+from .triangle_loops import areas, shear
+
+f64_1 = types.float64[::1]
+f64_2 = types.float64[:, ::1]
+i32_1 = types.int32[::1]
+
+
+@stage
+def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Transform a ray from the scene's to the mesh's local coordinates, as `Scene.enter`.
+
+    `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
+    the length of the direction before it was made a unit vector.
+    """
+    x = (m[0] * dx + m[1] * dy) + m[2] * dz
+    y = (m[4] * dx + m[5] * dy) + m[6] * dz
+    z = (m[8] * dx + m[9] * dy) + m[10] * dz
+    length = np.sqrt((x * x + y * y) + z * z)
+    u = ((m[0] * ox + m[1] * oy) + m[2] * oz) + m[3]
+    v = ((m[4] * ox + m[5] * oy) + m[6] * oz) + m[7]
+    w = ((m[8] * ox + m[9] * oy) + m[10] * oz) + m[11]
+    return u, v, w, x / length, y / length, z / length, length
+
+
+@inlined
+def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
+    """Return the three corners of a triangle, each as three coordinates of which `axis` is last.
+
+    `triangle` is the row in `table`.
+    """
+    x = axis + 1 if axis < 2 else 0
+    y = x + 1 if x < 2 else 0
+    k = 9 * triangle
+    return (
+        (table[k + x], table[k + y], table[k + axis]),
+        (table[k + 3 + x], table[k + 3 + y], table[k + 3 + axis]),
+        (table[k + 6 + x], table[k + 6 + y], table[k + 6 + axis]),
+    )
+
+
+@stage
+def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
+    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`.
+
+    `mesh` points to a `MESH`, `triangle` is the row in its corners.
+    """
+    uv = float32s(mesh[1])
+    mask = uint8s(mesh[2])
+    height = mesh[3]
+    width = mesh[4]
+    k = 6 * triangle
+    p = hit.a / hit.det
+    q = hit.b / hit.det
+    r = hit.c / hit.det
+    u = (p * np.float64(uv[k]) + q * np.float64(uv[k + 2])) + r * np.float64(uv[k + 4])
+    v = (p * np.float64(uv[k + 1]) + q * np.float64(uv[k + 3])) + r * np.float64(uv[k + 5])
+    column = min(np.int64((u - np.floor(u)) * width), width - 1)
+    row = min(np.int64((v - np.floor(v)) * height), height - 1)
+    return mask[row * width + column] != 0
+
+
+@compiled(types.void(memory.CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
+def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    casts, origins, directions, triangle_row, instance, u, v
+):
+    """Write the weights `u` and `v` (m,) of the second and third corner for hits of a `CAST`.
+
+    Rays (m, 3) are local to the scene; origins are (1, 3) if all rays share their origin.
+    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `trace` wrote
+    with `index` 0.
+    """
+    mesh = casts[0].mesh
+    instances = casts[0].instances
+    for k in range(len(triangle_row)):
+        o = origins[k if len(origins) > 1 else 0]
+        d = directions[k]
+        ox = o[0]
+        oy = o[1]
+        oz = o[2]
+        dx = d[0]
+        dy = d[1]
+        dz = d[2]
+        row = np.int64(triangle_row[k])
+        mesh_address = mesh
+        if instances != 0:
+            address = instances + memory.INSTANCE_BYTES * np.int64(instance[k])
+            record = int64s(address)
+            mesh_address = record[memory.MESH_FIELD]
+            row = row - record[memory.FIRST_ROW_FIELD]
+            ox, oy, oz, dx, dy, dz, _ = enter_instance(
+                float64s(address), ox, oy, oz, dx, dy, dz
+            )
+        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
+        corners = corners_of(float64s(int64s(mesh_address)[0]), row, axis)
+        a, b, c, det, _ = areas(corners, (p, q, r, sx, sy, sz))
+        sign = -1.0 if det < 0 else 1.0  # areas of a hit have the sign of `det`, or are 0
+        a = max(sign * a, 0.0)
+        b = max(sign * b, 0.0)
+        c = max(sign * c, 0.0)
+        total = (a + b) + c
+        u[k] = b / total
+        v[k] = c / total

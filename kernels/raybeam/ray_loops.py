@@ -1,0 +1,509 @@
+"""Rays of a pattern, a tile at a time in compiled loops, with the operations of `plain_rays`.
+
+A ray is a beam of the pattern, or a sub-ray of a beam, cast from a pose. `cast` is a `CAST` record
+(cast_memory.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py),
+to which `floats` and `numbers` point as float64 and int64. Tables that a `CAST` names come as
+addresses, with one column for each beam or pose. A vector has four rays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import types
+
+from . import cast_memory as memory
+from .arrays import Floats, Ints
+from .cast_memory import float64s, int64s
+from .compiled import compiled, inlined, stage
+from .mesh import NEAR
+from .pattern import Pattern
+from .poses import Poses
+from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_at, thread_tiles
+from .vectors import load, splat, square_root, store
+
+_TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
+_BEAMS = 64  # of a tile of rays that are only computed
+
+
+class FirstRay(NamedTuple):
+    """The ray with number 0 of a call.
+
+    Attributes
+    ----------
+    row
+        Row in the pattern, counted in sub-rays.
+    pose, within
+        Number of the pose, and number of the ray within the pose.
+    ray
+        Number of the ray in the scan.
+    """
+
+    row: int
+    pose: int
+    within: int
+    ray: int
+
+
+@inlined
+def _quotient(number, divisor):  # type: ignore[no-untyped-def]
+    """Return ``number // divisor``, for whole numbers below 2^52: exact, faster than `//`."""
+    return np.int64(np.floor(np.float64(number) / np.float64(divisor)))
+
+
+@inlined
+def any_axes(x, y, z):  # type: ignore[no-untyped-def]
+    """Return the two axes across a unit direction of `sub_rays.any_axes`, as six numbers."""
+    sign = -1.0 if z < 0 else 1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
+
+
+@inlined
+def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
+    """Return the two axes across a unit direction of `sub_rays.axes_about`, as six numbers.
+
+    `axis` is `SubRays.axis`: three numbers.
+    """
+    a, b, c = axis
+    p = b * z - c * y
+    q = c * x - a * z
+    r = a * y - b * x
+    length = np.sqrt((p * p + q * q) + r * r)
+    norm = max(length, 1e-300)
+    p = p / norm
+    q = q / norm
+    r = r / norm
+    u = y * r - z * q
+    v = z * p - x * r
+    w = x * q - y * p
+    if length < 1e-6:
+        p, q, r, u, v, w = any_axes(x, y, z)
+    return p, q, r, u, v, w
+
+
+@stage
+def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
+    """Write the rows in the pattern of a tile's rays, counted in sub-rays.
+
+    `first_row` is the row of the call's first ray; the pattern, of `row_count` rows, repeats.
+    """
+    numbers = int64s(tile)
+    number_at = row_at(NUMBER, rays)
+    target = row_at(ROW, rays)
+    for lane in range(rays):
+        row = first_row + numbers[number_at + lane]
+        numbers[target + lane] = row - _quotient(row, row_count) * row_count
+
+
+@stage
+def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
+    """Write the poses of a tile's rays, and the numbers of the rays within their poses.
+
+    `first` is the `FirstRay`. Rays outside the call take the nearest pose.
+    """
+    numbers = int64s(tile)
+    number_at = row_at(NUMBER, rays)
+    pose_at = row_at(POSE, rays)
+    within_at = row_at(WITHIN, rays)
+    for lane in range(rays):
+        inside = first.within + numbers[number_at + lane]
+        later = _quotient(inside, rays_per_pose)
+        numbers[pose_at + lane] = min(max(first.pose + later, 0), poses - 1)
+        numbers[within_at + lane] = inside - later * rays_per_pose
+
+
+@stage
+def _use_one_pose(tile, rays):  # type: ignore[no-untyped-def]
+    """Write pose 0 for all rays of a tile."""
+    numbers = int64s(tile)
+    pose_at = row_at(POSE, rays)
+    for lane in range(rays):
+        numbers[pose_at + lane] = 0
+
+
+@stage
+def _look_up_beams(tile, rays, directions, rows):  # type: ignore[no-untyped-def]
+    """Write the directions of a tile's rays, by their rows in the pattern."""
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    table = float64s(directions)
+    row_of = row_at(ROW, rays)
+    target = row_at(DX, rays)
+    for lane in range(rays):
+        row = numbers[row_of + lane]
+        floats[target + lane] = table[row]
+        floats[target + rays + lane] = table[rows + row]
+        floats[target + 2 * rays + lane] = table[2 * rows + row]
+
+
+@inlined
+def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
+    """Return ``a x + b y`` of vectors."""
+    return a * x + b * y
+
+
+@stage
+def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the directions of a tile's sub-rays, and their starts relative to the beams' origins.
+
+    The rows of the sub-rays become rows of their beams. `lanes_per_beam` consecutive lanes are of a
+    beam. With `offsets` of the beams, radians, rows 1 and 2 of the table of shares are tangents of
+    angles, to which the offsets are added.
+    """
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    shares = float64s(cast.shares)
+    offsets = float64s(cast.offsets)
+    directions = float64s(cast.directions)
+    rows = cast.rows
+    lanes = cast.lanes_per_beam
+    row_of = row_at(ROW, rays)
+    origin = row_at(OX, rays)
+    target = row_at(DX, rays)
+    one = splat(1.0)
+    axis = cast.axis[0], cast.axis[1], cast.axis[2]
+    for first in range(0, rays, lanes):
+        beam = _quotient(numbers[row_of + first], cast.subrays)
+        for lane in range(first, first + lanes):
+            numbers[row_of + lane] = beam
+        x = directions[beam]
+        y = directions[rows + beam]
+        z = directions[2 * rows + beam]
+        if cast.has_axis:
+            a, b, c, d, e, f = axes_about(x, y, z, axis)
+        else:
+            a, b, c, d, e, f = any_axes(x, y, z)
+        for k in range(0, lanes, 4):
+            straight = load(shares, k)
+            across = load(shares, lanes + k)
+            up = load(shares, 2 * lanes + k)
+            if cast.offsets != 0:
+                across = across + splat(offsets[beam])
+                up = up + splat(offsets[rows + beam])
+                straight = one / square_root((one + across * across) + up * up)
+                across = across * straight
+                up = up * straight
+            i = target + first + k
+            store(floats, i, _combine(straight, splat(x), across, splat(a)) + up * splat(d))
+            store(floats, i + rays, _combine(straight, splat(y), across, splat(b)) + up * splat(e))
+            store(
+                floats, i + 2 * rays, _combine(straight, splat(z), across, splat(c)) + up * splat(f)
+            )
+            if cast.has_starts:
+                aside = load(shares, 3 * lanes + k)
+                above = load(shares, 4 * lanes + k)
+                i = origin + first + k
+                store(floats, i, _combine(aside, splat(a), above, splat(d)))
+                store(floats, i + rays, _combine(aside, splat(b), above, splat(e)))
+                store(floats, i + 2 * rays, _combine(aside, splat(c), above, splat(f)))
+
+
+@inlined
+def _turn(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
+    """Rotate four vectors, whose components are in three rows from `target` on, by nine vectors."""
+    a, b, c, d, e, f, g, h, i = matrix
+    p = load(floats, target)
+    q = load(floats, target + rays)
+    r = load(floats, target + 2 * rays)
+    store(floats, target, (p * a + q * b) + r * c)
+    store(floats, target + rays, (p * d + q * e) + r * f)
+    store(floats, target + 2 * rays, (p * g + q * h) + r * i)
+
+
+@inlined
+def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
+    """Return the nine numbers of a pose's matrix, each as a vector."""
+    k = pose
+    n = poses
+    return (
+        splat(matrices[k]),
+        splat(matrices[k + n]),
+        splat(matrices[k + 2 * n]),
+        splat(matrices[k + 3 * n]),
+        splat(matrices[k + 4 * n]),
+        splat(matrices[k + 5 * n]),
+        splat(matrices[k + 6 * n]),
+        splat(matrices[k + 7 * n]),
+        splat(matrices[k + 8 * n]),
+    )
+
+
+@stage
+def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Rotate vectors of a tile, in three rows from `first_row` on, to the scene's axes.
+
+    `rotations` is the address of the matrices of the poses, float64 (9, poses).
+    """
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    matrices = float64s(rotations)
+    pose_at = row_at(POSE, rays)
+    target = row_at(first_row, rays)
+    if poses == 1:
+        matrix = _matrix(matrices, 0, 1)
+        for lane in range(0, rays, 4):
+            _turn(floats, target + lane, rays, matrix)
+        return
+    for lane in range(rays):
+        i = target + lane
+        p = floats[i]
+        q = floats[i + rays]
+        r = floats[i + 2 * rays]
+        k = numbers[pose_at + lane]
+        n = poses
+        floats[i] = (p * matrices[k] + q * matrices[k + n]) + r * matrices[k + 2 * n]
+        floats[i + rays] = (p * matrices[k + 3 * n] + q * matrices[k + 4 * n]) + r * matrices[
+            k + 5 * n
+        ]
+        floats[i + 2 * rays] = (p * matrices[k + 6 * n] + q * matrices[k + 7 * n]) + r * matrices[
+            k + 8 * n
+        ]
+
+
+@stage
+def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]
+    """Rotate vectors of a tile by the angular rates of their poses, as `PoseMotion` describes."""
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    delays = float64s(cast.delays)
+    rates = float64s(cast.rates)
+    poses = cast.poses
+    pose_at = row_at(POSE, rays)
+    within_at = row_at(WITHIN, rays)
+    target = row_at(first_row, rays)
+    for lane in range(rays):
+        i = target + lane
+        p = floats[i]
+        q = floats[i + rays]
+        r = floats[i + 2 * rays]
+        k = numbers[pose_at + lane]
+        delay = delays[numbers[within_at + lane]]
+        a = rates[k]
+        b = rates[k + poses]
+        c = rates[k + 2 * poses]
+        floats[i] = p + delay * (b * r - c * q)
+        floats[i + rays] = q + delay * (c * p - a * r)
+        floats[i + 2 * rays] = r + delay * (a * q - b * p)
+
+
+@stage
+def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
+    """Add vectors of a table (3, count) to the origins; row `field` has the column of each ray."""
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    vectors = float64s(table)
+    column_of = row_at(field, rays)
+    target = row_at(OX, rays)
+    for lane in range(rays):
+        k = numbers[column_of + lane]
+        floats[target + lane] += vectors[k]
+        floats[target + rays + lane] += vectors[k + count]
+        floats[target + 2 * rays + lane] += vectors[k + 2 * count]
+
+
+@stage
+def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
+    """Move the origins of a tile's rays by the velocities of their poses."""
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    delays = float64s(cast.delays)
+    velocities = float64s(cast.velocities)
+    poses = cast.poses
+    pose_at = row_at(POSE, rays)
+    within_at = row_at(WITHIN, rays)
+    target = row_at(OX, rays)
+    for lane in range(rays):
+        k = numbers[pose_at + lane]
+        delay = delays[numbers[within_at + lane]]
+        floats[target + lane] += delay * velocities[k]
+        floats[target + rays + lane] += delay * velocities[k + poses]
+        floats[target + 2 * rays + lane] += delay * velocities[k + 2 * poses]
+
+
+@stage
+def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
+    """Write zero to the origins of a tile's rays."""
+    floats = float64s(tile)
+    zero = splat(0.0)
+    for k in range(row_at(OX, rays), row_at(OX + 3, rays), 4):
+        store(floats, k, zero)
+
+
+@stage
+def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
+    """Write the origins of a tile's rays in the scene, metres.
+
+    If sub-rays have starts, the rows of the origins hold these.
+    """
+    has_starts = cast.shares != 0 and cast.has_starts != 0
+    if not has_starts:
+        _clear_origins(tile, rays)
+    if cast.origins != 0:
+        _add_to_origins(tile, rays, cast.origins, cast.rows, ROW)
+    if cast.origins != 0 or has_starts:
+        if cast.rotations != 0:
+            _rotate(tile, rays, OX, cast.rotations, cast.poses)
+        if cast.delays != 0:
+            _apply_rates(tile, rays, OX, cast)
+    _add_to_origins(tile, rays, cast.positions, cast.poses, POSE)
+    if cast.delays != 0:
+        _apply_velocities(tile, rays, cast)
+
+
+@stage
+def _localise(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
+    """Convert the origins of a tile's rays, metres, to local coordinates."""
+    floats = float64s(tile)
+    target = row_at(OX, rays)
+    factor = splat(scale)
+    for k in range(0, rays, 4):
+        i = target + k
+        store(floats, i, (load(floats, i) - splat(x)) * factor)
+        store(floats, i + rays, (load(floats, i + rays) - splat(y)) * factor)
+        store(floats, i + 2 * rays, (load(floats, i + 2 * rays) - splat(z)) * factor)
+
+
+@stage
+def _copy_out(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
+    """Write vectors of a tile to an output (3, total) of all rays.
+
+    `address` is of the output of the call's first ray, `count` the number of rays of the call.
+    """
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    vectors = float64s(address)
+    number_at = row_at(NUMBER, rays)
+    source = row_at(first_row, rays)
+    for lane in range(rays):
+        k = numbers[number_at + lane]
+        if 0 <= k < count:
+            vectors[k] = floats[source + lane]
+            vectors[k + total] = floats[source + rays + lane]
+            vectors[k + 2 * total] = floats[source + 2 * rays + lane]
+
+
+@stage
+def make_rays(cast, tile, rays, first, count):  # type: ignore[no-untyped-def]
+    """Compute the rays of a tile in local coordinates, by their numbers in the call.
+
+    `first` is the `FirstRay` of the call, `count` the number of its rays. Rays outside the call are
+    neighbours of its rays, if these have one pose. Origins that all rays share are computed for the
+    first tile: `share_origin`. Rays are also written to the outputs of rays of the cast, if any.
+    """
+    _find_rows(tile, rays, first.row, cast.rows * cast.subrays)
+    if cast.shares_origin == 0:
+        _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
+    if cast.shares != 0:
+        _make_sub_rays(tile, rays, cast)
+    else:
+        _look_up_beams(tile, rays, cast.directions, cast.rows)
+    if cast.rotations != 0:
+        _rotate(tile, rays, DX, cast.rotations, cast.poses)
+    if cast.delays != 0:
+        _apply_rates(tile, rays, DX, cast)
+    if cast.directions_out != 0:
+        out = cast.directions_out + 8 * first.ray
+        _copy_out(tile, rays, DX, out, cast.ray_count, count)
+    if cast.shares_origin == 0:
+        _write_origins(tile, rays, cast)
+        if cast.origins_out != 0:
+            out = cast.origins_out + 8 * first.ray
+            _copy_out(tile, rays, OX, out, cast.ray_count, count)
+        _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
+
+
+@stage
+def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
+    """Write the origin that all rays of a cast share to the rays of a tile, for all tiles."""
+    _use_one_pose(tile, rays)
+    _write_origins(tile, rays, cast)
+    _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
+
+
+@inlined
+def first_ray(cast, ray):  # type: ignore[no-untyped-def]
+    """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
+    total = cast.rows * cast.subrays
+    rays_per_pose = cast.rays_per_pose
+    pose = ray // rays_per_pose
+    within = ray - pose * rays_per_pose
+    return FirstRay((cast.first + ray) % total, pose, within, ray)
+
+
+@inlined
+def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
+    """Return the larger of `entry` and the distance at which a ray enters a slab of the box."""
+    component = d
+    if abs(d) < _TINY:
+        component = -_TINY if d < 0 else _TINY
+    return max(entry, min((lower - o) / component, (upper - o) / component))
+
+
+@inlined
+def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
+    """Return the distance at which a remote ray enters the box from -half to half; 0 for others.
+
+    Local; `o` and `d` are the ray's origin and direction.
+    """
+    entry = 0.0
+    if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > NEAR:
+        entry = _clip_axis(-half, half, o[0], d[0], entry)
+        entry = _clip_axis(-half, half, o[1], d[1], entry)
+        entry = _clip_axis(-half, half, o[2], d[2], entry)
+    return entry
+
+
+@compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
+def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
+    """Write the directions (3, m), and the origins unless (3, 0), of rays with numbers (m,)."""
+    cast = casts[0]
+    tile = cast.tile
+    lanes = cast.tile_rays
+    each = cast.lanes_per_beam
+    count = len(rays)
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    number_at = row_at(NUMBER, lanes)
+    origin = row_at(OX, lanes)
+    direction = row_at(DX, lanes)
+    beams = lanes // each
+    for start in range(0, count, beams):
+        # Each ray fills the lanes of a beam, of which one is the ray.
+        for k in range(beams):
+            number = rays[min(start + k, count - 1)]
+            first_of_beam = number - (cast.first + number) % cast.subrays
+            for lane in range(each):
+                numbers[number_at + k * each + lane] = first_of_beam + min(lane, cast.subrays - 1)
+        make_rays(cast, tile, lanes, first_ray(cast, 0), 0)
+        for k in range(min(beams, count - start)):
+            number = rays[start + k]
+            lane = k * each + (cast.first + number) % cast.subrays
+            for axis in range(3):
+                directions[axis, start + k] = floats[direction + axis * lanes + lane]
+            if origins.shape[1] > 0:
+                for axis in range(3):
+                    origins[axis, start + k] = floats[origin + axis * lanes + lane]
+
+
+def compiled_rays(
+    pattern: Pattern, first: int, ray: Ints, poses: Poses
+) -> tuple[Floats | None, Floats]:
+    """Return origins and directions, float64 (3, m), of rays with numbers (m,).
+
+    Arguments are those of `pattern_rays.checked_rays`. Origins are None if all rays start at the
+    position of a single pose.
+    """
+    cast = memory.Cast(np.zeros(1, memory.CAST))
+    record = cast.record
+    cast.set_pattern(pattern, poses, first)
+    record["scale"] = 1.0  # local coordinates are metres, about the origin of the scene
+    lanes = _BEAMS * int(record["lanes_per_beam"][0])
+    record["tile_rays"] = lanes
+    record["tile"] = thread_tiles.address(lanes, 0, 0)
+    origins = np.empty((3, 0 if record["shares_origin"] else len(ray)))
+    directions = np.empty((3, len(ray)))
+    _compute_rays(record, np.ascontiguousarray(ray), origins, directions)
+    return None if record["shares_origin"] else origins, directions

@@ -1,0 +1,253 @@
+"""Ray casting by tiles of neighbouring rays, in loops that numba compiles: on every processor."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, ClassVar
+from weakref import ref
+
+import numpy as np
+
+from .arrays import AnyArray, Floats
+from .backend import Backend, ClosestHits
+from .crossing import Crossing, Nearest
+from .hits import Part, join_hits
+from .installation import install_command
+from .instances import Scene
+from .poses import Poses
+from .rays import Rays
+from .scan import Scan
+from .tile_plan import TilePlan, consecutive, plan_tiles
+
+if TYPE_CHECKING:
+    from .cast_memory import Cast
+
+_SHARE = 1 << 14  # rays that a thread casts in a call, if there are several threads
+_BODY_RAYS = 64  # of a tile of rays at bodies
+_MAX_PLANS = 16
+
+
+class TileBackend(Backend):
+    """Tiles of rays in float32, whose candidates the watertight test in float64 decides.
+
+    Margins cover all rounding in float32, so hits have the bits of the numpy backend.
+    """
+
+    name: ClassVar[str] = "tiles"
+    chunk: ClassVar[int] = 1 << 17  # rays; hits take 20 bytes a ray, until chunks are joined
+
+    @classmethod
+    def missing(cls) -> str:
+        """Return why numba cannot be used and the remedy; "" if usable."""
+        if importlib.util.find_spec("numba") is None:
+            return f"numba is not installed: {install_command('numba')}"
+        return ""
+
+    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+        from . import cast_memory, mesh_loops, tile_casts, tile_memory, tile_tree
+
+        super().__init__(scene, threads, device)
+        self._count = threads or os.cpu_count() or 1
+        self._threads = ThreadPoolExecutor(self._count, "tiles")  # threads start on first use
+        self._process = os.getpid()
+        self._loops = tile_casts
+        self._weigh = mesh_loops.weigh
+        self._memory = cast_memory
+        self._tiles = tile_memory.thread_tiles
+        self._top_nodes = tile_tree.top_nodes
+        self._trees = [tile_tree.tile_tree(mesh.corners) for mesh in scene.meshes]
+        self._waiting = 2 + max(tree.stack for tree in self._trees)
+        self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
+        self._meshes = self._mesh_records(scene)
+        # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
+        self._index = np.concatenate([mesh.index for mesh in scene.meshes])
+        cast = np.zeros(1, cast_memory.CAST)
+        cast["mesh"] = self._meshes.ctypes.data
+        cast["index"] = self._index.ctypes.data
+        self._records = self._instance_records(scene)
+        if scene.nested:
+            cast["instances"] = self._records.ctypes.data
+        self._base = cast
+        self._plans: dict[tuple[int, int, int], tuple[ref[AnyArray], TilePlan]] = {}
+        self.update_scene(scene)
+
+    def _mesh_records(self, scene: Scene) -> AnyArray:
+        """Return a `MESH` record for each mesh of a scene."""
+        records = np.zeros(len(scene.meshes), self._memory.MESH)
+        for record, mesh, tree, corners in zip(
+            records, scene.meshes, self._trees, self._corners, strict=True
+        ):
+            record["corners"] = corners.ctypes.data
+            record["nodes"] = tree.nodes.ctypes.data
+            record["blocks"] = tree.blocks.ctypes.data
+            record["leaf_corners"] = tree.corners.ctypes.data
+            record["order"] = tree.order.ctypes.data
+            if (opacity := mesh.opacity) is not None:
+                record["uv"] = opacity.uv.ctypes.data
+                record["mask"] = opacity.mask.ctypes.data
+                record["mask_height"], record["mask_width"] = opacity.mask.shape
+        return records
+
+    def _instance_records(self, scene: Scene) -> AnyArray:
+        """Return an `INSTANCE` record for each instance of a scene, without matrices."""
+        records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
+        first_rows = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
+        records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
+        records["first"] = first_rows[scene.mesh]
+        return records
+
+    def update_scene(self, scene: Scene) -> None:
+        """Replace the scene by a scene of the same instances with new transforms."""
+        super().update_scene(scene)
+        frame = scene.frame
+        base = self._base
+        base["centre"] = frame.centre
+        base["scale"] = frame.scale
+        if scene.nested:
+            self._top, top_stack = self._top_nodes(scene.boxes)
+            self._top_stack = top_stack
+            base["top"] = self._top.ctypes.data
+            self._records["matrix"] = scene.matrices
+
+    def closest(self, rays: Rays) -> ClosestHits:
+        """Return the closest hits of at most `chunk` rays."""
+        cast = self._ray_cast(rays)
+        cast.record["index"] = 0  # hits get the row of the corners, which `weigh` needs
+        ray, distance, row, instance = self._cast(cast, 0, len(rays), consecutive(1))
+        u, v = np.empty((2, len(ray)))
+        origins = self._scene.frame.to_local(rays.origins)
+        if len(origins) > 1:
+            origins = np.ascontiguousarray(origins[ray])
+        directions = np.ascontiguousarray(rays.directions[ray])
+        self._weigh(cast.record, origins, directions, row, instance, u, v)
+        t = distance * self._scene.frame.scale  # local; exact, since the scale is a power of two
+        return ClosestHits(ray, t, self._index[row], u, v, instance)
+
+    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+        """Cast pairs of a ray and a body on this scene, the shape that the bodies share.
+
+        Hits nearer than those in `nearest` replace these.
+        """
+        record = self._base.copy()
+        scale = self._scene.frame.scale
+        record["t_min"], record["t_max"] = self._reach(crossing.limits, scale)
+        record["tile"] = self._tile(_BODY_RAYS)
+        self._loops.cast_crossing(record, crossing.contiguous(), nearest)
+
+    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
+        """Yield ranges of rays of a scan, and the hits of each range.
+
+        Yields start and stop of the range, and a `Part`: hits in ray order, whose rays are numbered
+        from start.
+        """
+        cast = self._scan_cast(scan)
+        plan = self._plan(scan)
+        for start, stop in scan.chunks(self.chunk):
+            yield start, stop, self._cast(cast, start, stop, plan)
+
+    def _plan(self, scan: Scan) -> TilePlan:
+        """Return the tiles that scans of the same beams share; new ones if there are none."""
+        beams = np.asarray(scan.pattern.directions.base)  # shared by copies of a pattern
+        key = id(beams), scan.pattern.subrays_per_beam, len(scan)
+        known = self._plans.get(key)
+        if known is not None and known[0]() is beams:
+            return known[1]
+        if len(self._plans) >= _MAX_PLANS:
+            self._plans.clear()
+        plan = plan_tiles(scan)
+        self._plans[key] = ref(beams), plan
+        return plan
+
+    def _tile(self, rays: int) -> int:
+        """Return the address of this thread's memory for tiles of a number of rays."""
+        nested = self._scene.nested
+        waiting = self._waiting + (self._top_stack if nested else 0)
+        return self._tiles.address(rays, waiting, len(self._scene.mesh) if nested else 0)
+
+    @staticmethod
+    def _reach(limits: tuple[float, float], scale: float) -> tuple[float, float]:
+        """Return the limits of distances, local; the farthest finite, so that infinity is no hit."""
+        t_min, t_max = limits
+        return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
+
+    def _ray_cast(self, rays: Rays) -> Cast:
+        """Return the `Cast` of rays that are not of a pattern.
+
+        Each ray becomes a beam, seen from a single pose.
+        """
+        origins: Floats | None = rays.origins
+        position = np.zeros((1, 3))
+        if len(rays.origins) == 1:
+            position = rays.origins
+            origins = None
+        cast = self._memory.Cast(self._base)
+        poses = Poses(position, None, max(len(rays), 1))
+        cast.set_beams(rays.directions, origins, poses, 0)
+        self._set_limits(cast, (rays.t_min, rays.t_max))
+        return cast
+
+    def _scan_cast(self, scan: Scan) -> Cast:
+        """Return the `Cast` of a scan; the loops also write the rays to `scan.room`, if any."""
+        cast = self._memory.Cast(self._base)
+        cast.set_pattern(scan.pattern, scan.poses, scan.first)
+        if scan.room is not None:
+            cast.record["directions_out"] = scan.room[-3:].ctypes.data
+            cast.record["ray_count"] = len(scan)
+            if len(scan.room) > 3:
+                cast.record["origins_out"] = scan.room.ctypes.data
+                if cast.record["shares_origin"]:
+                    scan.room[:3] = scan.poses.positions.T
+        self._set_limits(cast, (scan.t_min, scan.t_max))
+        return cast
+
+    def _set_limits(self, cast: Cast, limits: tuple[float, float]) -> None:
+        """Write the limits of distances, metres, to a cast."""
+        record = cast.record
+        record["t_min"], record["t_max"] = self._reach(limits, self._scene.frame.scale)
+
+    def _cast(self, cast: Cast, start: int, stop: int, plan: TilePlan) -> Part:
+        """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
+
+        Distances are in metres; `triangle` is the row in the caller's faces, or the row of the
+        corners if `index` of the record is 0.
+        """
+        n = stop - start
+        ray = np.empty(n, np.uint32)
+        distance = np.empty(n)
+        triangle = np.empty(n, np.int32)
+        instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
+
+        def cast_share(begin: int) -> Part:
+            """Return the hits of `share` rays from `begin`, as views of the memory of all rays."""
+            record = cast.record.copy()
+            row = begin - start
+            hits = np.empty(2 * (min(share, stop - begin) + 1))
+            record["hits"] = hits.ctypes.data
+            record["tile"] = self._tile(plan.rays)
+            record["tile_rays"] = plan.rays
+            record["lanes"] = plan.lanes.ctypes.data
+            record["shifts"] = plan.shifts.ctypes.data
+            record["groups"] = len(plan.lanes)
+            record["firing"] = plan.firing
+            record["firings"] = plan.firings
+            record["first_ray"] = start
+            record["ray"] = ray[row:].ctypes.data
+            record["distance"] = distance[row:].ctypes.data
+            record["triangle"] = triangle[row:].ctypes.data
+            record["instance"] = instance[row:].ctypes.data
+            count = self._loops.trace(record, begin, min(begin + share, stop))
+            part = slice(row, row + count)
+            return ray[part], distance[part], triangle[part], instance[part]
+
+        column = plan.firing * plan.firings
+        share = max(_SHARE // column, 1) * column
+        if self._count == 1 or n <= share:
+            share = n
+            return cast_share(start)
+        if self._process != os.getpid():  # a fork, which has no threads of its parent
+            self._threads = ThreadPoolExecutor(self._count, "tiles")
+            self._process = os.getpid()
+        return join_hits(list(self._threads.map(cast_share, range(start, stop, share))))

@@ -1,0 +1,260 @@
+"""The loops that cast scans, and rays at moving bodies, tile by tile; hits in the order of rays.
+
+tile_plan.py says which rays form tiles. The hits of a call go to memory by their numbers; then they
+are written in the order of rays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from . import cast_memory as memory
+from .cast_memory import (
+    FIRST_ROW_FIELD,
+    INSTANCE_BYTES,
+    KEYS_PER_INSTANCE,
+    float64s,
+    int32s,
+    int64s,
+)
+from .compiled import compiled, inlined, stage
+from .moving_loops import (
+    CROSSING,
+    NEAREST,
+    PADS_M,
+    box_corners,
+    passes_box,
+    pose_rotation,
+    to_body_axes,
+)
+from .ray_loops import first_ray, make_rays, share_origin
+from .rays import UNIT_SLACK
+from .tile_loops import cast_tile
+from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, row_at
+from .vectors import splat, store
+
+_TILE_RAYS = 8 * SUBTILES  # of rays at bodies
+
+
+@stage
+def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
+    """Write the numbers of a tile's rays; return whether the tile has one of the `count` rays.
+
+    `lanes` is the address of numbers, to which `first` is added. Numbers below 0 or from `count` on
+    are of rays that are cast with the tile, for nothing.
+    """
+    numbers = int64s(tile)
+    lane_numbers = int64s(lanes)
+    row = row_at(NUMBER, rays)
+    exists = np.int64(0)
+    for lane in range(rays):
+        number = first + lane_numbers[lane]
+        numbers[row + lane] = number
+        exists |= np.int64((number >= 0) & (number < count))
+    return exists != 0
+
+
+@stage
+def _reset(tile, rays, t_max):  # type: ignore[no-untyped-def]
+    """Write reaches and no hits to the rays of a tile."""
+    floats = float64s(tile)
+    numbers = int64s(tile)
+    t_at = row_at(T, rays)
+    key_at = row_at(KEY, rays)
+    length_at = row_at(LENGTH, rays)
+    for k in range(0, rays, 4):
+        store(floats, t_at + k, splat(t_max))
+        store(floats, length_at + k, splat(1.0))
+    for k in range(rays):
+        numbers[key_at + k] = -1
+
+
+@stage
+def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
+    """Write the hits of a tile to the memory of the call's `count` rays; others to its last row."""
+    floats = float64s(tile)
+    numbers = int64s(tile)
+    distances = float64s(hits)
+    keys = int64s(hits + 8 * (count + 1))
+    t_at = row_at(T, rays)
+    key_at = row_at(KEY, rays)
+    number_at = row_at(NUMBER, rays)
+    for lane in range(rays):
+        number = numbers[number_at + lane]
+        ray = number if (number >= 0) & (number < count) else count
+        distances[ray] = floats[t_at + lane]
+        keys[ray] = numbers[key_at + lane]
+
+
+@compiled(types.int64(memory.CASTS, types.int64, types.int64))
+def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Cast rays `start` to `stop` of a `CAST`; write the hits in ray order, return their number."""
+    cast = casts[0]
+    tile = cast.tile
+    rays = cast.tile_rays
+    instances = cast.instances
+    firing = cast.firing
+    metre = 1.0 / cast.scale
+    index = int32s(cast.index)
+    indexed = cast.index != 0
+    shifts = int64s(cast.shifts)
+    count = stop - start
+    distances = float64s(cast.hits)
+    keys = int64s(cast.hits + 8 * (count + 1))
+    ray_out = memory.uint32s(cast.ray)
+    distance_out = float64s(cast.distance)
+    triangle_out = int32s(cast.triangle)
+    instance_out = int32s(cast.instance)
+    if cast.shares_origin != 0:
+        share_origin(cast, tile, rays)
+    first = first_ray(cast, start)
+    lead = (cast.first + start) % firing  # the call may start within a firing
+    firing_count = -(-(count + lead) // firing)
+    max_shift = np.int64(0)
+    for group in range(cast.groups):
+        max_shift = max(max_shift, shifts[group])
+    for column in range(-(-(firing_count + max_shift) // cast.firings)):
+        for group in range(cast.groups):
+            number = (column * cast.firings - shifts[group]) * firing - lead
+            if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
+                make_rays(cast, tile, rays, first, count)
+                _reset(tile, rays, cast.t_max)
+                cast_tile(tile, rays, cast.mesh, instances, cast.top, rays, cast.t_min)
+                _keep_hits(tile, rays, cast.hits, count)
+    hit_count = 0
+    for k in range(count):
+        key = keys[k]
+        if key < 0:
+            continue
+        triangle = key & (KEYS_PER_INSTANCE - 1)
+        if instances != 0:
+            number = key // KEYS_PER_INSTANCE
+            record = int64s(instances + INSTANCE_BYTES * number)
+            triangle += record[FIRST_ROW_FIELD]
+            instance_out[hit_count] = number
+        ray_out[hit_count] = start - cast.first_ray + k
+        distance_out[hit_count] = distances[k] * metre
+        triangle_out[hit_count] = index[triangle] if indexed else triangle
+        hit_count += 1
+    return hit_count
+
+
+@inlined
+def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
+    """Write a ray to a lane of a tile, in local coordinates; return the length of its direction.
+
+    `origin`, metres, and `direction` are in the axes of the body. The length is 1 but for a sensor
+    that turns during a pose.
+    """
+    scale = cast.scale
+    centre = cast.centre
+    u, v, w = direction
+    squared = (u * u + v * v) + w * w
+    length = np.sqrt(squared)
+    if abs(squared - 1) > UNIT_SLACK:
+        max_component = max(abs(u), max(abs(v), abs(w)))
+        u = u / max_component
+        v = v / max_component
+        w = w / max_component
+        norm = np.sqrt((u * u + v * v) + w * w)
+        u = u / norm
+        v = v / norm
+        w = w / norm
+    k = row_at(OX, _TILE_RAYS) + lane
+    floats[k] = (origin[0] - centre[0]) * scale
+    floats[k + _TILE_RAYS] = (origin[1] - centre[1]) * scale
+    floats[k + 2 * _TILE_RAYS] = (origin[2] - centre[2]) * scale
+    floats[k + 3 * _TILE_RAYS] = u
+    floats[k + 4 * _TILE_RAYS] = v
+    floats[k + 5 * _TILE_RAYS] = w
+    return length
+
+
+@inlined
+def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
+    """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays."""
+    floats = float64s(tile)
+    for field in range(6):
+        k = row_at(OX + field, _TILE_RAYS)
+        for lane in range(filled, _TILE_RAYS):
+            floats[k + lane] = floats[k]
+
+
+@inlined
+def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the hits of a tile's first `filled` rays to a `Nearest`, where they are nearer."""
+    numbers = int64s(cast.tile)
+    floats = float64s(cast.tile)
+    index = int32s(cast.index)
+    metre = 1.0 / cast.scale
+    distance, bodies, instance, triangle = nearest
+    t_at = row_at(T, _TILE_RAYS)
+    key_at = row_at(KEY, _TILE_RAYS)
+    pair_at = row_at(NUMBER, _TILE_RAYS)
+    norm_at = row_at(NORM, _TILE_RAYS)
+    for lane in range(filled):
+        key = numbers[key_at + lane]
+        pair = numbers[pair_at + lane]
+        ray = crossing.row[pair]
+        body = crossing.body[pair]
+        metres = floats[t_at + lane] * metre / floats[norm_at + lane]
+        nearer = metres < distance[ray] or (metres == distance[ray] and body < bodies[ray])
+        if key < 0 or not nearer:
+            continue
+        row = key & (KEYS_PER_INSTANCE - 1)
+        instance[ray] = 0
+        if cast.instances != 0:
+            number = key // KEYS_PER_INSTANCE
+            instance[ray] = number
+            row += int64s(cast.instances + INSTANCE_BYTES * number)[FIRST_ROW_FIELD]
+        distance[ray] = metres
+        bodies[ray] = body
+        triangle[ray] = index[row]
+
+
+@compiled(types.void(memory.CASTS, CROSSING, NEAREST))
+def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`.
+
+    A pair whose ray misses the body's box, or ends before the box, takes no lane of a tile.
+    """
+    cast = casts[0]
+    tile = cast.tile
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    rays = crossing.rays
+    poses = crossing.poses
+    row = crossing.row
+    bodies = crossing.body
+    corners = box_corners(float64s(crossing.box.ctypes.data))
+    pair_at = row_at(NUMBER, _TILE_RAYS)
+    norm_at = row_at(NORM, _TILE_RAYS)
+    pair = 0
+    while pair < len(row):
+        filled = 0
+        body = bodies[pair]
+        while filled < _TILE_RAYS and pair < len(row) and bodies[pair] == body:
+            k = row[pair]
+            p = crossing.pose[pair]
+            rotation = pose_rotation(poses, p)
+            x = rays[0, k] - poses[0, p]
+            y = rays[1, k] - poses[1, p]
+            z = rays[2, k] - poses[2, p]
+            origin = to_body_axes(rotation, x, y, z)
+            direction = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
+            if passes_box(corners, PADS_M, nearest.distance[k], origin, direction):
+                norm = _write_ray(cast, floats, filled, origin, direction)
+                floats[norm_at + filled] = norm
+                numbers[pair_at + filled] = pair
+                filled += 1
+            pair += 1
+        if filled != 0:
+            _fill_up(tile, filled)
+            _reset(tile, _TILE_RAYS, cast.t_max)
+            cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled, cast.t_min)
+            _write_hits(cast, crossing, nearest, filled)
+
+
+# Whether this process compiled the loops; otherwise numba loaded the code of an earlier process.
+COMPILED = bool(trace.stats.cache_misses)

@@ -1,0 +1,163 @@
+"""Which rays of a scan form tiles: neighbours, whatever their order within a firing.
+
+A pattern's rays are numbered firing after firing. Rings of a firing need not follow each other by
+elevation, and their beams may point in other azimuths, by whole degrees. So rings are sorted by
+elevation, and a tile takes each ring from the firings that pass the same azimuth.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .arrays import Floats, Ints
+from .pattern_rays import checked_rays
+from .scan import Scan
+from .tile_memory import SUBTILES
+
+_VECTOR = 8  # rays of a vector
+_MAX_LANES = 1 << 20  # of all tiles of a column: a longer firing counts as consecutive rays
+_FEW_FIRINGS = 4  # times the shift of a ring: shorter scans would have too many incomplete tiles
+
+
+class TilePlan(NamedTuple):
+    """Division of a scan's rays into tiles.
+
+    Attributes
+    ----------
+    firing
+        Rays of a firing, with all sub-rays.
+    firings
+        Of a tile; a column of tiles starts at each multiple.
+    lanes
+        int64 (groups, rays): number of each ray of a tile, from the first ray of the tile's first
+        firing on. Each group of rings has tiles of its own.
+    shifts
+        int64 (groups,): by how many firings a group's first tile starts before the first firing.
+    """
+
+    firing: int
+    firings: int
+    lanes: Ints
+    shifts: Ints
+
+    @property
+    def rays(self) -> int:
+        """Number of rays of a tile."""
+        return self.lanes.shape[1]
+
+
+def consecutive(subrays: int) -> TilePlan:
+    """Return tiles of consecutive beams with a number of sub-rays each."""
+    beams = np.arange(SUBTILES * _VECTOR)
+    return TilePlan(
+        subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64)
+    )
+
+
+def _sub_rays(beams: Ints, subrays: int) -> Ints:
+    """Return the numbers of the sub-rays of beams (..., n): those of a beam fill whole vectors."""
+    if subrays == 1:
+        return beams
+    lanes = -(-subrays // _VECTOR) * _VECTOR
+    sub_ray = np.minimum(np.arange(lanes), subrays - 1)  # copies of the last one
+    return (beams[..., None] * subrays + sub_ray).reshape(*beams.shape[:-1], -1)
+
+
+def plan_tiles(scan: Scan) -> TilePlan:
+    """Return the tiles of a scan, by the rays of two of its firings."""
+    subrays = scan.pattern.subrays_per_beam
+    step = scan.pattern.step
+    firing = step * subrays
+    start = -scan.first % firing  # of the first whole firing
+    whole_firings = (len(scan) - start) // firing
+    if step == 1 or whole_firings < 2 or firing * SUBTILES * _VECTOR > _MAX_LANES:
+        return consecutive(subrays)
+    start += (whole_firings - 2) // 2 * firing
+    beams = start + subrays * np.arange(step)
+    _, directions = checked_rays(scan.pattern, scan.first, np.r_[beams, beams + firing], scan.poses)
+    rings, shifts, spacings = _sorted_rings(directions[:step], directions[step:])
+    if whole_firings < _FEW_FIRINGS * np.ptp(shifts):
+        shifts[:] = 0
+    return _laid_out(rings, shifts, spacings, subrays)
+
+
+def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
+    """Return how the rings of two successive firings (n, 3) neighbour each other.
+
+    Returns
+    -------
+    rings
+        (n,): numbers of the rings in the order of their elevation above the plane of rotation.
+    shifts
+        (n,): the firing, relative to the first ring's, at which each of these passes its azimuth.
+    spacings
+        Angle between firings, and between rings, radians.
+    """
+    axis = np.cross(first, second).sum(axis=0)
+    rings = np.argsort(first @ axis, kind="stable")
+    ahead = (second - first)[rings]
+    squared = np.maximum((ahead * ahead).sum(axis=1), 1e-24)
+    steps = np.diff(first[rings], axis=0)
+    along = (steps * ahead[1:]).sum(axis=1) / squared[1:]
+    along = np.clip(along, -1e6, 1e6)
+    across = steps - along[:, None] * ahead[1:]
+    ring_spacing = float(np.median(np.sqrt((across * across).sum(axis=1))))
+    shifts = -np.rint(np.r_[0, np.cumsum(along)]).astype(np.int64)
+    return rings, shifts, (float(np.sqrt(np.median(squared))), max(ring_spacing, 1e-12))
+
+
+def _laid_out(
+    rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
+) -> TilePlan:
+    """Return tiles whose rays lie in squares, as far as their numbers allow."""
+    step = len(rings)
+    firing = step * subrays
+    each = 1 if subrays > 1 else 2  # vectors of beams in a subtile
+    beams = SUBTILES * _VECTOR * each
+    most_rings = 1 << (step.bit_length() - 1)
+    tile = _square(beams, spacings, most_rings, beams)
+    subtile = _square(_VECTOR * each, spacings, *tile)
+    vector = _square(_VECTOR, spacings, *subtile)
+    # Of the tile, subtile and vector: numbers of rings and firings.
+    grids = [
+        (tile[0] // subtile[0], tile[1] // subtile[1]),
+        (subtile[0] // vector[0], subtile[1] // vector[1]),
+        vector,
+    ]
+    ring = np.zeros(1, np.int64)
+    later = np.zeros(1, np.int64)
+    for ring_count, firing_count in grids:
+        ring = (ring[:, None, None] * ring_count + np.arange(ring_count)[:, None]) + np.zeros(
+            firing_count, np.int64
+        )
+        later = later[:, None, None] * firing_count + np.arange(firing_count) + np.zeros(
+            (ring_count, 1), np.int64
+        )
+        ring = ring.reshape(-1)
+        later = later.reshape(-1)
+    groups = -(-step // tile[0])
+    chosen = np.minimum(np.arange(groups)[:, None] * tile[0] + ring, step - 1)
+    shift = shifts[chosen]
+    shift = shift - shift.min(axis=1, keepdims=True)
+    beam = (later + shift) * step + rings[chosen]
+    return TilePlan(firing, tile[1], _sub_rays(beam, subrays), shift.max(axis=1))
+
+
+def _square(
+    beams: int, spacings: tuple[float, float], most_rings: int, most_firings: int
+) -> tuple[int, int]:
+    """Return numbers of rings and firings whose product is `beams`, nearest to a square."""
+    firing_spacing, ring_spacing = spacings
+    best = (1, beams)
+    least = np.inf
+    rings = 1
+    while rings <= min(beams, most_rings):
+        firings = beams // rings
+        difference = abs(np.log(rings * ring_spacing / (firings * firing_spacing)))
+        if firings <= most_firings and difference < least:
+            least = difference
+            best = rings, firings
+        rings *= 2
+    return best
