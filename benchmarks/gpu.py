@@ -175,7 +175,7 @@ def problems(results: dict[str, Any]) -> list[str]:
         if isinstance(row, dict) and row.get("failed")
     ]
     if figure_at(results, "different"):
-        failures.append("values differ from NumPy's or Embree's")
+        failures.append("values differ from those of numpy or tiles")
     if figure_at(results, "leaks/edges and corners/escaped"):
         failures.append("rays escape")
     if figure_at(results, "large/many rays/wrong hits"):

@@ -73,34 +73,20 @@ def scattered_instances(shear: float) -> Iterator[Instance]:
 
 
 def bits(session: Session) -> Rows:
-    """Count values of sample rays that differ from NumPy's or Embree's in any bit; 0 expected."""
+    """Count values of sample rays that differ from NumPy's or those of tiles in any bit; 0 expected."""
     step = max(1, session.sizes.rays // session.sizes.sample)
     sample = revolution(session.sizes.rays)[::step]
-    with_embree = not available_backends()["embree"]
+    other = "numpy" if available_backends()["tiles"] else "tiles"
     for name, scene, origin in scenes(session.sizes):
         casters = [RayCaster.from_instances(scene, backend) for backend in ("cuda", "numpy")]
         row = _count_differences(casters, sample, origin)
-        if with_embree:
-            embree = RayCaster.from_instances(scene, "embree")
-            row |= _compare_embree(casters[0], embree, sample, origin)
+        casters[1] = RayCaster.from_instances(scene, other)
+        row |= {
+            f"{count}, {other}": differences
+            for count, differences in _count_differences(casters, sample, origin).items()
+            if count.startswith("different")
+        }
         yield name, row
-
-
-def _compare_embree(
-    device: RayCaster, embree: RayCaster, sample: Float, origin: Float
-) -> dict[str, int]:
-    """Count hits that Embree misses, and hits with another triangle or distance.
-
-    Embree may miss a triangle whose rim a ray hits within rounding error.
-    """
-    device_hits, embree_hits = (caster.cast(origin, sample) for caster in (device, embree))
-    missed = embree_hits.distance > device_hits.distance
-    differs = embree_hits.distance != device_hits.distance
-    differs |= embree_hits.triangle != device_hits.triangle
-    return {
-        "missed by Embree": int(missed.sum()),
-        "different from Embree": int((differs & ~missed).sum()),
-    }
 
 
 def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -> dict[str, int]:

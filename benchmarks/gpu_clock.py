@@ -24,7 +24,7 @@ _BATCH_MS = 50  # of the device: short launches are repeated, until its clock ha
 _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
 # What sections of the benchmark are left out without.
 _PACKAGES = (
-    "pytest", "embreex", "numba", "pydantic", "trimesh", "distributed", "open3d-cpu", "warp-lang",
+    "pytest", "numba", "pydantic", "trimesh", "distributed", "open3d-cpu", "warp-lang",
     "cuda-pathfinder", "nvidia-cuda-nvrtc",
 )  # fmt: skip
 

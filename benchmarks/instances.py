@@ -1,7 +1,7 @@
 """Forests of equal trees: `python -m benchmarks.instances`.
 
 A tree is 50,000 leaf triangles of 4 cm. A thousand instances of it, and a smaller forest of which
-every tree is in one mesh, are scanned by a 64-beam lidar that moves between them, with Embree on
+every tree is in one mesh, are scanned by a 64-beam lidar that moves between them, on
 one thread. Each forest is made in a process of its own, which says how much memory the caster took
 (growth of VmHWM) and how many rays it casts in a second of processor time.
 """
@@ -126,7 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 2 if the backend is not available."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy sizes")
-    parser.add_argument("--backend", default="embree")
+    parser.add_argument("--backend", default="tiles")
     chosen = parser.parse_args(arguments)
     if reason := available_backends()[chosen.backend]:
         print(f"Nothing was measured: {reason}", file=sys.stderr)

@@ -82,7 +82,7 @@ def survey_of(model: str, sweeps: int) -> Survey:
 
 def cloud_of(survey: Survey, scene: Scene) -> Cloud:
     """Cast a survey in this process; return its cloud."""
-    rig = Rig(scene, survey, "embree")
+    rig = Rig(scene, survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     sweeps = Sweeps.from_survey(survey, scene)

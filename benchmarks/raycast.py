@@ -33,7 +33,6 @@ _VERSIONS = (
     "open3d-cpu",
     "open3d",
     "trimesh",
-    "embreex",
     "numba",
     "warp-lang",
     "cupy-cuda13x",
@@ -121,8 +120,8 @@ def findings(row: dict[str, Any]) -> list[str]:
     """Return sentences about the ratios that have targets."""
     engines = row["engines"]
     sentences = []
-    if "Open3D, bare" in engines and "embree" in engines:
-        sentences.append(f"embree is {ratio(row, 'embree', 'Open3D, bare'):.2f} x bare Open3D")
+    if "Open3D, bare" in engines and "tiles" in engines:
+        sentences.append(f"tiles take {ratio(row, 'tiles', 'Open3D, bare'):.2f} x bare Open3D")
     if "brute force, NumPy" in engines and "numpy" in engines:
         sentences.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
     return sentences

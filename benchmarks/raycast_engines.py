@@ -71,10 +71,10 @@ class Numpy(_RaybeamEngine):
     name = "numpy"
 
 
-class Embree(_RaybeamEngine):
-    """Backend `embree`."""
+class Tiles(_RaybeamEngine):
+    """Backend `tiles`."""
 
-    name = "embree"
+    name = "tiles"
 
 
 class Cuda(_RaybeamEngine):

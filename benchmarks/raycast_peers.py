@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .raycast_engines import BruteForce, Cast, Cuda, Embree, Engine, Numpy
+from .raycast_engines import BruteForce, Cast, Cuda, Engine, Numpy, Tiles
 from .raycast_scenes import Job
 
 Float = NDArray[np.float64]
@@ -190,6 +190,6 @@ def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
 
 
 ENGINES: tuple[type[Engine], ...] = (
-    Cuda, Embree, Numpy,
+    Cuda, Tiles, Numpy,
     Open3D, Open3DWithNumpy, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
 )  # fmt: skip

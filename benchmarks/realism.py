@@ -213,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rows", nargs="*", help="those to measure, beside the bare one")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    backend = next(name for name in ("embree", "numpy") if not available_backends()[name])
+    backend = next(name for name in ("tiles", "numpy") if not available_backends()[name])
     scene = city(options.triangles)
     rows = cases(scene, backend, tuple(options.cars), options.sensor)
     if options.rows is not None:

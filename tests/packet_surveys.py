@@ -27,7 +27,7 @@ def posts_before_walls() -> Scene:
 
 def points_of(survey, scene):
     """Cast a survey; return its points and its sweeps."""
-    rig = Rig(scene, survey, "embree")
+    rig = Rig(scene, survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     return cloud, Sweeps.from_survey(survey, scene)

@@ -14,7 +14,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
-CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
+CPU = [name for name in ("numpy", "tiles") if not available_backends()[name]]
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
 COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
 PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))

@@ -1,4 +1,4 @@
-"""Closest hits of rays with triangle meshes, on CUDA, Embree or NumPy."""
+"""Closest hits of rays with triangle meshes, on GPUs and on CPUs."""
 
 from .backend import BackendUnavailable
 from .caster import RayCaster

@@ -36,7 +36,7 @@ class RayCaster:
     faces
         (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
     backend
-        "cuda", "embree", "numpy", or "auto" for the first of these three that can be used.
+        "cuda", "tiles", "numpy", or "auto" for the first of these three that can be used.
     threads
         Maximum number of CPU threads; None for the default of the backend.
     device
@@ -248,8 +248,7 @@ class RayCaster:
             (n, 3), any length but zero.
         t_min, t_max
             Hits with ``t_min <= distance <= t_max`` count, metres. With `t_min` 0 a surface
-            that the ray starts on is a hit at distance 0; the embree backend, which decides in
-            single precision, may see or miss it.
+            that the ray starts on is a hit at distance 0.
 
         Raises
         ------

@@ -9,8 +9,8 @@ import numpy as np
 from numba import types
 
 from . import cast_memory as memory
-from .compiled import compiled, inlined, stage
 from .cast_memory import float32s, float64s, int64s, uint8s
+from .compiled import compiled, inlined, stage
 from .triangle_loops import areas, shear
 
 f64_1 = types.float64[::1]

@@ -232,7 +232,7 @@ def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
     """Rotate vectors of a tile, in three rows from `first_row` on, to the scene's axes.
 
     `rotations` is the address of the matrices of the poses, float64 (9, poses).

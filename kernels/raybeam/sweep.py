@@ -2,7 +2,7 @@
 
 From the root down, every node is divided where the heuristic is least, over all positions between
 its boxes sorted along each of the three axes. No builder that uses only boxes gives better trees in
-general; bins, as in Embree, are a few per cent worse. All nodes of a level are divided together, in
+general; bins are a few per cent worse. All nodes of a level are divided together, in
 tens of operations on whole arrays.
 """
 

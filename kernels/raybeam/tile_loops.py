@@ -37,8 +37,6 @@ from __future__ import annotations
 import numpy as np
 
 from . import tile_memory as memory
-from .compiled import inlined, stage
-from .mesh_loops import enter_instance, is_opaque
 from .cast_memory import (
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,
@@ -49,6 +47,8 @@ from .cast_memory import (
     int64s,
     uint8s,
 )
+from .compiled import inlined, stage
+from .mesh_loops import enter_instance, is_opaque
 from .ray_loops import entry_distance
 from .tile_memory import AXIS, ENTRY, IX, KEY, LENGTH, OX, SUBTILES, SX, T, U, at, row_at
 from .tile_tree import BLOCK, NODE
@@ -578,7 +578,7 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _test_leaf(tile, rays, mesh, nested_key, code, mask, deepest, t_min):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0912, PLR0914, PLR0915 - a compiled loop
+def _test_leaf(tile, rays, mesh, nested_key, code, mask, deepest, t_min):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Test the triangles of a leaf and the rays of the subtiles of a mask; return those with hits.
 
     `code` is of the leaf, `deepest` the greatest depth that a ray reaches, `nested_key` the instance

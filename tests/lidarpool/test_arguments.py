@@ -224,8 +224,8 @@ def test_a_scenario_says_how_it_is_run_unless_python_does():
     pool = PoolSection(gpu=3, batch_mb=64, backend="numpy")
     said = RunOptions(live=True).with_pool(pool)
     assert (said.gpu_workers, said.batch_mb, said.backend, said.live) == (3, 64, "numpy", True)
-    given = RunOptions(gpu_workers=2).with_pool(pool, {"backend": "embree", "batch_mb": None})
-    assert (given.gpu_workers, given.batch_mb, given.backend) == (2, 64, "embree")
+    given = RunOptions(gpu_workers=2).with_pool(pool, {"backend": "tiles", "batch_mb": None})
+    assert (given.gpu_workers, given.batch_mb, given.backend) == (2, 64, "tiles")
 
 
 def test_keywords_are_the_options_of_runs():

@@ -31,7 +31,7 @@ def test_every_engine_finds_the_same(tmp_path):
             for name, entry in row["engines"].items()
             if name != "brute force, NumPy"  # casts a few of the rays only
         }
-        assert {"numpy", "embree", "Open3D, bare"} <= set(shares)
+        assert {"numpy", "tiles", "Open3D, bare"} <= set(shares)
         assert 0.01 < shares["numpy"] < 1
         np.testing.assert_allclose(list(shares.values()), shares["numpy"], atol=2e-3)
 
@@ -55,7 +55,7 @@ def test_trees_are_about_as_good_as_the_best_there_are(tmp_path):
 @pytest.mark.slow
 def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
     out = tmp_path / "out.json"
-    assert scanner.main(["--quick", "--backend", "embree", "--json", str(out)]) == 0
+    assert scanner.main(["--quick", "--backend", "tiles", "--json", str(out)]) == 0
     rows = json.loads(out.read_text())["cases"]
     assert [row["case"] for row in rows] == [*scanner.CASES]
     for row in rows:

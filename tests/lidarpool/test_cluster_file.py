@@ -154,10 +154,10 @@ def test_counts_that_cannot_be(given):
 @pytest.mark.parametrize(
     ("gpus", "backend", "says"),
     [
-        (((), ()), "embree", ""),
+        (((), ()), "tiles", ""),
         ((("GPU-1",), ()), "cuda", ""),
-        ((("GPU-1",), ()), "embree", "the GPUs of partition GPU are not used"),
-        (((), ("GPU-1",)), "embree", "no GPU in partition GPU: CPU workers cast the rays"),
+        ((("GPU-1",), ()), "tiles", "the GPUs of partition GPU are not used"),
+        (((), ("GPU-1",)), "tiles", "no GPU in partition GPU: CPU workers cast the rays"),
     ],
 )
 def test_of_gpus_is_spoken_only_where_there_is_one_that_stays_idle(gpus, backend, says):

@@ -63,7 +63,7 @@ OS1 = ["ouster/os1-128", "ouster/os1-32", "ouster/os1-64"]
         ("lidarpool run hall.glb --format las,ros", ["las,rosbag2"]),
         ("lidarpool run hall.glb --unit m", ["mm", "m", "mi"]),
         ("lidarpool run hall.glb --up-axis ", ["x", "y", "z"]),
-        ("lidarpool run hall.glb --backend em", ["embree"]),
+        ("lidarpool run hall.glb --backend ti", ["tiles"]),
         ("lidarpool run hall.glb --live ", ["page", "foxglove", "rerun"]),
         ("lidarpool demo --live re", ["rerun"]),
         ("lidarpool play out --as ", [*BRIDGES]),

@@ -13,7 +13,7 @@ from raybeam import installation
 SOUND = {
     "machine": {"available_memory_gib": 8.0, "disk_gib": {"/tmp": 9.0}},
     "gpus": [],
-    "backends": {"cuda": "CuPy is not installed", "embree": "ready"},
+    "backends": {"cuda": "CuPy is not installed", "tiles": "ready"},
     "open3d": "ready",
 }
 
@@ -28,7 +28,7 @@ def test_nothing_is_wrong_without_a_gpu():
     [
         ({"gpus": ["GPU-1"]}, "a GPU that is not used: CuPy is not installed"),
         (
-            {"backends": {"embree": "pip install numba"}},
+            {"backends": {"tiles": "pip install numba"}},
             "hundred times slower .* pip install numba",
         ),
         ({"machine": {"available_memory_gib": 0.4, "disk_gib": {}}}, "0.4 GiB of memory are free"),

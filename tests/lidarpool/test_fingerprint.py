@@ -26,7 +26,6 @@ from lidarpool import Beams, LidarError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.base.software import PACKAGES, difference, software, sources
 from lidarsim.sensor import Head
-from raybeam import available_backends
 
 Pair = namedtuple("Pair", "a b")
 Other = namedtuple("Other", "a c")
@@ -261,5 +260,3 @@ def test_the_first_difference_is_named():
     assert difference(there, here) == f"numpy 1.0 with nothing, the run numpy {here['numpy']}"
     assert difference({}, here).startswith("lidarpool not installed, the run lidarpool 0.")
     assert here["numpy"] == np.__version__  # and no instruction sets
-    if not available_backends()["embree"]:
-        assert software("embree")["backend"].startswith("embree ")

@@ -66,7 +66,7 @@ def drive() -> Track:
 
 
 def cloud_of(survey, scene=SCENE):
-    rig = Rig(scene, survey, "embree")
+    rig = Rig(scene, survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     sweeps = Sweeps.from_survey(survey, scene)

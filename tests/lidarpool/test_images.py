@@ -88,7 +88,7 @@ SURVEYS = {
 
 
 def cloud_of(survey, scene=SCENE):
-    rig = Rig(scene, survey, "embree")
+    rig = Rig(scene, survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     return part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
 

@@ -35,7 +35,7 @@ def two_sensors():
         ],
         poses=[Pose((0, 0, 0))], steps=36, columns=COLUMNS, keep_every=1,
     )  # fmt: skip
-    rig = Rig(room(), survey, "embree")
+    rig = Rig(room(), survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, np.zeros(3))
     sweeps = Sweeps.from_survey(survey, Scene.seed())

@@ -65,7 +65,7 @@ def cast(model: str, mode: str = "strongest") -> Cloud:
         returns=Returns(mode=mode, subrays=7, divergence_mrad=8.0),
         start=datetime(2023, 11, 14, 22, 13, 20, 123_456, UTC),
     )
-    part = columns_of(list(Rig(SCENE, survey, "embree").cast(0, survey.scan_count)))
+    part = columns_of(list(Rig(SCENE, survey, "tiles").cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, SCENE.origin)
     sweeps = Sweeps.from_survey(survey, SCENE)
     return Cloud(cloud.positions, cloud.columns, sweeps=lambda: sweeps)

@@ -251,7 +251,7 @@ BAD = [
     ("planning: {obstacles: [Bel]}", "Did you mean 'Bell'"),
     ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
     ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
-    ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'embree' or 'numpy'"),
+    ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
     ("", "is empty; a scenario has sections"),
     ("hello", "holds only 'hello'"),
     ("a: b: c", "line 1: mapping values are not allowed here"),

@@ -126,8 +126,8 @@ def test_it_is_gone_on_with(unfinished):
     assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
-    with pytest.raises(LidarError, match=r"'embree' is asked for, .* cast with 'numpy'"):
-        opened(unfinished, backend="embree", resume=True)
+    with pytest.raises(LidarError, match=r"'tiles' is asked for, .* cast with 'numpy'"):
+        opened(unfinished, backend="tiles", resume=True)
 
 
 FIELDS_OF_OTHERS = {

@@ -37,7 +37,7 @@ def passing(beyond, times=(0.02, 0.065)):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
 def test_an_actor_is_hit_only_while_it_is_there(model, backend):
     mount = Pose((0, 0, 0), 90 if "livox" in model else 0)
@@ -169,7 +169,7 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     assert built.findings.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
 
     job = build(read).job()
-    found = made(job.survey, job.scene, "embree")
+    found = made(job.survey, job.scene, "tiles")
     for number, semantic_class, (begin, end) in ((2, 10, (0, 1)), (3, 7, (1, 2)), (4, 10, (3, 4))):
         own = found["object"] == number
         assert own.any() and set(found["class"][own]) == {semantic_class}

@@ -487,7 +487,7 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
     assert {"base_link", "upper_arm", "forearm", "front_left_wheel", "front_right_wheel"} <= seen
     # The same bytes in batches of any size, and on any backend.
     whole = made(survey, scene)
-    for backend, each in (("numpy", 7), ("embree", 50)):
+    for backend, each in (("numpy", 7), ("tiles", 50)):
         rig = Rig(scene, survey, backend)
         parts = [
             batch

@@ -311,7 +311,7 @@ def moving_box(velocity, seconds=1.0):
     return replace(mesh, animation=Animation(poses, seconds))
 
 
-@pytest.mark.parametrize("backend", ["embree", "numpy"])
+@pytest.mark.parametrize("backend", ["tiles", "numpy"])
 def test_radial_velocities_are_of_the_triangle_and_its_actor(backend):
     """2 m/s along the axes of an actor that is turned by a quarter and drives at 3 m/s."""
     way = Track([0, 1], [[6, 0, -0.5], [6, 0, 2.5]], [[0, 0, 0.5**0.5, 0.5**0.5]] * 2)
@@ -402,14 +402,14 @@ def test_copies_share_their_poses_and_backends_agree(walker):
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
     survey = Survey(Sensor.grid(500, 24), [(0, 0, 1)], steps=36, keep_every=1,
                     columns=["radial_velocity", "time", "intensity"])  # fmt: skip
-    one = made(survey, scene, "embree")
+    one = made(survey, scene, "tiles")
     other = made(survey, scene, "numpy")
     for name, values in one.items():
         assert np.array_equal(values, other[name]), name
     own = one["object"] > 0
     assert own.sum() > 60 and np.ptp(one["radial_velocity"][own]) > 2
     still = [replace(actor, mesh=replace(actor.mesh, animation=None)) for actor in actors]
-    rigid = made(survey, scene.with_actors(still), "embree")
+    rigid = made(survey, scene.with_actors(still), "tiles")
     assert not np.array_equal(rigid["x"], one["x"])
 
 
@@ -437,7 +437,7 @@ def test_boxes_hold_the_points_of_people_who_walk(walker, tmp_path):
                     columns=["time", "intensity", "reflectivity", "class"],
                     materials=[Material("Person*", semantic_class=7), Material("*")])  # fmt: skip
     sweeps = Sweeps.from_survey(survey, scene)
-    found = made(survey, scene, "embree")
+    found = made(survey, scene, "tiles")
     assert np.array_equal(sweeps.actor_bounds[0], fast.animation.bounds)
     positions = np.stack([found.pop(axis) for axis in "xyz"], axis=1) * survey.precision_m
     begins = [survey.begins_ns(scan) for scan in range(survey.scan_count)]

@@ -225,9 +225,9 @@ def test_drops_are_at_rest(subrays):
     still = air if subrays == 1 else air & (np.abs(returns.radial_velocity - expected) < 0.5)
     assert still.sum() > 0.95 * air.sum()
     assert np.abs(returns.radial_velocity - expected)[still].max() < room
-    cuts = cast_between(Rig(Scene.seed().with_actors([car]), survey, "embree"), survey, [0, 1, 3])
+    cuts = cast_between(Rig(Scene.seed().with_actors([car]), survey, "tiles"), survey, [0, 1, 3])
     assert cuts == cast_between(
-        Rig(Scene.seed().with_actors([car]), survey, "embree"), survey, [0, 3]
+        Rig(Scene.seed().with_actors([car]), survey, "tiles"), survey, [0, 3]
     )
 
 

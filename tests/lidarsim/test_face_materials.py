@@ -40,7 +40,7 @@ from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.stray_light import BLOOMING
 from raybeam import available_backends, registry
 
-CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
+CPU = [name for name in ("numpy", "tiles") if not available_backends()[name]]
 COLUMNS = ["class", "material", "reflectance", "incidence_deg"]
 # A front of 8 x 4 m at y = 0, its western half of brick, its eastern half of glass, on grass.
 HOUSE = """

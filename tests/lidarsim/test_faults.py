@@ -49,7 +49,7 @@ STATIONS = replace(STANDING, trajectory=None, poses=[(0, 0, 0), (1, 0, 0), (2, 0
 SWEEP = 36  # scans
 
 
-def cast(survey, size=10_000, backend="embree", scene=ROOM):
+def cast(survey, size=10_000, backend="tiles", scene=ROOM):
     """Columns of a survey, cast so many scans at a time, with `scan` and the counts."""
     rig = Rig(scene, survey, backend, threads=1)
     parts = [

@@ -19,8 +19,8 @@ from raybeam import available_backends
 
 @pytest.mark.slow
 def test_forests_of_instances_hit_as_one_mesh_does(capsys):
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
+    if reason := available_backends()["tiles"]:
+        pytest.skip(f"tiles: {reason}")
     assert instances.main(["--quick"]) == 0
     _, many, few, flat = (line.split("|") for line in capsys.readouterr().out.splitlines())
     assert "10,002" in many[3]

@@ -20,7 +20,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import Cutout, SceneMesh
 from lidarsim.sensor import Sensor
 
-BACKENDS = ["numpy", "embree"]
+BACKENDS = ["numpy", "tiles"]
 # No row or column is another's, reversed or not.
 MASK = np.array([[1, 0, 0, 1], [0, 0, 1, 1], [1, 1, 0, 1], [0, 1, 0, 0]], bool)
 CORNERS = np.array([[5, -2, 2], [5, 2, 2], [5, 2, -2], [5, -2, -2]], "<f4")

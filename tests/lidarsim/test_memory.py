@@ -86,7 +86,7 @@ SURVEYS = {
 @pytest.mark.parametrize("name", SURVEYS)
 def test_the_estimate_is_safe_and_near(name):
     survey = SURVEYS[name]
-    rig = Rig(SCENE, survey, "embree", threads=1)
+    rig = Rig(SCENE, survey, "tiles", threads=1)
     scans = RAYS // survey.scan(0).ray_count
     columns_of(list(rig.cast(0, 1)))  # what is made once
     tracemalloc.start()

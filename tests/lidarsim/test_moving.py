@@ -97,7 +97,7 @@ SURVEYS = {
 
 @pytest.mark.slow
 @pytest.mark.slow(keep=("standing-*", "driving-*"))
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 @pytest.mark.parametrize("name", SURVEYS)
 def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     sensor = load_sensor("velodyne/vlp16")
@@ -140,7 +140,7 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
     pane = quad("Pane", (-90, 2, -9), (90, 2, -9), (90, 2, 9), (-90, 2, 9))
     found = []

@@ -186,7 +186,7 @@ def case_of(model: str, profile: str, columns: int = 512, **options):
         | options,
     )  # fmt: skip
     scene = posts_before_walls()
-    part = columns_of(list(Rig(scene, survey, "embree").cast(0, survey.scan_count)))
+    part = columns_of(list(Rig(scene, survey, "tiles").cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     return survey, cloud, Sweeps.from_survey(survey, scene)
 

@@ -36,7 +36,7 @@ START_NS = 1_700_000_000_123_456_789
 
 
 def points_of(survey, scene):
-    rig = Rig(scene, survey, "embree")
+    rig = Rig(scene, survey, "tiles")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     return cloud, Sweeps.from_survey(survey, scene)

@@ -165,7 +165,7 @@ def hashed(**environment):
 
 @pytest.mark.slow
 def test_narrower_instructions_give_the_same_bytes(tmp_path):
-    """Those of NumPy, of compiled loops, and of Embree; each by itself, to name what differs."""
+    """Those of NumPy and of compiled loops; each by itself, to name what differs."""
     expected = hashed()
     dispatched = " ".join(np._core._multiarray_umath.__cpu_dispatch__)
     plain = {
@@ -174,5 +174,4 @@ def test_narrower_instructions_give_the_same_bytes(tmp_path):
         "NUMBA_CACHE_DIR": str(tmp_path),
     }
     assert hashed(NPY_DISABLE_CPU_FEATURES=dispatched) == expected
-    assert hashed(RAYBEAM_EMBREE_ISA="sse4.2") == expected
     assert hashed(**plain) == expected

@@ -326,7 +326,7 @@ def with_copies(scene, crate=None, *grates):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend):
     crate = Pose((6, -2, 0.5), 70, 5)
@@ -366,7 +366,7 @@ def with_bodies(scene, **options):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_bodies_that_move_together_give_the_bytes_of_bodies_that_move_one_by_one(
     scene, physics, backend
@@ -456,7 +456,7 @@ def test_a_copy_waits_for_sweeps_before_it_moves(scene):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("embree", FEW)])
+@pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("tiles", FEW)])
 def test_threads_share_a_scanner(scene, backend, sensor):
     def scan(number):
         cloud = scanner.sweep(BEND, number=number)
@@ -472,7 +472,7 @@ def test_threads_share_a_scanner(scene, backend, sensor):
 
 @pytest.mark.extended
 def test_a_forked_process_scans_with_the_scanner_of_its_parent(scene):
-    scanner = Scanner(scene, GRID, backend="embree", threads=2)
+    scanner = Scanner(scene, GRID, backend="tiles", threads=2)
     poses = [HERE] * 2000
     expected = scanner.ranges(poses, number=3).tobytes()  # which starts threads that a fork lacks
 

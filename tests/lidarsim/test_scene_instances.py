@@ -98,7 +98,7 @@ def hits_by_object(scene, tally):
 def scanned(scene, physics):
     """Cloud of some scans, its rows by (scan, ray, return), and hits by object."""
     survey = Survey(SENSOR, poses=[(-19.3, 0.4, 2.2)], steps=18, columns=COLUMNS, **physics)
-    batches = list(Rig(scene, survey, "embree").cast(0, survey.scan_count))
+    batches = list(Rig(scene, survey, "tiles").cast(0, survey.scan_count))
     table = (SCAN, *(c for c in survey.stored_columns if c.name not in "xyz"))
     cloud = columns_of(batches).cloud(table, survey.precision_m, scene.origin)
     keys = np.stack([cloud[name] for name in ("scan", "ray", "return_number")], axis=1).tolist()

@@ -95,7 +95,7 @@ def same(scene, cloud, whole):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("backend", ["numpy", "tiles"])
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "effects"])
 @pytest.mark.parametrize("kind", ["faces", "instances", "masks"])
 def test_points_are_those_of_the_whole_scene(kind, physics, backend, uncut):

@@ -141,7 +141,7 @@ class Watched:
 @pytest.mark.extended
 @pytest.mark.parametrize("name", SURVEYS)
 def test_steps_read_and_write_what_they_say(name):
-    rig = Rig(Scene.seed(), SURVEYS[name], "embree", threads=1)
+    rig = Rig(Scene.seed(), SURVEYS[name], "tiles", threads=1)
     pulses = rig.pulse_casters[0]
     assert {type(step) for step in pulses.steps} == {
         step for step in STEPS if step.applies(pulses.setup)

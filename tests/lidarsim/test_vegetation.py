@@ -30,7 +30,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 
 GROUND = Material("*", 0.3)
-cast = partial(shapes.cast, backend="embree")
+cast = partial(shapes.cast, backend="tiles")
 MANY = 60_000
 AT = (0, 0.02, 0.01)  # rays that meet an edge exactly take long
 
@@ -149,7 +149,7 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
         [Actor(SceneMesh("Crown", crown.vertices * 2, crown.faces), way)]
     )
     survey = Survey(rays(), poses=[AT], steps=1, materials=materials)
-    (batch,) = Rig(scene, survey, "embree").cast(0, 1)
+    (batch,) = Rig(scene, survey, "tiles").cast(0, 1)
     assert (batch.object == 0).mean() == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
 
 
@@ -206,7 +206,7 @@ def test_layers_that_touch_each_other(backend, order):
     materials = [Material("Voxel*", leaf_area_density=0.4), GROUND]
     found = cast(
         [*layers, wall],
-        rays((backend == "embree" and MANY) or 10_000, 91.0),
+        rays((backend == "tiles" and MANY) or 10_000, 91.0),
         backend=backend,
         materials=materials,
     )

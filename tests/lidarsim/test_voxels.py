@@ -343,8 +343,8 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
     monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
     monkeypatch.setattr("lidarsim.simulator.casting.voxels.BLOCK_RAYS", 33)
     assert cast_between(rig, survey, [0, 1, 5, 12, 17, 24]) == whole
-    if "embree" in CPU:
-        other = Rig(Scene.from_meshes(meshes), survey, "embree")
+    if "tiles" in CPU:
+        other = Rig(Scene.from_meshes(meshes), survey, "tiles")
         assert cast_between(other, survey, [0, 24]) == whole
 
 

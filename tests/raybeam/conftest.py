@@ -26,7 +26,7 @@ def usable(name, request):
     return name
 
 
-@pytest.fixture(params=["numpy", "tiles", "source", "embree", CUDA])
+@pytest.fixture(params=["numpy", "tiles", "source", CUDA])
 def backend(request):
     """Name of a backend that can be used here, for ``RayCaster(..., backend=backend)``."""
     return usable(request.param, request)
@@ -38,22 +38,10 @@ def kernels(request):
     return usable(request.param, request)
 
 
-@pytest.fixture(params=["numpy", "tiles", "source", CUDA])
-def exact_backend(request):
-    """Name of a backend that decides in float64: all but embree."""
-    return usable(request.param, request)
-
-
 @pytest.fixture
 def caster(backend):
     """Make a `RayCaster` with the backend under test."""
     return lambda vertices, faces, **more: RayCaster(vertices, faces, backend, **more)
-
-
-@pytest.fixture
-def exact_caster(exact_backend):
-    """Make a `RayCaster` with the backend under test, when it decides in float64."""
-    return lambda vertices, faces, **more: RayCaster(vertices, faces, exact_backend, **more)
 
 
 def _cube():

@@ -12,9 +12,9 @@ import pytest
 
 from raybeam import BackendUnavailable, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
-from raybeam.embree_backend import EmbreeBackend
 from raybeam.instances import plain
 from raybeam.mesh import local_mesh
+from raybeam.tile_backend import TileBackend
 
 MESH = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 
@@ -22,7 +22,7 @@ MESH = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 def test_auto_takes_the_first_that_can_be_used(monkeypatch):
     usable = [name for name, reason in available_backends().items() if not reason]
     assert RayCaster(*MESH).backend == usable[0]
-    for backend in (CudaBackend, EmbreeBackend):
+    for backend in (CudaBackend, TileBackend):
         monkeypatch.setattr(backend, "missing", classmethod(lambda _: "not today"))
     assert RayCaster(*MESH).backend == "numpy"
 
@@ -33,14 +33,14 @@ def test_backend_asked_for_is_taken(backend):
 
 
 def test_what_cannot_be_had_says_why(monkeypatch):
-    with pytest.raises(ValueError, match="no backend 'optix': use auto, cuda, embree, numpy"):
+    with pytest.raises(ValueError, match="no backend 'optix': use auto, cuda, tiles, numpy"):
         RayCaster(*MESH, backend="optix")
     with pytest.raises(ValueError, match="threads is 0"):
         RayCaster(*MESH, backend="numpy", threads=0)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "pip install cupy" in CudaBackend.missing()
-    with pytest.raises(BackendUnavailable, match=r"'embree' cannot be used here: .*: pip install"):
-        RayCaster(*MESH, backend="embree")
+    with pytest.raises(BackendUnavailable, match=r"'tiles' cannot be used here: .*: pip install"):
+        RayCaster(*MESH, backend="tiles")
 
 
 def run_python(code):
@@ -49,11 +49,11 @@ def run_python(code):
 
 
 def test_import_needs_numpy_only():
-    """Neither Embree nor CuPy is loaded by importing, nor by casting with numpy."""
+    """Neither numba nor CuPy is loaded by importing, nor by casting with numpy."""
     code = (
         "import sys, raybeam; "
         "raybeam.RayCaster([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]], 'numpy').cast([0,0,1],[0,0,-1]); "
-        "heavy = {'embreex', 'numba', 'open3d', 'cupy', 'dask', 'trimesh'} & set(sys.modules); "
+        "heavy = {'numba', 'open3d', 'cupy', 'dask', 'trimesh'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
     )
     run_python(code)
@@ -108,15 +108,15 @@ def test_what_cuda_lacks(monkeypatch, devices, version, headers, words):
 
 
 def casting_threads():
-    return {thread for thread in threading.enumerate() if thread.name.startswith("embree")}
+    return {thread for thread in threading.enumerate() if thread.name.startswith("tiles")}
 
 
-def test_embree_takes_as_many_threads_as_are_given(shapes):
+def test_tiles_take_as_many_threads_as_are_given(shapes):
     """Each of several gets its share of the rays, and the answer has the same bits."""
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
+    if reason := available_backends()["tiles"]:
+        pytest.skip(f"tiles: {reason}")
     directions = np.random.default_rng(1).normal(size=(40_000, 3))
-    casters = {n: RayCaster(*shapes["vase"](), "embree", threads=n) for n in (1, 3)}
+    casters = {n: RayCaster(*shapes["vase"](), "tiles", threads=n) for n in (1, 3)}
     before = casting_threads()
     one = casters[1].cast([0.05, 0.1, 0.4], directions)
     assert casting_threads() <= before

@@ -175,7 +175,7 @@ def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
 @pytest.mark.parametrize("kind", ["fan", "any", "apart", "moving", "far"])
 def test_hits_of_a_million_rays(kind):
     scan, times, around = scans(kind, 1_000_000)
-    moving = Bodies(30, 2, around).moving("embree")
+    moving = Bodies(30, 2, around).moving("tiles")
     hits = hits_on(moving, scan, lambda ray: times[ray])
     assert listed(hits) == by_all(moving, scan, times)
 
@@ -224,7 +224,7 @@ def test_most_rays_are_not_looked_at(monkeypatch):
 
 
 @pytest.mark.parametrize("there", [(2.0, 5.0), (0.0, 1.0)])
-@pytest.mark.parametrize("backend", ["tiles", "embree", "numpy"])
+@pytest.mark.parametrize("backend", ["tiles", "numpy"])
 def test_rays_beside_the_moment_when_a_body_is_there_miss_it(backend, there):
     """Also where they are compared together with rays of that very moment."""
 

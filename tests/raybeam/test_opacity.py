@@ -75,12 +75,12 @@ def test_kernels_have_the_bits_of_numpy(kernels, shapes, kind):
         same(other.cast(origins, directions), want)
 
 
-def test_embree_has_the_bits_of_numpy(shapes):
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
+def test_tiles_have_the_bits_of_numpy(shapes):
+    if reason := available_backends()["tiles"]:
+        pytest.skip(f"tiles: {reason}")
     origins, directions = rays(20_000)
-    for numpy, embree in casters(shapes, "random", ("numpy", "embree")):
-        want, got = (caster.cast(origins, directions) for caster in (numpy, embree))
+    for numpy, tiles in casters(shapes, "random", ("numpy", "tiles")):
+        want, got = (caster.cast(origins, directions) for caster in (numpy, tiles))
         differ = np.any([getattr(got, name) != getattr(want, name) for name in FIELDS], axis=0)
         assert want.hit.sum() > 2_000
         assert differ.sum() <= 2
@@ -143,7 +143,7 @@ def test_refused(mask, uv, words):
 
 
 def test_at_an_edge_the_opaque_neighbour_stops_a_ray(backend, shapes):
-    """Rays at the edges of triangles whose masks differ; Embree may propose either triangle."""
+    """Rays at the edges of triangles whose masks differ."""
     vertices, faces = shapes["sphere"](12, 16)
     rng = np.random.default_rng(6)
     opacity = Opacity(np.array([[True, False]]), rng.random((len(faces), 3, 2)))

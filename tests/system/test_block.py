@@ -25,7 +25,7 @@ def scanned(tmp_path_factory):
             shutil.copy(file, folder)
     built = build(Scenario.load(folder / "block.yaml"))
     job = built.job()
-    batches = list(Rig(job.scene, job.survey, "embree").cast(0, 72))
+    batches = list(Rig(job.scene, job.survey, "tiles").cast(0, 72))
     columns = {
         column.name: np.concatenate([column.make(batch) for batch in batches])
         for column in job.survey.stored_columns

@@ -329,17 +329,6 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     assert {"range", "intensity"} <= cloud.columns.keys()
 
 
-def test_triangles_too_fine_for_embree_are_told_of(tmp_path, lidarpool):
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
-    corners = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 5e-6, 0]])
-    for faces, told in (([[0, 1, 2]], False), ([[0, 1, 2], [0, 1, 3]], True)):
-        mesh = trimesh.Trimesh(corners, faces, process=False)
-        (tmp_path / "thin.ply").write_bytes(mesh.export(file_type="ply"))
-        outcome = lidarpool("check", tmp_path / "thin.ply", "--backend", "embree", "--no-plan")
-        assert ("note: 1 triangle with an edge below a millionth" in outcome.out) == told
-
-
 def test_an_unfinished_run_is_told_of(check, tmp_path):
     (tmp_path / "out" / "run").mkdir(parents=True)
     (tmp_path / "out" / "run" / "run.db").write_bytes(b"")

@@ -121,7 +121,7 @@ def test_the_report_has_all_that_is_promised(demo):
     assert (report["hits"], report["points"]) == (4926, 995)
     assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
     assert sum(report["points_by_object"].values()) == report["points"]
-    assert report["backend"] in ("cuda", "embree", "numpy")
+    assert report["backend"] in ("cuda", "tiles", "numpy")
     assert {"lidarpool", "python", "numpy", "dask", "distributed"} <= report["versions"].keys()
     assert report["parameters"]["sensor"]["channels"] == 40
     assert report["parameters"]["sensor"]["max_range_m"] is None  # infinite
@@ -227,7 +227,7 @@ def test_doctor_tells_what_is_here(lidarpool):
     outcome = lidarpool("doctor")
     assert (outcome.code, outcome.err) == (0, "")
     first_words = [line.split()[0] for line in outcome.out.splitlines()]
-    assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "embree"} <= {*first_words}
+    assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "tiles"} <= {*first_words}
     assert {"cores", "memory", "disk", "extras", "las", "ports", "8786"} <= {*first_words}
     assert re.search(r"^  numpy +ready$", outcome.out, re.MULTILINE)
     told = json.loads(lidarpool("doctor", "--json").out)

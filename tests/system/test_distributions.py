@@ -253,10 +253,10 @@ def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
 
 
 @pytest.mark.slow
-def test_raybeam_with_embree_needs_three_packages_more(built, tmp_path):
-    alone = Environment(tmp_path / "venv", built, "raybeam[embree]")
-    assert alone.names() - {"embreex", "numba", "llvmlite"} == {"raybeam", "numpy"}
-    assert alone.run_readme("raybeam", tmp_path) == "[ 5. inf]\nembree\n"
+def test_raybeam_with_tiles_needs_two_packages_more(built, tmp_path):
+    alone = Environment(tmp_path / "venv", built, "raybeam[tiles]")
+    assert alone.names() - {"numba", "llvmlite"} == {"raybeam", "numpy"}
+    assert alone.run_readme("raybeam", tmp_path) == "[ 5. inf]\ntiles\n"
 
 
 def surveys(environment: Environment, folder: Path, *options: str) -> str:

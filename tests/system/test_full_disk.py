@@ -20,7 +20,7 @@ from lidarpool.scenario.scenario import Scenario
 SCENARIO = """
 cloud: {keep_every: 1}
 planning: {trials: 2, iterations: 20}
-pool: {backend: embree}
+pool: {backend: tiles}
 """
 
 
@@ -33,7 +33,7 @@ def run(cluster: str) -> Callable[..., Any]:
         with Client(cluster, set_as_default=False) as client:
             return simulate(
                 built.scene, built.survey, built.planning, client=client,
-                backend="embree", **options,
+                backend="tiles", **options,
             )  # fmt: skip
 
     return run

@@ -29,7 +29,7 @@ def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, a
     assert (outcome.code, outcome.err) == (0, "")
     assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
     report = json.loads((out / "report.json").read_text())
-    assert report["backend"] == "numpy"  # the demo's is Embree
+    assert report["backend"] == "numpy"  # the demo's is tiles
     assert report["placement_violations"] == 0
     assert report["tasks"]["GPU"].keys() == {"intersect"}
     assert report["tasks"]["LIDAR"] == {"generate": 1, "sort": 1, "collect": 2}
@@ -49,7 +49,7 @@ def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, a
 
 
 @pytest.mark.slow
-def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
+def test_a_worker_whose_backend_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
     """Another version, for example: workers like most others cast."""
     expected = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="numpy")
     cluster = outside()

@@ -102,7 +102,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     )
     other = lidarpool(*arguments, "--resume", "--no-plan")
     assert other.code == 2 and "is of another planning: " in other.err
-    wrong = lidarpool(*arguments, "--resume", "--backend", "embree")
+    wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
     assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
     both = lidarpool(*arguments, "--resume", "--fresh")
     assert both.code == 2 and "give one of them" in both.err
@@ -156,9 +156,9 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
         if frame.scan == 50:  # its points are committed
             raise ZeroDivisionError("enough")
 
-    whole = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="embree")
+    whole = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="tiles")
     with pytest.raises(ZeroDivisionError) as caught:
-        run(on_frame=on_frame, backend="embree")
+        run(on_frame=on_frame, backend="tiles")
     assert re.fullmatch(
         rf"\d+ of 144 scans are kept in {folder}: continue with --resume \(.*\)\.",
         *caught.value.__notes__,
@@ -169,7 +169,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     assert first == list(range(51))
     assert second == list(range(50, 144))  # the one that it failed on is handed out again
     assert result.resumed > 50
-    assert result.backend == "embree"
+    assert result.backend == "tiles"
     assert (result.hit_counts == whole.hit_counts).all() and result.hits == whole.hits
     assert (result.sample_rays == whole.sample_rays).all()
     assert same_cloud(result.cloud, whole.cloud)
@@ -178,7 +178,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     monkeypatch.setattr("lidarpool.run.cluster.cluster.local_client", None)
     again = simulate(Scene.seed(), SURVEY, folder=folder, resume=True)
     assert again.resumed == SURVEY.scan_count and again.records == ()
-    assert again.backend == "embree"
+    assert again.backend == "tiles"
     assert same_cloud(again.cloud, whole.cloud)
     remove_run(folder)
     assert not folder.exists()

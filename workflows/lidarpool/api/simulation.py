@@ -82,7 +82,7 @@ def simulate(
         has a page of partitions during the run; the log has its address. Without a client, a local
         cluster is started on the loopback interface and stopped at the end.
     backend
-        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
+        Ray-casting backend of stage 2: auto, cuda, tiles or numpy.
     live
         Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
         cell. `Result.view` shows the result afterwards. "foxglove" and "rerun" show its sweeps in

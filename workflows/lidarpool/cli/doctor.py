@@ -134,8 +134,8 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
             yield f"{folder} has {free_gib:.1f} GiB left: make room there"
     if figures["gpus"] and backends["cuda"] != READY:
         yield f"There is a GPU that is not used: {backends['cuda']}"
-    if backends["embree"] != READY:
-        yield f"Rays are cast a hundred times slower than by Embree: {backends['embree']}"
+    if backends["tiles"] != READY:
+        yield f"Rays are cast a hundred times slower without numba: {backends['tiles']}"
     elif not HAS_CACHE:
         yield (
             "Each process compiles its loops for 20 s, as there is no folder to keep them: set "

@@ -41,7 +41,7 @@ STAGES = {
     TRIAL: "plan path",
 }
 _PACKAGES = (
-    "numpy", "dask", "distributed", "trimesh", "embreex", "numba", "open3d-cpu", "open3d",
+    "numpy", "dask", "distributed", "trimesh", "numba", "open3d-cpu", "open3d",
     "matplotlib", "cupy-cuda12x", "cupy-cuda13x",
 )  # fmt: skip
 # What `--json` prints of a report.

@@ -17,9 +17,7 @@ from distributed.system import MEMORY_LIMIT
 
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
 from lidarsim.columns.cloud import CHUNK_POINTS
-from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
@@ -49,7 +47,7 @@ from .store.database import FILE
 from .store.run_store import RUN_FOLDER
 
 # Measured on Linux: a worker process with Dask loaded.
-PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles the calls of Embree
+PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles loops
 PARTICLE_BYTES = 140  # memory of a particle of the swarm, for each corner of its path
 PART_BYTES = 2500  # disk of a part's head, and of its row in the database
 FIRST_PARTS = 60  # parts of one or a few scans, written before batches become large
@@ -58,7 +56,6 @@ SUMMARY_BYTES = 28  # disk of a scan in the database
 FORMAT_BYTES = 30  # largest size of a point in an exported file without its columns: LAS
 REPORT_BYTES = 32 << 20  # disk of pictures and report
 TRAJECTORY_POSES = 1000  # for measuring the length of a trajectory
-_FINE_SHARE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 
 def forecast(
@@ -106,8 +103,6 @@ def forecast(
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
             warnings.append(f"{EMPTY}: {empty_cloud_reason(job.scene, job.survey)}")
-    if backend == "embree":
-        notes += _fine_triangle_notes(job.scene)
     # Without an estimate every ray may hit.
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small batches take less memory.
@@ -307,20 +302,6 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
 def _existing(folder: Path) -> Path:
     """Return a folder, or its innermost existing parent."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
-
-
-def _fine_triangle_notes(scene: Scene) -> list[str]:
-    """Return a note on triangles too small for Embree, which tests in float32; perhaps none."""
-    count = 0
-    shortest = _FINE_SHARE * np.ptp(scene.bounds, axis=0).max()
-    parts = scene.instances.parts if scene.instances else ()
-    for points, faces in ((scene.vertices, scene.faces), *((p.vertices, p.faces) for p in parts)):
-        corners = points[faces.T]
-        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
-        # No backend hits triangles without an area.
-        count += int(((edges > 0) & (edges < shortest)).sum())
-    note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
-    return [f"{plural(count, 'triangle')} {note}"] if count else []
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:

@@ -85,7 +85,7 @@ class StandingSurfaces:
     def _caster(self) -> RayCaster:
         """Ray caster of the surfaces."""
         # Never CUDA, whose context would stay in this process.
-        backend = "numpy" if available_backends()["embree"] else "embree"
+        backend = "numpy" if available_backends()["tiles"] else "tiles"
         corners = self._tops[0].reshape(-1, 3)
         return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
 

@@ -701,7 +701,7 @@ class TaskOptions:
     ] = 256
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
-        about("cuda, embree or numpy; auto takes the fastest available"),
+        about("cuda, tiles (compiled, on CPUs) or numpy; auto takes the fastest available"),
     ] = "auto"
 
 

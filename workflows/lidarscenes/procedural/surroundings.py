@@ -84,7 +84,7 @@ class Surroundings:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         # Never CUDA, whose context would stay in this process.
-        backend = "numpy" if available_backends()["embree"] else "embree"
+        backend = "numpy" if available_backends()["tiles"] else "tiles"
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
     def views(self, positions: ArrayLike) -> Views:

@@ -5,7 +5,7 @@ Help and completion of the command import no other module.
 
 from __future__ import annotations
 
-BACKENDS = ("auto", "cuda", "embree", "numpy")
+BACKENDS = ("auto", "cuda", "tiles", "numpy")
 PICTURES = ("scene", "hits", "intensity", "cloud", "path")  # drawn pictures
 
 # Names of the columns of `lidarsim.columns.table.TABLE`, in its order; a test compares both.

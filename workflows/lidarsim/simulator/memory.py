@@ -23,7 +23,7 @@ MB = 1_000_000
 
 # Bytes, measured in `Rig.cast` and `columns_of` as the peak of tracemalloc, at a million rays that
 # all hit a sphere of 20,480 triangles: 128 beams and a single beam, a prism, static and moving,
-# with all columns and none, 1 to 19 sub-rays, a glass sphere around the sensor, with Embree and
+# with all columns and none, 1 to 19 sub-rays, a glass sphere around the sensor, with tiles and
 # NumPy, which differ by 30 MB at most (2026-11-22, Linux, NumPy 2.4). The estimate was 1.02 to 1.5
 # times the measured peak; 1.64 times if two returns of a pulse may be reported and there is one,
 # 0.8 times if there are always two. The peak of the process (VmHWM) was at most 16 % above the peak

@@ -94,7 +94,7 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
         **declared(Weather(), Weather),
     )
     # Never CUDA, whose context would stay in this process.
-    backend = "numpy" if available_backends()["embree"] else "embree"
+    backend = "numpy" if available_backends()["tiles"] else "tiles"
     batches = _batches(Rig(scene, plain, backend), firsts, stops)
     return np.concatenate([np.zeros(0), *(batch.range for batch in batches)])
 

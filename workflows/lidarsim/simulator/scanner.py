@@ -69,7 +69,7 @@ class Scanner:
     spray_g_m3
         As in `Survey`.
     backend
-        "cuda", "embree", "numpy", or "auto" for the first of the three that can be used.
+        "cuda", "tiles", "numpy", or "auto" for the first of the three that can be used.
     threads
         CPU threads to cast with; None for all cores.
     device

@@ -30,9 +30,9 @@ keep_freed_memory()
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # if it cannot be loaded, a check says why
     from lidarsim.base import elementary_loops  # noqa: F401
-    from raybeam import embree_bodies, embree_packets, moving_loops  # noqa: F401
+    from raybeam import moving_loops, tile_casts  # noqa: F401
 
-    if embree_packets.COMPILED:
+    if tile_casts.COMPILED:
         print("note: compiled the ray caster for this processor, once", file=sys.stderr)  # noqa: T201
 # What each worker would read from many files: versions of packages, and a hash of the sources.
 distributed.versions.get_versions()

@@ -427,7 +427,7 @@ def move_instances(
 def _clear_m(scene: Scene) -> float:
     """Return the distance behind a surface at which light continues, metres.
 
-    At this distance a ray does not hit the surface again: Embree's rounding is up to a quarter.
+    At this distance a ray does not hit the surface again, wherever its start is rounded to.
     """
     reach = np.float32(np.abs(scene.bounds).max())
     return max(1e-5, 4 * float(np.spacing(reach)))

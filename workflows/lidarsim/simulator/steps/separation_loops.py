@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
 from raybeam.cast_memory import float64s, int64s, uint8s
+from raybeam.compiled import compiled, inlined, stage
 
 from ...base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row

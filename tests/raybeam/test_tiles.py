@@ -1,4 +1,4 @@
-"""Embree casts rays in packets; which rays share one has no effect on any bit."""
+"""Tiles of neighbouring rays are cast together; which rays share one has no effect on any bit."""
 
 import hashlib
 import os
@@ -11,8 +11,8 @@ from benchmarks.gpu_scenes import grid_faces
 
 from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
 
-if reason := available_backends()["embree"]:
-    pytest.skip(f"embree: {reason}", allow_module_level=True)
+if reason := available_backends()["tiles"]:
+    pytest.skip(f"tiles: {reason}", allow_module_level=True)
 
 RINGS = 24
 FIRINGS = 600
@@ -55,7 +55,7 @@ def found(caster, directions, order, **options):
 def test_neighbours_have_no_effect(mesh):
     directions = lidar()
     rng = np.random.default_rng(2)
-    caster = RayCaster(*mesh, "embree", threads=1)
+    caster = RayCaster(*mesh, "tiles", threads=1)
     straight = np.arange(len(directions))
     want = found(caster, directions, straight)
     assert np.isfinite(want[0]).mean() > 0.3
@@ -70,12 +70,12 @@ def test_neighbours_have_no_effect(mesh):
 
 @pytest.mark.extended
 @pytest.mark.parametrize("limits", [(0.0, np.inf), (0.7, 1.5)])
-def test_embree_has_the_bits_of_numpy(mesh, limits):
+def test_tiles_have_the_bits_of_numpy(mesh, limits):
     directions = lidar()
     straight = np.arange(len(directions))
     given = {"t_min": limits[0], "t_max": limits[1]}
     (t, triangle), (t_2, triangle_2) = (
-        found(RayCaster(*mesh, name), directions, straight, **given) for name in ("embree", "numpy")
+        found(RayCaster(*mesh, name), directions, straight, **given) for name in ("tiles", "numpy")
     )
     np.testing.assert_array_equal(t, t_2)
     np.testing.assert_array_equal(triangle, triangle_2)
@@ -109,12 +109,12 @@ def ties(backend):
         hits = caster.cast(start, directions)
         for column in (hits.distance, hits.triangle, hits.instance):
             found.update(column.tobytes())
-    # Neighbours in packets, in a plain scene and among instances.
+    # Neighbours in tiles, in a plain scene and among instances.
     for caster in (
         RayCaster(points, rng.permutation(thrice), backend),
         RayCaster.from_instances(stack, backend),
     ):
-        scans = {}  # {window: returns}: Embree tries other packets each time, NumPy does not
+        scans = {}  # {window: returns}
         for window in [(0, RINGS * FIRINGS)] * 4 + [(7, 5_000)]:
             if backend != "numpy" or window not in scans:
                 scans[window] = caster.scan(Pattern(lidar()), [0.05, 0.1, 0.4], window=window)
@@ -124,18 +124,8 @@ def ties(backend):
     return found.hexdigest()
 
 
-@pytest.mark.slow
-@pytest.mark.slow(keep=("AVX2",))
-@pytest.mark.parametrize("isa", ("SSE4.2", "AVX", "AVX2", "AVX512"))
-def test_the_lowest_of_equals_wins_with_every_instruction_set(isa):
-    """Packets of 4, 8 and 16 rays, with and without fused multiply-adds."""
-    flag = {"SSE4.2": "SSE42", "AVX512": "AVX512_SKX"}.get(isa, isa)
-    if not np._core._multiarray_umath.__cpu_features__[flag]:
-        pytest.skip(f"this processor has no {isa}")
-    code = (
-        "import sys; from tests.raybeam.test_packets import ties; assert ties('embree') in sys.argv"
-    )
-    run_python(code, ties("numpy"), RAYBEAM_EMBREE_ISA=isa.lower())
+def test_the_lowest_of_equals_wins():
+    assert ties("tiles") == ties("numpy")
 
 
 def run_python(code, *arguments, **environment):
@@ -148,7 +138,7 @@ def test_forked_processes_cast_too():
     run_python(
         "import os, sys; from raybeam import RayCaster; "
         "mesh = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]; "
-        "cast = lambda: RayCaster(*mesh, 'embree', threads=2).cast([0.2, 0.2, 5], [0, 0, -1]); "
+        "cast = lambda: RayCaster(*mesh, 'tiles', threads=2).cast([0.2, 0.2, 5], [0, 0, -1]); "
         "assert cast().distance == 5; child = os.fork(); "
         "assert cast().distance == 5; child or os._exit(0); "
         "sys.exit(os.waitpid(child, 0)[1])"
@@ -157,8 +147,8 @@ def test_forked_processes_cast_too():
 
 @pytest.mark.extended
 def test_which_rays_go_together_changes_nothing(mesh):
-    """Groupings of rays are tried in turn, until one is known to be the fastest."""
-    caster = RayCaster(*mesh, backend="embree", threads=1)
+    """A window may begin and end within a firing, and so within tiles."""
+    caster = RayCaster(*mesh, backend="tiles", threads=1)
     given = Pattern(lidar())
     where = [0.05, 0.1, 0.4]
     expected = RayCaster(*mesh, backend="numpy").scan(given, where)
@@ -171,14 +161,14 @@ def test_which_rays_go_together_changes_nothing(mesh):
 
 
 def test_what_few_rays_hit_beside_many_that_miss():
-    """Groups at the end of a ring, or of a window, are not full."""
+    """Tiles at the end of a ring, or of a window, are not full."""
     card = np.array([[5, -2, -2], [5, 2, -2], [5, 2, 2], [5, -2, 2.0]]), [[0, 1, 2], [0, 2, 3]]
     azimuth, elevation = np.meshgrid(
         np.radians(np.arange(360)), np.radians(np.linspace(-30, 30, 31))
     )
     flat = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
     given = Pattern(np.stack([*flat, np.sin(elevation)], axis=-1).swapaxes(0, 1).reshape(-1, 3))
-    casters = [RayCaster(*card, backend=backend, threads=1) for backend in ("numpy", "embree")]
+    casters = [RayCaster(*card, backend=backend, threads=1) for backend in ("numpy", "tiles")]
     for start in range(0, 600, 50):  # ahead, the card; at the end, the other half of it
         window = (start, len(given) - 7)
         expected, returns = (c.scan(given, [0, 0, 0], window=window) for c in casters)
