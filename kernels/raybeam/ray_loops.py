@@ -24,6 +24,7 @@ from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_at, thread_tiles
 from .vectors import load, splat, square_root, store
 
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
+_LONE = 8  # numbers of a row of the table of shares of a single sub-ray
 _BEAMS = 64  # of a tile of rays that are only computed
 
 
@@ -199,6 +200,48 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
                 store(floats, i, _combine(aside, splat(a), above, splat(d)))
                 store(floats, i + rays, _combine(aside, splat(b), above, splat(e)))
                 store(floats, i + 2 * rays, _combine(aside, splat(c), above, splat(f)))
+
+
+@stage
+def _make_lone_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write directions and starts as `_make_sub_rays`, of the only sub-ray of each beam."""
+    numbers = int64s(tile)
+    floats = float64s(tile)
+    shares = float64s(cast.shares)
+    offsets = float64s(cast.offsets)
+    directions = float64s(cast.directions)
+    rows = cast.rows
+    row_of = row_at(ROW, rays)
+    origin = row_at(OX, rays)
+    target = row_at(DX, rays)
+    axis = cast.axis[0], cast.axis[1], cast.axis[2]
+    straight = shares[0]
+    across = shares[_LONE]
+    up = shares[2 * _LONE]
+    for lane in range(rays):
+        beam = numbers[row_of + lane]
+        x = directions[beam]
+        y = directions[rows + beam]
+        z = directions[2 * rows + beam]
+        if cast.has_axis:
+            a, b, c, d, e, f = axes_about(x, y, z, axis)
+        else:
+            a, b, c, d, e, f = any_axes(x, y, z)
+        if cast.offsets != 0:
+            across = shares[_LONE] + offsets[beam]
+            up = shares[2 * _LONE] + offsets[rows + beam]
+            straight = 1 / np.sqrt((1 + across * across) + up * up)
+            across = across * straight
+            up = up * straight
+        floats[target + lane] = (straight * x + across * a) + up * d
+        floats[target + rays + lane] = (straight * y + across * b) + up * e
+        floats[target + 2 * rays + lane] = (straight * z + across * c) + up * f
+        if cast.has_starts:
+            aside = shares[3 * _LONE]
+            above = shares[4 * _LONE]
+            floats[origin + lane] = aside * a + above * d
+            floats[origin + rays + lane] = aside * b + above * e
+            floats[origin + 2 * rays + lane] = aside * c + above * f
 
 
 @inlined
@@ -397,7 +440,10 @@ def make_rays(cast, tile, rays, first, count):  # type: ignore[no-untyped-def]
     if cast.shares_origin == 0:
         _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
     if cast.shares != 0:
-        _make_sub_rays(tile, rays, cast)
+        if cast.lanes_per_beam == 1:
+            _make_lone_sub_rays(tile, rays, cast)
+        else:
+            _make_sub_rays(tile, rays, cast)
     else:
         _look_up_beams(tile, rays, cast.directions, cast.rows)
     if cast.rotations != 0:

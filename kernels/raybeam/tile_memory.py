@@ -12,8 +12,8 @@ import threading
 import numpy as np
 
 from .compiled import inlined
+from .tile_plan import SUBTILES
 
-SUBTILES = 8
 
 # Fields of a tile. float32 unless stated; vectors of eight numbers, if not one for each subtile.
 TILE = np.dtype(

@@ -14,8 +14,8 @@ import numpy as np
 from .arrays import Floats, Ints
 from .pattern_rays import checked_rays
 from .scan import Scan
-from .tile_memory import SUBTILES
 
+SUBTILES = 8  # of a tile
 _VECTOR = 8  # rays of a vector
 _MAX_LANES = 1 << 20  # of all tiles of a column: a longer firing counts as consecutive rays
 _FEW_FIRINGS = 4  # times the shift of a ring: shorter scans would have too many incomplete tiles
