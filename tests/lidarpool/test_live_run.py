@@ -22,7 +22,7 @@ from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.runner import Run, StoredOutput
 from lidarpool.run.store.job_under_way import JobUnderWay

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from lidarsim.base.sections import FieldPath, dotted, fields_of, is_section
+from lidarsim.base.section_fields import FieldPath, dotted, fields_of, is_section
 
 _FIELDS = {"file", "calibration", "model", "times"}
 

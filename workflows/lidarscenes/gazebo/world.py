@@ -33,15 +33,15 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..files.lenient_xml import lenient_root
-from .actors import actors_of
 from .appearance import appearance_of
 from .bodies import Body, BodyReader, Instance, Link, scoped
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Resources, Source
-from .shapes import road_mesh
+from .sdf_shapes import road_mesh
 from .state import NO_SCALE, State, state_of
-from .visibility import ALL_BITS, masks_of
+from .visibility_flags import ALL_BITS, masks_of
+from .waypoint_actors import actors_of
 
 _ADVICE = "simplify its meshes, or export them in parts"
 _OLD_ROOT = "gazebo"  # of Gazebo before 1.9

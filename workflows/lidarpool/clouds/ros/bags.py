@@ -34,7 +34,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
 from .. import sweep_reader
-from ..frames import survey_start_ns
+from ..frame_names import survey_start_ns
 from ..recording import Read, Recording, RecordingSource, positions_of
 from .bag_poses import sweep_poses
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits

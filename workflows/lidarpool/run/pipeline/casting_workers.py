@@ -28,9 +28,9 @@ from ...base.shared_memory import Pickled, SharedHandle, SharedValue
 from ...base.software import difference, software_query
 from .batches import Outcome
 from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
-from .messages import BatchRange
-from .names import INTERSECT
 from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
+from .stage_messages import BatchRange
+from .stage_names import INTERSECT
 
 LOOK_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError

@@ -23,7 +23,7 @@ from lidarview.viewer.view import View
 from ...columns.parts import read_part
 from ...plan import best
 from ...report.picture_content import planning_picture
-from ...run.pipeline.messages import Receipt, ScanFrame
+from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.run_result import RunResult
 from ...run.store.job_under_way import JobUnderWay
 from .downloads import downloads

@@ -31,7 +31,7 @@ from poolpart import Partition
 
 from ...datasets.dataset import DataSet
 from ...datasets.job_table import JobRow
-from ...run.pipeline.messages import Receipt, ScanFrame
+from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.progress import Progress
 from ...run.run_page import RunPage
 from ...run.run_result import RunResult
