@@ -21,7 +21,7 @@ import psutil
 
 from lidarpool import Campaign
 from lidarpool.run.cluster.connection import local_client
-from lidarpool.run.pipeline.names import GPU
+from lidarpool.run.pipeline.stage_names import GPU
 from lidarpool.run.progress import Progress
 
 MIB = 1 << 20

@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 
 from lidarpool import LidarError, Noise, fit
 from lidarpool.clouds.recording import Recording
-from lidarpool.comparing.fit.motion import read_static
+from lidarpool.comparing.fit.smooth_surfaces import find_surfaces, select_smooth_rays
 from lidarpool.comparing.fit.stack import SweepStack
-from lidarpool.comparing.fit.surfaces import find_surfaces, select_smooth_rays
+from lidarpool.comparing.fit.standstill import read_static
 from lidarpool.recordings.opening import open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.steps.angle_noise import angle_errors

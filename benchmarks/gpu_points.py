@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-import lidarsim.simulator.points.device
+import lidarsim.simulator.points.device_columns
 from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
@@ -93,7 +93,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
     split = Split(cupy)
     engine = rig.scene_casters[0].caster.engine
     run = engine._run  # type: ignore[attr-defined]
-    kernel = lidarsim.simulator.points.device._kernel
+    kernel = lidarsim.simulator.points.device_columns._kernel
     send = Outbox.send
 
     def running(name: str, *arguments: Any) -> None:
@@ -114,7 +114,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
     with (
         patch.object(engine, "_run", running),
-        patch.object(lidarsim.simulator.points.device, "_kernel", columns),
+        patch.object(lidarsim.simulator.points.device_columns, "_kernel", columns),
         patch.object(Outbox, "send", sending),
     ):
         yield split

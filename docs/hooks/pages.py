@@ -42,6 +42,30 @@ _FETCHED = re.compile(
 )
 
 
+def on_config(config: Any) -> Any:
+    """List the pages of each folder that the navigation names, `how-to/mesh-formats/`."""
+    config["nav"] = _with_pages(config["nav"], Path(config["docs_dir"]))
+    return config
+
+
+def _with_pages(nav: list[Any], docs: Path) -> list[Any]:
+    """Return a navigation with the pages of folders, by the names of files, for the folders."""
+    entries: list[Any] = []
+    for entry in nav:
+        if isinstance(entry, str) and entry.endswith("/"):
+            entries += [f"{entry}{page.name}" for page in sorted((docs / entry).glob("*.md"))]
+        elif isinstance(entry, dict):
+            entries.append(
+                {
+                    title: _with_pages(inner, docs) if isinstance(inner, list) else inner
+                    for title, inner in entry.items()
+                }
+            )
+        else:
+            entries.append(entry)
+    return entries
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add README and the like, the reference, and the sources that pages link to."""
     pages = {

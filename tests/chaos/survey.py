@@ -31,7 +31,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.report.growing_cloud import GrowingCloud
-from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.run_result import RunResult
 from lidarpool.run.runner import Run, StoredOutput

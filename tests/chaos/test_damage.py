@@ -24,7 +24,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
 from lidarpool.run.pipeline.committed_job import CommittedJob
-from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
 DAMAGES = 3  # of each file, for each reader

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
-from tests.lidarsim.test_device import MADE, backend, scenes  # noqa: F401 - fixtures
+from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F401 - fixtures
 from tests.lidarsim.test_rig import TURNED, survey
 
 from lidarpool import Scene

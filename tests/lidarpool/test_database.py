@@ -17,7 +17,7 @@ from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
 from lidarpool.plan import Planning, run_trial
 from lidarpool.run.pipeline.committed_job import CommittedJob
-from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
 SCANS = 20

@@ -20,7 +20,10 @@ from lidarpool.run.pipeline import pipeline as driver
 from lidarpool.run.pipeline.batches import BatchState, Outcome
 from lidarpool.run.pipeline.dispatch import PIECES
 from lidarpool.run.pipeline.failures import JobError
-from lidarpool.run.pipeline.messages import (
+from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
+from lidarpool.run.pipeline.pipeline_job import PipelineJob
+from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
+from lidarpool.run.pipeline.stage_messages import (
     ColumnsLost,
     Failed,
     Receipt,
@@ -29,9 +32,6 @@ from lidarpool.run.pipeline.messages import (
     samples_of_scan,
     summary_type,
 )
-from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
-from lidarpool.run.pipeline.pipeline_job import PipelineJob
-from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.store.database import RunDatabase
 from lidarsim.base.storage import Storage

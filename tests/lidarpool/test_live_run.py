@@ -22,20 +22,15 @@ from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.pipeline.messages import Receipt
+from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.runner import Run, StoredOutput
 from lidarpool.run.store.job_under_way import JobUnderWay
 from lidarpool.run.store.run_store import RunStore
-from lidarpool.showing.pages.live_page import (
-    MAX_ENDED,
-    MAX_FAILED,
-    MAX_UNDER_WAY,
-    LiveJob,
-    LivePage,
-    busy_slots,
-    live_page,
-)
+from lidarpool.showing.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
+from lidarpool.showing.pages.live_job import LiveJob
+from lidarpool.showing.pages.live_page import LivePage, live_page
+from lidarpool.showing.pages.run_status import busy_slots
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats

@@ -21,7 +21,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import view as view_command
-from lidarpool.clouds.ros import bag_poses
+from lidarpool.clouds.ros import bags
 from lidarpool.clouds.writing import Format
 from lidarpool.recordings.opening import open_recording
 from lidarpool.showing.pages import recorded
@@ -283,7 +283,7 @@ def test_sweeps_of_a_bag_are_where_its_frames_say(exported, name, monkeypatch):
         of_sensor = view.sweeps.sensor == number
         expected = sweeps.pose.positions[sweeps.sensor == sweeps.sensors.index(sensor)]
         np.testing.assert_allclose(view.sweeps.pose.positions[of_sensor], expected, atol=1e-4)
-    monkeypatch.setattr(bag_poses, "_MAX_DISTANCE_NS", -1)  # no pose is near enough
+    monkeypatch.setattr(bags, "_MAX_DISTANCE_NS", -1)  # no pose is near enough
     state = state_of(open_view(folder / Format(name).row.file))
     assert state["by_sweep"] and IN_SENSOR_AXES in state["note"]
 
@@ -292,7 +292,7 @@ def test_several_files_of_different_formats_are_one_view(exported, monkeypatch):
     folder, cloud, _ = exported
     view = open_views([folder / "cloud.las", folder / "nuscenes"])
     assert len(view.points) == 2 * len(cloud) and view.results == ["cloud.las", "nuscenes"]
-    monkeypatch.setattr(bag_poses, "_MAX_DISTANCE_NS", -1)
+    monkeypatch.setattr(bags, "_MAX_DISTANCE_NS", -1)
     with pytest.raises(LidarError, match=r"cloud.mcap has points in the axes of its sensors"):
         open_views([folder / "cloud.las", folder / "cloud.mcap"])
 

@@ -38,7 +38,7 @@ from lidarpool import (
 )
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.writing import Format
-from lidarpool.showing.playback.packets import RepeatedInstruments
+from lidarpool.showing.playback.live_sensor import RepeatedInstruments
 from lidarpool.showing.playback.pcap_recording import PcapRecording
 from lidarpool.showing.playback.sources import open_source, scenario_job
 from lidarpool.showing.playback.transmitter import Transmitter, sensor_streams

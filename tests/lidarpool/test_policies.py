@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool.run.pipeline.batches import Batch, BatchState, Outcome
-from lidarpool.run.pipeline.names import INTERSECT
 from lidarpool.run.pipeline.policies import (
     LATE_FACTOR,
     LATE_S,
@@ -23,6 +22,7 @@ from lidarpool.run.pipeline.policies import (
     scans_per_batch,
     slots_wanted,
 )
+from lidarpool.run.pipeline.stage_names import INTERSECT
 from lidarpool.run.pipeline.task_book import MAX_MISPLACED, MAX_RECORDS, StageTotals, TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
 from poolpart.task_locations import TaskLocations, TaskPlace

@@ -22,10 +22,10 @@ from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_counts import CloudCounts
 from lidarpool.report.page.rendering import MAX_ROWS, put_picture, sentence, write_page
 from lidarpool.report.report import make_report
-from lidarpool.run.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
-from lidarpool.run.trials import TRIAL
+from lidarpool.run.planning_trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor import Sensor

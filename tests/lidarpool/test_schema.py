@@ -24,7 +24,7 @@ from lidarpool.scenario.schema import (
     schema_text,
     short_scenario,
 )
-from lidarsim.base.sections import fields_of, is_section
+from lidarsim.base.section_fields import fields_of, is_section
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]

@@ -230,6 +230,10 @@ def test_what_a_device_is_tested_with_needs_no_dask():
     root = Path(__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-    for name in ("raybeam/test_cast", "lidarsim/test_device", "lidarsim/test_gpu_benchmarks"):
+    for name in (
+        "raybeam/test_cast",
+        "lidarsim/test_device_columns",
+        "lidarsim/test_gpu_benchmarks",
+    ):
         assert f"tests/{name}.py" in done.stdout
     assert "tests/lidarpool" not in done.stdout

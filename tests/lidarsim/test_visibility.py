@@ -37,7 +37,7 @@ from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.memory import rig_bytes
 from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.points.device import DevicePoints
+from lidarsim.simulator.points.device_columns import DevicePoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 

@@ -11,7 +11,7 @@ from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, si
 from lidarpool.run.cluster.watch import WATCH_EVERY_S
 from lidarpool.run.pipeline.pipeline import Pipeline
 from lidarpool.run.pipeline.task_records import placement_violations
-from lidarpool.run.trials import TrialPump
+from lidarpool.run.planning_trials import TrialPump
 from poolpart.workers import worker_identities
 
 # Enough batches that the run is still under way when something happens to it.

@@ -9,7 +9,7 @@ import pytest
 from distributed import Client
 
 import lidarpool.run.pipeline.long_stages
-import lidarpool.run.trials
+import lidarpool.run.planning_trials
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.pipeline.failures import memory_clause
 
@@ -78,7 +78,7 @@ def test_a_trial_whose_workers_were_killed_is_tried_again(client, monkeypatch, t
     """Dask gives a task up at the fourth death, whoever is to blame for it."""
     lives = tmp_path / "lives"
     lives.write_bytes(bytes(4))
-    original = lidarpool.run.trials.run_trial
+    original = lidarpool.run.planning_trials.run_trial
 
     def run_trial(planning, number):
         left = lives.stat().st_size
@@ -87,7 +87,7 @@ def test_a_trial_whose_workers_were_killed_is_tried_again(client, monkeypatch, t
             os.kill(os.getpid(), signal.SIGKILL)
         return original(planning, number)
 
-    monkeypatch.setattr(lidarpool.run.trials, "run_trial", run_trial)
+    monkeypatch.setattr(lidarpool.run.planning_trials, "run_trial", run_trial)
     planning = Planning((25, 25), (-30, -20), trials=5, particles=50, iterations=20)
     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning, client=client)
     assert sorted(trial.trial for trial in result.trials) == list(range(5))

@@ -16,7 +16,7 @@ from tests.shapes import room
 from lidarpool import LidarError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.base.shared_memory import SharedHandle
 from lidarpool.run.pipeline.casting_workers import INLINE_BYTES
-from lidarpool.run.pipeline.messages import ScanRange
+from lidarpool.run.pipeline.stage_messages import ScanRange
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from poolpart import Pool
@@ -233,11 +233,15 @@ def raise_at(scan: int | str | None, scan_of=None):
             r"stage collect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.run.pipeline.messages.StageStart.trace",
+            "lidarpool.run.pipeline.stage_messages.StageStart.trace",
             raise_at("sort", lambda arguments: arguments[0].stage),
             "stage sort failed: the mirror is loose",
         ),
-        ("lidarpool.run.trials.run_trial", raise_at(None), "Planning trial 0 failed: .*the mirror"),
+        (
+            "lidarpool.run.planning_trials.run_trial",
+            raise_at(None),
+            "Planning trial 0 failed: .*the mirror",
+        ),
     ],
 )
 def test_a_failure_anywhere_ends_the_run_and_says_where(

@@ -15,7 +15,7 @@ import poolpart.deploy.clusters
 from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.cluster.checks import common_backend
 from lidarpool.run.pipeline.casting_workers import CastingWorkers
-from lidarpool.run.pipeline.names import GPU, LIDAR
+from lidarpool.run.pipeline.stage_names import GPU, LIDAR
 from poolpart import Pool
 from poolpart.deploy import start_partitions
 from poolpart.workers import worker_identities

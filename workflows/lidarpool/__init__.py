@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from .datasets.sweep_data import Sweep
     from .plan import Plan, Planning
     from .report.merging import merge
-    from .run.pipeline.messages import ScanFrame
+    from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scenario.build import Job
@@ -121,7 +121,7 @@ _MODULES = {
     ".clouds.writing": ("save_cloud",),
     ".clouds.open3d_cloud": ("to_open3d",),
     ".clouds.ply": ("read_cloud",),
-    ".run.pipeline.messages": ("ScanFrame",),
+    ".run.pipeline.stage_messages": ("ScanFrame",),
     ".showing.pages.scanner_page": ("show",),
     ".plan": ("Plan", "Planning"),
     ".showing.playback.live": ("play",),

@@ -23,7 +23,7 @@ from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
 from ..run.job_source import OneJob
 from ..run.options import RunKeywords, RunOptions, options_of_call
-from ..run.pipeline.messages import ScanFrame
+from ..run.pipeline.stage_messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
 from ..run.runner import Run, StoredOutput

@@ -31,7 +31,7 @@ from lidarsim.base.words import plural
 
 from ..base.logs import set_logs
 from ..base.shard import ALL
-from ..showing.viewers.table import PAGE, VIEWERS
+from ..showing.viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
 from .first_step import begin

@@ -17,7 +17,7 @@ from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_
 
 from ..clouds.format_table import EXPORTS, GROUP
 from ..showing.playback.bridge_table import BRIDGES
-from ..showing.viewers.table import PAGE, VIEWERS
+from ..showing.viewers.viewer_table import PAGE, VIEWERS
 
 Items = list[CompletionItem]
 

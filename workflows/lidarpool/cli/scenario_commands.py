@@ -57,7 +57,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.advice import advice
     from ..scenario.build import build
-    from ..scenario.placing import as_entry
+    from ..scenario.default_poses import as_entry
     from ..scenario.scenario import Scenario, mesh_data
     from ..scenario.schema import (
         SCENARIO_FILE,
@@ -216,7 +216,7 @@ def check(
     from ..run.cluster.connection import connected
     from ..run.cluster_file import ClusterFile
     from ..run.options import RunOptions
-    from .forecast import forecast_scenario
+    from .forecast_text import forecast_scenario
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)

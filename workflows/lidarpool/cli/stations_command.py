@@ -260,7 +260,7 @@ def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, li
     """Build a scenario whose poses do not matter; return its notes, which are printed at once."""
     from ..scenario.advice import advice
     from ..scenario.build import build
-    from ..scenario.placing import Placing
+    from ..scenario.default_poses import Placing
 
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=False)

@@ -21,7 +21,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 from lidarview.render.colouring import TURBO
 
-from .frames import CARRIER, WORLD
+from .frame_names import CARRIER, WORLD
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 
 APPLICATION = "lidarpool"

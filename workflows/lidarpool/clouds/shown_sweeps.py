@@ -17,7 +17,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from .boxes import Boxes
-from .frames import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
+from .frame_names import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
 
 MAX_TRIANGLES = 200_000  # of the scene in viewers
 MAX_POSITIONS = 10_000  # of a trajectory

@@ -23,8 +23,8 @@ from numpy.typing import DTypeLike
 from lidarsim.base.archives import read_arrays, read_npy
 from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Integers, Ints, Ints32
 from lidarsim.base.errors import LidarError
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.input_files import open_input
-from lidarsim.base.sampling import even_indices
 from lidarsim.base.storage import Storage, target_of
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudDisplay
 from lidarsim.columns.part_columns import PartColumns, positions_of

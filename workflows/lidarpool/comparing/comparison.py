@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm, Normalize
 
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import explained
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural

@@ -13,7 +13,7 @@ from pydantic import Field
 from lidarsim._version import __version__
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural

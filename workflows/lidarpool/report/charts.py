@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lidarsim.base.arrays import Bools, Floats, Indices
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import plural, shortened
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme

@@ -22,7 +22,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.ply import GrowingPly, real_type
 from ..columns.parts import StoredCloud, read_part
-from ..run.pipeline.messages import Receipt
+from ..run.pipeline.stage_messages import Receipt
 from ..run.store.job_under_way import JobUnderWay
 from .cloud_counts import CloudCounts
 

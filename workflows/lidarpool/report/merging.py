@@ -32,7 +32,7 @@ from ..plan import Trial
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.pipeline.committed_job import CommittedJob
-from ..run.pipeline.messages import Receipt
+from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun, RunResult

@@ -29,7 +29,7 @@ from ..clouds.format_table import FORMATS, FormatRow, plugin_rows
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import Format, refuse_strangers
 from ..columns.parts import StoredCloud
-from ..run.pipeline.messages import Receipt
+from ..run.pipeline.stage_messages import Receipt
 from ..run.run_result import RunResult
 from ..run.runner import Output, Run
 from ..run.writer import LidarWorkers

@@ -24,10 +24,10 @@ from lidarsim.survey.survey import CloudOptions, Survey
 
 from ..plan.planning import Search
 from ..run.job_source import fields_of
-from ..run.pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
+from ..run.planning_trials import TRIAL
 from ..run.run_result import RunResult
-from ..run.trials import TRIAL
 from .cloud_counts import CloudCounts
 
 ELEVATION_RAYS = 20_000  # whose elevations are examined

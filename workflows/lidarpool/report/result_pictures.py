@@ -18,7 +18,7 @@ from matplotlib.patheffects import withStroke
 
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.vocabulary import PICTURES
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.writing_progress import WritingProgress

@@ -21,7 +21,7 @@ from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFORMATION
 
-from .pipeline.names import GPU, LIDAR, OTHER
+from .pipeline.stage_names import GPU, LIDAR, OTHER
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends after this time
 # without tasks.

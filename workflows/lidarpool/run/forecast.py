@@ -41,8 +41,8 @@ from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from .cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from .cluster.connection import default_workers
 from .options import RunOptions
-from .pipeline.names import GPU, LIDAR, OTHER
 from .pipeline.policies import max_scans_per_batch
+from .pipeline.stage_names import GPU, LIDAR, OTHER
 from .store.database import FILE
 from .store.run_store import RUN_FOLDER
 

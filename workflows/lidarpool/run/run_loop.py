@@ -30,15 +30,15 @@ from .job_source import JobMaker, failed_row
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
-from .pipeline.messages import Receipt, ScanFrame
-from .pipeline.names import GPU, LIDAR, OTHER
 from .pipeline.pipeline import Pipeline
+from .pipeline.stage_messages import Receipt, ScanFrame
+from .pipeline.stage_names import GPU, LIDAR, OTHER
 from .pipeline.task_book import StageTotals
+from .planning_trials import TrialPump
 from .progress import Progress, Show
 from .run_page import RunPage
 from .store.job_under_way import JobUnderWay
 from .store.run_store import RunStore
-from .trials import TrialPump
 from .writer import JobFiles, JobWriter
 
 PROGRESS_EVERY_S = 0.1

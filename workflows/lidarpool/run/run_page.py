@@ -10,7 +10,7 @@ from poolpart import Partition
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from .pipeline.messages import Receipt, ScanFrame
+from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Progress
 from .run_result import RunResult
 from .store.job_under_way import JobUnderWay

@@ -39,7 +39,7 @@ from .cluster.cluster import Cluster, start_local
 from .cluster.connection import StartedAhead
 from .job_source import JobMaker, Jobs
 from .options import RunOptions
-from .pipeline.messages import Receipt, ScanFrame
+from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Screen
 from .run_loop import Listeners, RunLoop
 from .run_page import RunPage

@@ -47,9 +47,9 @@ from .options import RunOptions
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.dispatch import Dispatcher
 from .pipeline.failures import JobError
-from .pipeline.messages import CollectOrder, ColumnsLost, Receipt
-from .pipeline.names import GPU
 from .pipeline.pipeline_job import PipelineJob
+from .pipeline.stage_messages import CollectOrder, ColumnsLost, Receipt
+from .pipeline.stage_names import GPU
 from .progress import Screen
 
 LONGEST_PAUSE_S = 0.02  # while nothing moves

@@ -29,7 +29,7 @@ from .cluster.cluster import Cluster
 from .cluster.tasks import Tasks
 from .pipeline.casting_workers import share
 from .pipeline.failures import JobError, raise_if_failed, was_killed
-from .pipeline.names import EXPORT, LIDAR
+from .pipeline.stage_names import EXPORT, LIDAR
 from .pipeline.task_records import Recorder, TaskRecord
 from .run_result import RunResult
 from .store.run_store import RunStore

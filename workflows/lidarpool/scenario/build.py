@@ -44,9 +44,9 @@ from ..clouds.writing import Format
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
+from .default_poses import Placing, place_sensor
 from .ground import StandingSurfaces
 from .osi_traffic import OSI_SUFFIXES, read_osi
-from .placing import Placing, place_sensor
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
 from .static_scene import Findings, SceneCache, Shapes, read_static_scene

@@ -18,7 +18,7 @@ from pydantic_core import to_json
 
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.input_files import open_input
-from lidarsim.base.sections import dotted
+from lidarsim.base.section_fields import dotted
 from lidarsim.base.textfile import read_text
 from lidarsim.base.value_texts import shown
 from lidarsim.base.words import plural

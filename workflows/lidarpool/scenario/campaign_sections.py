@@ -46,7 +46,7 @@ from lidarsim.base.declared import (
 from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes, message_of
 from lidarsim.base.input_files import not_found, read_input_text
-from lidarsim.base.sections import sections_in
+from lidarsim.base.section_fields import sections_in
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields

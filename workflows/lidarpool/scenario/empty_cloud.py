@@ -13,7 +13,7 @@ from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
 
 from ..datasets.job_table import JobRow
-from .placing import seen_from
+from .default_poses import seen_from
 
 EMPTY = "the cloud has no points"
 NO_POINTS = "no points: "  # before the names of jobs

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.field_advice import owner_of_file, owners_by_level
-from lidarsim.base.sections import fields_by_name, fields_of, is_section, sections_in
+from lidarsim.base.section_fields import fields_by_name, fields_of, is_section, sections_in
 from lidarsim.base.words import did_you_mean, plural, shortened
 
 from .scenario import Scenario

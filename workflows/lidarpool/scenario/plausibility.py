@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import as_scenario, printable
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses, velocities
@@ -21,7 +21,7 @@ from lidarsim.simulator.casting.visibility import static_key, unseen_objects, wi
 from lidarsim.survey.survey import Survey
 
 from .build import Built
-from .placing import seen_from, surroundings_of
+from .default_poses import seen_from, surroundings_of
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars

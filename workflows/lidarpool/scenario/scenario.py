@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -16,6 +16,7 @@ from lidarsim.base.declared import Several, Text, about, by_text
 from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.input_files import not_found
+from lidarsim.base.section_fields import FieldPath, dotted, fields_of, is_section
 from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLOURS
 from lidarsim.media.materials import ClassNames, Material
@@ -29,7 +30,6 @@ from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
 from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrajectoryEntry
-from .named_files import field_that_names
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -46,6 +46,8 @@ from .sections import (
     scene_in_short,
 )
 from .traffic import TrafficSection
+
+_NAMING_FILES = {"file", "calibration", "model", "times"}  # fields whose texts name files
 
 # Options of a mesh file without a scenario, and the fields of a scenario for them.
 MESH_OPTIONS = {
@@ -371,7 +373,7 @@ class Scenario(Section):
 
         Empty for the mesh file of a survey without a scenario, and if no field names the file.
         """
-        field = field_that_names(self, lambda text: self.path(text) == file)
+        field = _field_that_names(self, lambda text: self.path(text) == file)
         return f"{self._source}: {field}: " if field and self._source != survey_of(file) else ""
 
     @contextmanager
@@ -435,3 +437,39 @@ def _is_contradictory(content: Any) -> bool:
         return any(Scenario.model_validate(content)._contradictions())
     except ValidationError:  # another fault
         return False
+
+
+def _field_that_names(section: Any, is_file: Callable[[str], bool]) -> str:
+    """Return the path of the first field whose text is the name of a file, or an empty string.
+
+    Parameters
+    ----------
+    section
+        The section in which fields are searched, also in sections within it.
+    is_file
+        Returns True for a text that names the file.
+
+    Returns
+    -------
+    Such as ``scene.files[0].file``.
+    """
+    for path, text in _texts(section):
+        if path[-1] in _NAMING_FILES and is_file(text):
+            return dotted(path)
+    return ""
+
+
+def _texts(node: Any, path: FieldPath = ()) -> Iterator[tuple[FieldPath, str]]:
+    """Yield the texts in a section, a list or a mapping, each with its path."""
+    entries: Any = ()
+    if isinstance(node, str):
+        yield path, node
+    elif is_section(type(node)):
+        fields = fields_of(type(node)).items()
+        entries = ((field.alias or name, getattr(node, name, None)) for name, field in fields)
+    elif isinstance(node, Mapping):
+        entries = node.items()
+    elif isinstance(node, (tuple, list)):
+        entries = enumerate(node)
+    for key, value in entries:
+        yield from _texts(value, (*path, key))

@@ -11,10 +11,10 @@ from typing import Any
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema, JsonRef
 
-from lidarsim.base.sections import fields_of, is_section, kinds_of
+from lidarsim.base.section_fields import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
-from .placing import on_one_line
+from .default_poses import on_one_line
 from .scenario import Scenario
 from .sections import Section
 

@@ -39,7 +39,7 @@ from lidarsim.base.declared import (
     short,
 )
 from lidarsim.base.errors import LidarError
-from lidarsim.base.sections import fields_of
+from lidarsim.base.section_fields import fields_of
 from lidarsim.base.validation import STRICT
 from lidarsim.base.vocabulary import BACKENDS
 from lidarsim.media.materials import SemanticClass

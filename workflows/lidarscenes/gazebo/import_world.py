@@ -21,7 +21,7 @@ from lidarsim.scene.object_names import unique_names
 from ..writers.lidar_scenario import write_scenario
 from .frames import numbers_of
 from .lidars import lidars_of, unknown_sensors
-from .visibility import ALL_BITS, flags_of
+from .visibility_flags import ALL_BITS, flags_of
 from .world import GazeboOptions, World, content_of, load_world
 
 

@@ -17,7 +17,7 @@ from ..writers.lidar_scenario import Lidar, clean
 from .bodies import scoped
 from .frames import numbers_in, numbers_of, pose_of
 from .notes import unknown_children
-from .visibility import LIDARS, figures_of, lidar_elements, mask_of
+from .visibility_flags import LIDARS, figures_of, lidar_elements, mask_of
 from .world import PlacedLink, World
 
 _COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes

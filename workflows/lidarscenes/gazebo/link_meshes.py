@@ -30,8 +30,8 @@ from .bodies import Body, Link
 from .frames import numbers_of, pose_of
 from .notes import Notes
 from .resources import MissingFileError, Resources, Source
-from .shapes import height_map_mesh, polyline_mesh, shape_mesh
-from .visibility import ALL_BITS, flags_of
+from .sdf_shapes import height_map_mesh, polyline_mesh, shape_mesh
+from .visibility_flags import ALL_BITS, flags_of
 
 # Formats that Gazebo reads; worlds would be read without end.
 MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")

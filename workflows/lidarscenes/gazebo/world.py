@@ -8,7 +8,7 @@ Gazebo alone.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -33,18 +33,19 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..files.lenient_xml import lenient_root
-from .actors import actors_of
 from .appearance import appearance_of
 from .bodies import Body, BodyReader, Instance, Link, scoped
+from .frames import matrix_of, numbers_of
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Resources, Source
-from .shapes import road_mesh
-from .state import NO_SCALE, State, state_of
-from .visibility import ALL_BITS, masks_of
+from .sdf_shapes import road_mesh
+from .visibility_flags import ALL_BITS, masks_of
+from .waypoint_actors import actors_of
 
 _ADVICE = "simplify its meshes, or export them in parts"
 _OLD_ROOT = "gazebo"  # of Gazebo before 1.9
+_NO_SCALE = (1.0, 1.0, 1.0)
 
 
 # A model that is farther along x, y or z from the origin of its world has fallen, or physics has
@@ -74,6 +75,19 @@ class PlacedLink(NamedTuple):
     scale: tuple[float, ...]
 
 
+@dataclass
+class _State:
+    """The <state> of a world of Gazebo classic: poses that replace the poses of the models.
+
+    Poses are in world coordinates by the names of models and links, MODEL::LINK.
+    """
+
+    poses: dict[str, Floats] = field(default_factory=dict)  # (4, 4)
+    scales: dict[str, tuple[float, ...]] = field(default_factory=dict)  # of models
+    inserted: list[Element] = field(default_factory=list)  # models
+    deleted: set[str] = field(default_factory=set)  # names of models
+
+
 @dataclass(eq=False)
 class World:
     """A world, or a file of models, with the links of all models."""
@@ -81,7 +95,7 @@ class World:
     element: Element
     source: Source
     body: Body
-    state: State
+    state: _State
     resources: Resources
     notes: Notes
     allowance: Allowance
@@ -114,7 +128,7 @@ class World:
                 matrix = matmul(outer_matrix, matrix)
             matrix = state.poses.get(scoped(path), matrix)
             outermost = matrix if outermost is None else outermost
-            scale = state.scales.get(path[0], NO_SCALE)
+            scale = state.scales.get(path[0], _NO_SCALE)
             for link in instance.body.links:
                 with prefixed(f"model {scoped(path)[:80]!r}, link {link.name!r}"):
                     in_model = instance.body.frames.matrix(link.name)
@@ -202,7 +216,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     allowance = Allowance(len(data), _ADVICE)
     resources = Resources.of_world(path, folders[1:])
     element = _world_element(root, notes)
-    state = state_of(element)
+    state = _state_of(element)
     for model in state.inserted:
         element.append(model)
     body = BodyReader(resources, notes, allowance).world(element, resources.world)
@@ -236,3 +250,36 @@ def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
                 mesh = meshes.painted(mesh, appearance_of(road, 0.0))
                 matrix = world.body.frames.matrix(world.body.frames.root)
                 yield PlacedNode(replace(mesh, name=name), matrix, name)
+
+
+def _state_of(world: Element) -> _State:
+    """Return the last state of a world; an empty state without <state>."""
+    state = _State()
+    elements = world.findall("state")
+    if not elements:
+        return state
+    element = elements[-1]
+    state.inserted = element.findall("insertions/model")
+    state.deleted = {printable(name.text or "") for name in element.findall("deletions/name")}
+    for path, entry in _state_entries(element, ()):
+        name = scoped(path)
+        with prefixed(f"state of {name[:80]!r}"):
+            pose = entry.find("pose")
+            if pose is not None and (pose.text or "").strip():
+                state.poses[name] = matrix_of(pose)
+            if entry.tag == "model":
+                scale = tuple(numbers_of(entry, "scale", 3, "1 1 1").tolist())
+                if scale != _NO_SCALE:
+                    state.scales[name] = scale
+    return state
+
+
+def _state_entries(
+    element: Element, path: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], Element]]:
+    """Yield the models and links in a state, with their names."""
+    for child in element:
+        if child.tag in ("model", "link"):
+            inner = (*path, printable(child.get("name", "")))
+            yield inner, child
+            yield from _state_entries(child, inner)

@@ -25,9 +25,7 @@ from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
 from .files import Assets, clean, number, rotation, vector
-from .scanner_xml import Device, channels, device, unsupported_features
-from .scene_xml import HeliosScene, SurfelMaker
-from .trajectory import (
+from .legs import (
     HeliosTrajectory,
     Leg,
     Stretch,
@@ -36,6 +34,8 @@ from .trajectory import (
     read_trajectory,
     standing_trajectory,
 )
+from .scanner_xml import Device, channels, device, unsupported_features
+from .scene_xml import HeliosScene, SurfelMaker
 
 SCENARIO_FILE = "scenario.yaml"
 # Carriers look along x, the platforms of HELIOS++ along y.

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
 
+from .cross_sections import Stations
 from .elements import number
-from .stations import Stations
 
 
 class Cubics:

@@ -19,10 +19,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-from .cubics import NOTHING, Cubics
-from .elements import MAX_SHOWN, UnreadElements, number
-from .road import Frames, Network, Road
-from .stations import (
+from .cross_sections import (
     GAP_M,
     HEIGHT_SHARE,
     SAMPLES,
@@ -34,6 +31,9 @@ from .stations import (
     has_extent,
     placed_stations,
 )
+from .cubics import NOTHING, Cubics
+from .elements import MAX_SHOWN, UnreadElements, number
+from .road import Frames, Network, Road
 
 _ACROSS_SHARE = 0.3  # of the tolerance of heights, for cross sections that are curved
 _KERB_M = 1e-3  # least height of a kerb

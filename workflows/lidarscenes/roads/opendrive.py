@@ -34,9 +34,9 @@ from lidarsim.scene.scene_mesh import SceneMesh
 
 from .elements import UnreadElements, number
 from .lanes import Lane, SectionSurface, lane_sections, section_surfaces
-from .materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
 from .road import Network, Road
 from .road_marks import painted_quads
+from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 

@@ -19,10 +19,10 @@ from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import length
 from lidarsim.scene.files.scene_graph import MeshFileError
 
+from .cross_sections import GAP_M, Intervals, Stations
 from .cubics import Cubics
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .plan_view import PlanTable
-from .stations import GAP_M, Intervals, Stations
 
 _STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
 MAX_ROAD_M = 1e7  # longest road

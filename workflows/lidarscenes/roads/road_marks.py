@@ -11,9 +11,9 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 
+from .cross_sections import GAP_M
 from .elements import UnreadElements, number, positive
 from .lanes import Lane, SectionSurface
-from .stations import GAP_M
 
 LIFT_M = 0.003  # of marks above the road: thickness of thermoplastic marks
 DASH_M = 3.0  # dashes of broken marks that state no lengths

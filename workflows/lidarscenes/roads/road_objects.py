@@ -15,11 +15,20 @@ from lidarsim.base.elementary import arctan2
 from lidarsim.base.vectors import length
 from lidarsim.scene.files.scene_graph import Piece
 
+from .cross_sections import (
+    HEIGHT_SHARE,
+    Intervals,
+    SampledSurface,
+    Samples,
+    Stations,
+    has_extent,
+    placed_stations,
+)
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .lanes import LaneSection
-from .materials import CONCRETE, PAINT, material_of_object
 from .road import Frames, Network, Road
 from .road_marks import LIFT_M
+from .road_materials import CONCRETE, PAINT, material_of_object
 from .solids import (
     box,
     cylinder,
@@ -30,15 +39,6 @@ from .solids import (
     prism,
     rotation,
     zebra,
-)
-from .stations import (
-    HEIGHT_SHARE,
-    Intervals,
-    SampledSurface,
-    Samples,
-    Stations,
-    has_extent,
-    placed_stations,
 )
 
 TUNNEL_HEIGHT_M = 5.0

@@ -12,12 +12,12 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import arctan2
 from lidarsim.scene.files.scene_graph import Piece
 
+from .cross_sections import Stations
 from .elements import MAX_SHOWN, UnreadElements, number, positive
 from .lanes import LaneSection
-from .materials import CARRIAGEWAY, LAMP, METAL, SIGN
 from .road import Network, Road
+from .road_materials import CARRIAGEWAY, LAMP, METAL, SIGN
 from .solids import FRONT_FACES, box, cylinder, rotation
-from .stations import Stations
 
 SIZE_M = 0.6  # width and height of signs that state no size
 LIGHT_M = (0.3, 0.9)  # width and height of traffic lights that state no size

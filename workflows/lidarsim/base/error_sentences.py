@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails, ValidationError
 
 from .errors import Mistakes
 from .field_advice import Contradictory, list_advice, name_advice, place_advice
-from .sections import FieldPath, Fields, classes_in, dotted, fields_by_name, limits_of
+from .section_fields import FieldPath, Fields, classes_in, dotted, fields_by_name, limits_of
 from .value_texts import shown, with_article
 from .words import did_you_mean, listed, plural
 

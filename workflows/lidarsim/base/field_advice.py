@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args, get_origin
 from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
-from .sections import FieldPath, classes_in, fields_by_name, is_section
+from .section_fields import FieldPath, classes_in, fields_by_name, is_section
 from .words import did_you_mean, joined
 
 # Returns True for the content of a file whose fields contradict each other.

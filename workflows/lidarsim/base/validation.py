@@ -37,7 +37,7 @@ from pydantic_core import PydanticKnownError, SchemaValidator, ValidationError, 
 from .arrays import AnyArray
 from .error_sentences import argument_error
 from .errors import LidarError
-from .sections import LIMITS, limits_of
+from .section_fields import LIMITS, limits_of
 from .signatures import ReadableSignature, readable
 from .value_texts import one_line, shown
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import AnyArray, AnyFloats, Ints, Records
-from ..base.sampling import even_indices
+from ..base.even_samples import even_indices
 from .cloud import CHUNK_POINTS, Cloud
 from .ply_format import AXES, mapped_rows
 from .table import TABLE, Column

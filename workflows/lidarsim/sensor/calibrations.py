@@ -17,12 +17,12 @@ from ..base.errors import LidarError, message_of
 from ..base.textfile import read_text
 from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
+from ..sensor_files.comma_rows import rows_of
 from ..sensor_files.fired_rays import FiredRays
 from ..sensor_files.format_table import read_rays
 from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
-from ..sensor_files.text_rows import rows_of
 from .beams import Beams
 
 # Errors of files that users write.

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ..base.textfile import read_text
+from .comma_rows import rows_of
+from .complete_files import write_text_of
 from .fired_rays import FiredRays, directions_of
-from .text_rows import rows_of
-from .writing import write_text_of
 
 HEADER = "Time/s,Azimuth/deg,Zenith/deg"
 _DECIMALS = 9

@@ -13,8 +13,8 @@ from xml.sax.saxutils import quoteattr
 
 from ..base.arrays import Floats
 from ..base.errors import LidarError
+from .complete_files import remark, write_text_of
 from .fired_rays import AXES, FiredRays
-from .writing import remark, write_text_of
 
 MAX_SITES = 10_000  # MuJoCo casts the rangefinders of each step one by one
 

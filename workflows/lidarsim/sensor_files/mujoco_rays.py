@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from .complete_files import write_bytes_of
 from .fired_rays import FiredRays
 from .ray_header import TIME_COLUMN, check_names, columns_of, header_of, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
-from .writing import write_bytes_of
 
 _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 

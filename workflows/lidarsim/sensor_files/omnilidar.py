@@ -17,8 +17,8 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Ints
 from ..base.errors import LidarError
+from .complete_files import write_text_of
 from .fired_rays import AXES, FiredRays
-from .writing import write_text_of
 
 CORE = "omni:sensor:Core:"
 STATE = f"{CORE}emitterState:"

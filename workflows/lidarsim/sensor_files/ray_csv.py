@@ -13,9 +13,9 @@ import numpy as np
 from ..base.tables import DEGREES, METRES, NUMBERS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.time_units import SECONDS
+from .complete_files import write_text_of
 from .fired_rays import FiredRays
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
-from .writing import write_text_of
 
 _DECIMALS = 9  # of angles; directions have all digits
 _TIMES = ("time", "t", "time offset", "offset", "timestamp", "stamp", "fire time")

@@ -12,9 +12,9 @@ import numpy as np
 
 from ..base.allowance import Allowance
 from ..base.input_files import check_input
+from .complete_files import write_bytes_of
 from .fired_rays import FiredRays
 from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
-from .writing import write_bytes_of
 
 HEADER = "header"
 

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 
 from ..base.errors import message_of
 from ..base.input_files import open_input
+from .complete_files import write_bytes_of
 from .fired_rays import FiredRays
 from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
-from .writing import write_bytes_of
 
 _HEADER = b"lidarpool"
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import Floats
+from .complete_files import write_bytes_of
 from .fired_rays import AXES, FiredRays
 from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
-from .writing import write_bytes_of
 
 _NAMES = ("rays", "ring_ids", "time_offsets", "ranges")
 _STEEP = 0.9  # z component above which a ray is taken as vertical

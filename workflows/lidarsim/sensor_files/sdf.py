@@ -15,8 +15,8 @@ import numpy as np
 
 from ..base.arrays import Floats, Ints
 from ..base.errors import LidarError
+from .complete_files import remark, write_text_of
 from .fired_rays import AXES, FiredRays
-from .writing import remark, write_text_of
 
 _SLACK_DEG = 1e-4  # from the even spacing
 _SAME_DEG = 1e-6  # angles nearer than this are equal

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import AnyArray
+from .complete_files import write_text_of
 from .fired_rays import AXES, FiredRays
-from .writing import write_text_of
 
 _WIDTH = 96  # letters of a line of packed numbers
 

@@ -13,7 +13,7 @@ from ..scene.scene import Scene
 from ..sensor.optics import TWO_RETURNS
 from ..survey.survey import Survey
 from .casting.visibility import static_key, unseen_objects
-from .points.device import needs_hits
+from .points.device_columns import needs_hits
 from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
 from .steps.step import Memory, Setup, Sizes

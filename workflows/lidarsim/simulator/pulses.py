@@ -40,7 +40,7 @@ class Scanned(NamedTuple):
 
     returns: PulseReturns
     hits: Ints  # (scans,): returns of each scan, kept or not
-    tally: Ints | None  # (counters,): hits by `Surfaces.counter`, kept or not, on request
+    tally: Ints | None  # (counters,): hits by `StoredTriangles.counter`, kept or not, on request
 
 
 class PulseCaster:
@@ -99,7 +99,7 @@ class PulseCaster:
         firings
             Firings of the beams.
         tally
-            Whether returns from surfaces are counted by `Surfaces.counter`.
+            Whether returns from surfaces are counted by `StoredTriangles.counter`.
         """
         first_row = window[0]
         beam_count = window[1] - window[0]
@@ -144,7 +144,7 @@ class PulseCaster:
         tally = scanned.tally
         if tally is not None:
             triangle = returns.triangle[removed]
-            counter = self._surfaces.counter(triangle[triangle != NO_SURFACE])
+            counter = self._surfaces.triangles.counter(triangle[triangle != NO_SURFACE])
             tally = tally - np.bincount(counter, minlength=len(tally))
         start = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
         stop = np.searchsorted(returns.ray, returns.ray, "right")
@@ -242,7 +242,5 @@ class PulseCaster:
         )
         if not tally:
             return Scanned(thinned, hits, None)
-        surfaces = self._surfaces
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
-        tally_counts = np.bincount(surfaces.counter(triangle), minlength=surfaces.counters)
-        return Scanned(thinned, hits, tally_counts)
+        return Scanned(thinned, hits, self._surfaces.triangles.count(triangle))

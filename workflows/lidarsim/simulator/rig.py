@@ -24,7 +24,7 @@ from .casting.motion import CastPoses, Clock, Firings, check_trajectory, poses_o
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
 from .casting.surfaces import Surfaces
 from .points.batch_points import BatchPoints
-from .points.device import DeviceColumns, DevicePoints
+from .points.device_columns import DeviceColumns, DevicePoints
 from .pulses import PulseCaster
 from .returns import required
 

@@ -12,7 +12,7 @@ from raybeam import available_backends
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import declared
-from ..base.sampling import even_indices
+from ..base.even_samples import even_indices
 from ..media.weather import Weather
 from ..scene.scene import Scene
 from ..sensor import Noise, Returns, Sensor

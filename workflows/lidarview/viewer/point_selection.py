@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, AnyFloats, Bools, Floats, Ints
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES

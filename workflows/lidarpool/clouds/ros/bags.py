@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
+from lidarsim.base.errors import LidarError
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -31,12 +32,13 @@ from lidarsim.columns.bags import (
     point_columns,
 )
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.motion.bag_trajectories import read_bag
+from lidarsim.motion.trajectory import Track
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
 
 from .. import sweep_reader
-from ..frames import survey_start_ns
+from ..frame_names import survey_start_ns
 from ..recording import Read, Recording, RecordingSource, positions_of
-from .bag_poses import sweep_poses
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
 from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topic
 
@@ -45,6 +47,7 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
 )  # fmt: skip
+_MAX_DISTANCE_NS = 2e8  # from a sweep to the nearest pose, before the first and after the last
 
 
 def write_rosbag2(
@@ -217,7 +220,7 @@ def open_file(source: RecordingSource) -> Recording:
         return (time for _, time, _ in messages())
 
     def frame_poses() -> Floats | None:
-        return sweep_poses(source.path, (data for _, _, data in messages()))
+        return _sweep_poses(source.path, (data for _, _, data in messages()))
 
     return source.stream(
         messages,
@@ -231,3 +234,35 @@ def open_file(source: RecordingSource) -> Recording:
 def open_folder(source: RecordingSource) -> Recording:
     """Open the folder of a bag of ROS 2."""
     return open_file(source)
+
+
+def _header_of(data: bytes) -> tuple[int, str]:
+    """Return the stamp, ns, and the frame of a message that begins with a header of ROS 2."""
+    order = "<u4" if data[1] & 1 else ">u4"
+    seconds, nanoseconds, length = np.frombuffer(data, order, 3, 4).tolist()
+    return seconds * 10**9 + nanoseconds, bytes(data[16 : 15 + length]).decode(errors="replace")
+
+
+def _sweep_poses(path: Path, messages: Iterable[bytes]) -> Floats | None:
+    """Return the poses (n, 4, 4) of the frame of sweeps in the root of its tree of frames.
+
+    `messages` are the sweeps of a sensor. None if the bag has no poses of the frame at the
+    times of all sweeps.
+    """
+    headers = [_header_of(message) for message in messages]
+    frames = {frame.lstrip("/") for _, frame in headers}
+    if len(frames) != 1:
+        return None
+    try:
+        seconds, positions, quaternions = read_bag(path, f"/tf:{frames.pop()}", None)
+    except LidarError:  # no frame of this name, or a frame that stands still
+        return None
+    times_ns = 1e9 * (seconds - seconds[0])
+    stamps_ns = np.array([stamp for stamp, _ in headers]) - 1e9 * seconds[0]
+    within_ns = stamps_ns.clip(times_ns[0], times_ns[-1])
+    if np.abs(stamps_ns - within_ns).max() > _MAX_DISTANCE_NS:
+        return None
+    track = Track(seconds - seconds[0], positions, quaternions)
+    poses = np.tile(np.eye(4), (len(headers), 1, 1))
+    poses[:, :3, 3], poses[:, :3, :3] = track.poses(0, within_ns)
+    return poses

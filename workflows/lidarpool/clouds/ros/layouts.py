@@ -18,7 +18,7 @@ from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..frames import survey_start_ns
+from ..frame_names import survey_start_ns
 
 # Types of returns of Autoware's sensor drivers.
 UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)

@@ -19,7 +19,7 @@ from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 from ..boxes import Boxes
-from ..frames import CARRIER, INSTRUMENTS, WORLD, frame_names, points_topic, survey_start_ns
+from ..frame_names import CARRIER, INSTRUMENTS, WORLD, frame_names, points_topic, survey_start_ns
 from ..laser_scan import ScanRays
 from .layouts import LaidOut, message_stamp_ns, point_rows, sensor_traits, since_stamp_ns
 from .livox import CUSTOM_DEFINITION, CUSTOM_MSG, check_lines, custom_message

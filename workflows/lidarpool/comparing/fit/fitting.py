@@ -35,9 +35,9 @@ from .charts import draw_charts
 from .estimates import Estimate
 from .known_poses import KnownPoses
 from .measured import Measured, measure_moving, measure_standing
-from .motion import moving_message
 from .performance import has_frontal_rays
 from .stack import SweepStack, check_sweeps
+from .standstill import moving_message
 
 _RANGE_NOISE_FIELDS = ("range_m", "range_per_m", "range_at_threshold_m")
 _MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not one of its beams

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import plural
 from lidarsim.motion.rotations import check_rotations
 from lidarsim.motion.trajectory import Pose, pose_of
@@ -20,7 +20,7 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ...clouds.recording import FiredPoints, Recording
-from .motion import Speed, sweep_period_ns
+from .standstill import Speed, sweep_period_ns
 
 _MAX_SWEEPS = 64  # whose poses are read
 # Poses of a sensor that stands differ by less: exact poses, and those of a localization.

@@ -17,12 +17,10 @@ from lidarsim.simulator import Scanner
 from ...clouds.recording import Recording
 from .estimates import MIN_RAYS, Estimate
 from .known_poses import KnownPoses
-from .motion import read_static
+from .moving_pulses import Pulses, measure_pulses
 from .performance import alarm_share, fit_performance
-from .pulses import Pulses, measure_pulses
 from .ring_bias import ring_bias
-from .stack import SweepStack, finite_median
-from .surfaces import (
+from .smooth_surfaces import (
     ASSUMED_DIRECTION_NOISE_RAD,
     FLAT_TANGENT,
     SCENE_TOLERANCE_M,
@@ -30,6 +28,8 @@ from .surfaces import (
     find_surfaces,
     select_smooth_rays,
 )
+from .stack import SweepStack, finite_median
+from .standstill import read_static
 
 _CURVE_POINTS = 14  # points of a curve at most
 _MIN_SCENE_SHARE = 0.5  # share of rays that must be within `SCENE_TOLERANCE_M` of the scene

@@ -11,8 +11,8 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 
 from .estimates import MIN_RAYS, Estimate, sandwich
+from .smooth_surfaces import MIN_RETURN_SHARE, SmoothRays
 from .stack import SweepStack
-from .surfaces import MIN_RETURN_SHARE, SmoothRays
 
 # chances of a variance above which a ray is left out: outliers only, and the upper tail
 _OUTLIER_CHANCE = 1e-4

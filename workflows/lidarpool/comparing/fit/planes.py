@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 
 from .estimates import MIN_RAYS, sandwich
 from .sight import Evidence, RigidMotion, count_objects
+from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfaces
 from .stack import SweepStack, finite_median
-from .surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfaces
 
 SWEEP_PAIRS = 8  # pairs of sweeps that are compared
 ARM_M = 10.0  # distance at which rotations are expressed in metres

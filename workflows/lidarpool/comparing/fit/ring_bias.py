@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Indices, Ints
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 
 from ...base.open3d_module import load_open3d
 from .estimates import Estimate, sandwich
-from .surfaces import SmoothRays
+from .smooth_surfaces import SmoothRays
 
 _MAX_PLANES = 8
 _PLANE_TOLERANCE_M = 0.05

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 
 from .stack import SweepStack
 

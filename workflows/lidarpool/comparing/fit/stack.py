@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 
 from ...clouds.recording import RecordedPoints, Recording
 from ..range_image import RangeImages, range_images

@@ -23,7 +23,7 @@ from PIL import Image
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import explained
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import natural, plural, shortened, without_common_prefix
 from lidarsim.media.weather import Weather

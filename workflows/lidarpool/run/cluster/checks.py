@@ -25,7 +25,7 @@ from ...clouds.writing import Format
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
-from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2

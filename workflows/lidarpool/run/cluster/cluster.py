@@ -18,7 +18,7 @@ from poolpart.task_context import own_client
 from ...base import timeline
 from ...scenario.build import Job
 from ..options import RunOptions
-from ..pipeline.names import GPU, LIDAR, OTHER
+from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
 from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed

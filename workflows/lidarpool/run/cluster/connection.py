@@ -35,7 +35,7 @@ from poolpart.rules import check_count
 from ...base.fork_server import start_fork_server
 from ...base.tls_files import TlsFiles
 from ..cluster_file import ClusterFile
-from ..pipeline.names import GPU, LIDAR, OTHER
+from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .watch import Waiting
 

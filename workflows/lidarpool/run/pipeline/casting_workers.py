@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
+from enum import Enum, auto
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -27,9 +28,9 @@ from ...base.shared_memory import Pickled, SharedHandle, SharedValue
 from ...base.software import difference, software_query
 from .batches import Outcome
 from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
-from .messages import BatchRange
-from .names import INTERSECT
 from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
+from .stage_messages import BatchRange
+from .stage_names import INTERSECT
 
 LOOK_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
@@ -68,6 +69,26 @@ class _Payload:
             self.future.release()
 
 
+class WorkerState(Enum):
+    """How far a worker has come; a worker that leaves is forgotten, unless it was refused."""
+
+    CHECKING = auto()  # a task on the worker asks for its software
+    CASTING = auto()  # it may cast
+    REFUSED = auto()  # other software, or a lost GPU: it gets no task of this run
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A worker that the run knows, by its address."""
+
+    # The task that checks it. Its answer is not kept on the worker: a worker with a result cannot
+    # be returned to the queue.
+    check: Future | None
+    state: WorkerState = WorkerState.CHECKING
+    slots: int = 0  # casting tasks at a time
+    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
+
+
 class CastingWorkers:
     """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
 
@@ -95,12 +116,7 @@ class CastingWorkers:
         # {ids of the fields of a scene: its static part}, last used last. `_Payload.make` holds the
         # scene, so that the ids stay valid.
         self._scenes: dict[tuple[int, ...], _Payload] = {}
-        self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
-        self._setups: dict[str, Future] = {}  # {address: task that is checking the worker}
-        # {address of a worker that may cast: tasks at a time}. The answers are not kept on the
-        # workers: one with a result cannot be returned to the queue.
-        self._checked: dict[str, int] = {}
-        self._refused: dict[str, str] = {}  # {address: reason of refusal}
+        self._workers: dict[str, _Worker] = {}  # {address: worker}
         self._name_count = 0  # names and keys so far
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
         self._died: list[str] = []  # workers that died while they were checked, in a row
@@ -114,7 +130,8 @@ class CastingWorkers:
     @property
     def slots(self) -> dict[str, int]:
         """Workers that were checked and take tasks, {address: tasks at a time}."""
-        return {a: slots for a, slots in self._checked.items() if a in self.locations.free}
+        casting = self._in_state(WorkerState.CASTING)
+        return {a: worker.slots for a, worker in casting.items() if a in self.locations.free}
 
     @property
     def slot_count(self) -> int:
@@ -125,7 +142,16 @@ class CastingWorkers:
     def futures(self) -> list[Future]:
         """Futures of all casting tasks, checks of workers and shared payloads."""
         shared = [payload.future for payload in self._payloads if payload.future is not None]
-        return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *shared]
+        return [*(cast for cast, _ in self._casts.values()), *self._checks.values(), *shared]
+
+    def _in_state(self, state: WorkerState) -> dict[str, _Worker]:
+        """Return the workers in a state, {address: worker}."""
+        return {a: worker for a, worker in self._workers.items() if worker.state is state}
+
+    @property
+    def _checks(self) -> dict[str, Future]:
+        """Tasks that are checking workers, {address: task}."""
+        return {a: worker.check for a, worker in self._workers.items() if worker.check is not None}
 
     @property
     def _payloads(self) -> list[_Payload]:
@@ -135,7 +161,7 @@ class CastingWorkers:
     def pending(self) -> list[str]:
         """Keys of the tasks that have not ended."""
         casts = [key for key, (future, _) in self._casts.items() if future.status == "pending"]
-        return casts + [future.key for future in self._setups.values()]
+        return casts + [check.key for check in self._checks.values()]
 
     # -- jobs ------------------------------------------------------------------------------
 
@@ -173,8 +199,8 @@ class CastingWorkers:
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for payload in old:
             payload.release()
-            for address in payload.recipients & self._checked.keys():
-                self._unneeded.setdefault(address, []).append(payload.name)
+            for address in payload.recipients & self._in_state(WorkerState.CASTING).keys():
+                self._workers[address].unneeded.append(payload.name)
 
     def _payload(self, label: str, make: Callable[[], object]) -> _Payload:
         self._name_count += 1
@@ -230,7 +256,10 @@ class CastingWorkers:
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         self._name_count += 1
         key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._name_count}"
-        unneeded = self._unneeded.pop(worker, [])
+        unneeded = []
+        if worker in self._workers:
+            unneeded = self._workers[worker].unneeded
+            self._workers[worker].unneeded = []
         future = self._partition.submit(
             intersect, works, unneeded, *arguments, key=key, workers=worker
         )
@@ -274,8 +303,8 @@ class CastingWorkers:
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
-        self._checked.pop(worker, None)  # until its process ends; the next has another address
-        self._refused[worker] = "its GPU answers no call any more"
+        # Until its process ends; the next has another address.
+        self._workers[worker] = _Worker(None, WorkerState.REFUSED)
         self.notes.append(f"The GPU of {worker} answered no call any more ({error}).")
         if not error.restarts:
             raise LidarError(
@@ -311,24 +340,25 @@ class CastingWorkers:
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.locations = look_for_tasks(self._client, self._partition.name, keys)
-        known_workers = self._setups.keys() | self._checked.keys()
-        for address in known_workers - self.locations.members:
+        refused = self._in_state(WorkerState.REFUSED).keys()
+        for address in self._workers.keys() - self.locations.members - refused:
             self._remove(address)
-        for address in sorted(self.locations.free.keys() - known_workers - self._refused.keys()):
+        for address in sorted(self.locations.free.keys() - self._workers.keys()):
             self._name_count += 1
-            self._setups[address] = self._partition.submit(
+            check = self._partition.submit(
                 software_query(self._backend),
                 key=f"check-{self.run}-{self._name_count}",
                 priority=10,
                 workers=address,
             )
+            self._workers[address] = _Worker(check)
         self._check()
         return self.locations
 
     def _check(self) -> None:
         """Record the workers whose software check has ended."""
         addresses = {}
-        for address, future in self._setups.items():
+        for address, future in self._checks.items():
             if future.status == "finished" and address in self.locations.free:
                 addresses[future.key] = address
             elif future.status == "error" and not was_killed(future):
@@ -360,8 +390,10 @@ class CastingWorkers:
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
-        addresses = [*self._checked.keys() & self.locations.members]
-        self._checked.clear()
+        casting = self._in_state(WorkerState.CASTING).keys()
+        addresses = [*casting & self.locations.members]
+        for address in casting:
+            del self._workers[address]
         if self._client.status == "running":
             self.want(0)
         if addresses and self._client.status == "running":
@@ -377,32 +409,32 @@ class CastingWorkers:
 
     def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
         """Record a worker that has answered the software check; refuse different software."""
-        del self._setups[address]
+        worker = self._workers[address]
+        worker.check = None
         if differs := difference(software, self._software):
-            self._refused[address] = differs
+            worker.state = WorkerState.REFUSED
             self.notes.append(
                 f"worker {identity['name']} at {address} has {differs}: it cast nothing"
             )
-            if self._refused.keys() >= self.locations.members:
+            if self._in_state(WorkerState.REFUSED).keys() >= self.locations.members:
                 raise LidarError(
                     f"No worker of partition {self._partition.name!r} has the run's software: the "
                     f"one at {address} has {differs}. Install the same on all."
                 )
             return
         slots = identity["resources"].get(self._partition.name, 1)
-        self._checked[address] = max(1, int(slots))
+        worker.state = WorkerState.CASTING
+        worker.slots = max(1, int(slots))
         self._died.clear()
 
     def _remove(self, address: str) -> None:
         """Remove a worker that has gone."""
-        self._refused.pop(address, None)
-        self._unneeded.pop(address, None)
+        check = self._workers.pop(address).check
         for payload in self._payloads:
             payload.holders.discard(address)
-        if self._checked.pop(address, None) is not None:
+        if check is None:
             return
-        future = self._setups.pop(address)
-        location = self.locations.tasks.get(future.key)
+        location = self.locations.tasks.get(check.key)
         if location is not None and location.deaths:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:

@@ -11,7 +11,7 @@ import numpy as np
 from lidarsim.base.arrays import Ints
 
 from ...plan import Trial
-from .messages import Receipt
+from .stage_messages import Receipt
 
 _FIRST = attrgetter("first")  # the order of parts
 

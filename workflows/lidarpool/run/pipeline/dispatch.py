@@ -21,9 +21,9 @@ from . import policies
 from .batches import Batch, BatchState, Outcome
 from .casting_workers import CastingWorkers
 from .failures import JobError
-from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
-from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .pipeline_job import PipelineJob
+from .stage_messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
+from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .task_records import TaskRecord
 
 MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a request to stage 1

@@ -11,7 +11,7 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from poolpart.task_context import WorkerLeft
 
-from .messages import scans_in_words
+from .stage_messages import scans_in_words
 
 ASK_S = 10.0  # wait for an error's text, which the scheduler has
 

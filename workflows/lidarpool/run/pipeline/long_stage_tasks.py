@@ -25,7 +25,8 @@ from poolpart.task_context import telling_departure
 
 from ...columns.parts import pack
 from .failures import ScanError, naming_scans, storing
-from .messages import (
+from .rigs import CastBatch
+from .stage_messages import (
     CollectOrder,
     ColumnsLost,
     Description,
@@ -36,8 +37,7 @@ from .messages import (
     StageStart,
     Summaries,
 )
-from .names import COLLECT, GENERATE, LIDAR
-from .rigs import CastBatch
+from .stage_names import COLLECT, GENERATE, LIDAR
 from .task_records import Recorder, TaskRecord
 
 SEND_EVERY_S = 0.05  # messages that follow each other faster are sent together

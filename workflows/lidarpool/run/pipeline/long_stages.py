@@ -34,8 +34,8 @@ from ...base.software import call_with_same_sources
 from ...columns.parts import probe_name
 from .failures import memory_clause, raise_if_failed, storing, was_killed
 from .long_stage_tasks import collect, generate, sort_frames
-from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
-from .names import COLLECT, GENERATE, SORT
+from .stage_messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
+from .stage_names import COLLECT, GENERATE, SORT
 from .task_records import TaskRecord
 
 LOOK_EVERY_S = 0.5

@@ -1,6 +1,6 @@
 """The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
 
-The driver and four stages exchange messages (`messages.py`):
+The driver and four stages exchange messages (`stage_messages.py`):
 
 1. GENERATE describes scans: it finds out that the survey defines them, and reports ranges of scans,
    of which the driver makes batches;
@@ -30,7 +30,8 @@ from .casting_workers import CastingWorkers
 from .dispatch import Dispatcher
 from .failures import JobError
 from .long_stages import LongStages
-from .messages import (
+from .pipeline_job import PipelineJob
+from .stage_messages import (
     ColumnsLost,
     Description,
     Failed,
@@ -40,8 +41,7 @@ from .messages import (
     ScanRange,
     Summaries,
 )
-from .names import COLLECT, GENERATE, SORT
-from .pipeline_job import PipelineJob
+from .stage_names import COLLECT, GENERATE, SORT
 from .task_book import TaskBook
 
 STALL_S = 60.0  # time without frames of the sorter, after which it gets its summaries again

@@ -13,8 +13,8 @@ from lidarsim.survey.survey import Survey
 
 from ...base.tracing import trace
 from .committed_job import CommittedJob
-from .messages import Receipt, ScanFrame, Summaries, samples_of_scan, summary_type
-from .names import SORT
+from .stage_messages import Receipt, ScanFrame, Summaries, samples_of_scan, summary_type
+from .stage_names import SORT
 
 
 class PipelineJob(CommittedJob):

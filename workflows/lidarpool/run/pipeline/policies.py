@@ -15,7 +15,7 @@ from typing import NamedTuple
 from poolpart.task_locations import TaskLocations
 
 from .batches import Batch, BatchState, Outcome
-from .names import COLLECT, INTERSECT
+from .stage_names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
 SMALL_SECONDS = 0.05  # casting time of a batch that no slot idles for at the end

@@ -28,7 +28,7 @@ from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.batch_points import BatchPoints
-from lidarsim.simulator.points.device import DevicePoints
+from lidarsim.simulator.points.device_columns import DevicePoints
 from lidarsim.simulator.rig import Rig
 from lidarsim.survey.survey import Survey
 from poolpart import own_device, own_device_share
@@ -37,8 +37,8 @@ from raybeam.registry import choose
 from ...base.shared_memory import Pickled, SharedHandle
 from ...base.tracing import trace
 from .failures import DeviceLost, ScanError, naming_scans
-from .messages import BatchRange, samples_of_scan
-from .names import GPU, INTERSECT
+from .stage_messages import BatchRange, samples_of_scan
+from .stage_names import GPU, INTERSECT
 from .task_records import Recorder, TaskRecord
 
 logger = logging.getLogger(__name__)

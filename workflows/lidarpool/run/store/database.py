@@ -25,7 +25,7 @@ from ...columns.parts import part_name
 from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
 from ..pipeline.committed_job import CommittedJob
-from ..pipeline.messages import Receipt
+from ..pipeline.stage_messages import Receipt
 
 J = TypeVar("J", bound=CommittedJob)
 

@@ -17,8 +17,8 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack
 from ...scenario.build import Job
-from ..pipeline.messages import Receipt, samples_of_scan, summary_type
 from ..pipeline.pipeline_job import PipelineJob
+from ..pipeline.stage_messages import Receipt, samples_of_scan, summary_type
 from ..progress import Progress
 
 SAMPLE_RAYS = 400  # rays in pictures of a survey, about

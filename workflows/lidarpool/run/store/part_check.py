@@ -9,7 +9,7 @@ from operator import attrgetter
 
 from lidarsim.base.words import listed
 
-from ..pipeline.messages import Receipt, scans_in_words
+from ..pipeline.stage_messages import Receipt, scans_in_words
 from .database import RunDatabase
 from .job_under_way import JobUnderWay
 

@@ -22,7 +22,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarview.viewer.result_views import wait_for_interrupt
 
-from ...clouds.frames import WORLD
+from ...clouds.frame_names import WORLD
 from ...clouds.shown_sweeps import (
     ShownSweep,
     Surface,
@@ -35,7 +35,7 @@ from ...clouds.shown_sweeps import (
 from ...columns.parts import read_part
 from ...datasets.job_table import JobRow
 from ...plan import best
-from ...run.pipeline.messages import Receipt, ScanFrame
+from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.progress import Progress
 from ...run.run_page import RunPage
 from ...run.run_result import RunResult

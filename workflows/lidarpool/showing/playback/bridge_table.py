@@ -14,7 +14,7 @@ class BridgeEntry(NamedTuple):
 
 # {name for --as: the bridge}
 BRIDGES = {
-    "packets": BridgeEntry("lidarpool.showing.playback.packets:PacketsBridge"),
+    "packets": BridgeEntry("lidarpool.showing.playback.live_sensor:PacketsBridge"),
     "ros2": BridgeEntry("lidarpool.showing.playback.ros2:Ros2Bridge", "ros2"),
     "foxglove": BridgeEntry("lidarpool.showing.playback.viewer_bridges:FoxgloveBridge", "live"),
     "rerun": BridgeEntry("lidarpool.showing.playback.viewer_bridges:RerunBridge", "rerun"),

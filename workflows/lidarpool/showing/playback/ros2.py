@@ -13,7 +13,7 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...clouds.frames import survey_start_ns
+from ...clouds.frame_names import survey_start_ns
 from ...clouds.ros.layouts import LaidOut
 from ...clouds.ros.messages import RosMessage, SurveyMessages
 from ...clouds.writing import Format

@@ -14,7 +14,7 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Records
 from lidarsim.base.errors import LidarError
 
-from ...clouds.frames import WORLD
+from ...clouds.frame_names import WORLD
 from ...clouds.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform
 from .viewer import LOOPBACK, Address, Viewer
 

@@ -20,7 +20,7 @@ from lidarsim.scene.actors import Actor
 from lidarsim.simulator import Scanner
 from lidarsim.sweeps.sweeps import type_of
 
-from ...clouds.frames import CARRIER, WORLD, frame_names, points_topic
+from ...clouds.frame_names import CARRIER, WORLD, frame_names, points_topic
 from ...clouds.shown_sweeps import (
     ActorBoxes,
     ShownSweep,

@@ -20,7 +20,7 @@ from lidarsim.base.ports import port_number
 from lidarsim.base.words import shortened
 
 from ...clouds.shown_sweeps import ShownSweep, Surroundings
-from .table import VIEWERS
+from .viewer_table import VIEWERS
 
 LOOPBACK = "127.0.0.1"
 _PORTS_TRIED = 20

@@ -20,7 +20,7 @@ from typing import Any
 
 from ...base.errors import LidarError, prefixed
 from ...base.plugins import Plugin, find_plugin, plugins_of
-from ...base.sections import is_section
+from ...base.section_fields import is_section
 from ...base.words import did_you_mean, joined
 from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions

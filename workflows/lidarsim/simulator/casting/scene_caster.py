@@ -101,7 +101,7 @@ class SceneCaster:
     scene
         Faces, instances and actors to hit.
     surfaces
-        Surfaces of the scene; a tally counts hits by `Surfaces.counter`.
+        Surfaces of the scene; a tally counts hits by `StoredTriangles.counter`.
     bodies
         Trees of the static bodies and shapes of the actors.
     range_m
@@ -173,13 +173,13 @@ class SceneCaster:
             [self._face_count + number, 0] for number in range(instance_count)
         ]
         counters = np.array([*table, [instance_count, 1]], np.int64)
-        return counters[self.body_rows], self._surfaces.counters
+        return counters[self.body_rows], self._surfaces.triangles.counters
 
     @property
     def body_rows(self) -> Indices:
-        """Rows in `Surfaces.bodies` of the caster's instances, and of all actors: (instances + 1,).
+        """Rows in `StoredTriangles.bodies` of instances that are cast, and of all actors.
 
-        The static bodies that no ray hits are missing.
+        Shape (instances + 1,). The static bodies that no ray hits are missing.
         """
         trees = self._static.trees
         first_instance = min(1, self._face_count)
@@ -221,7 +221,7 @@ class SceneCaster:
         -------
         ScanReturns
             Ray numbers are from 0 at the window's start. Triangles are numbered as in
-            `SceneCaster`, and the tally is by `Surfaces.counter`. With instances or actors,
+            `SceneCaster`, and the tally is by `StoredTriangles.counter`. With instances or actors,
             `instance` is 0.
         """
         window = (0, len(pattern)) if window is None else window
@@ -253,9 +253,7 @@ class SceneCaster:
         counts = np.diff(cuts)
         counted = None
         if tally:
-            counted = np.bincount(
-                self._surfaces.counter(triangle), minlength=self._surfaces.counters
-            )
+            counted = self._surfaces.triangles.count(triangle)
         if keep_every > 1:
             rows = _rows_to_keep(counts, keep_every)
             ray = ray[rows]
@@ -369,14 +367,14 @@ def casters_of_sensors(
         If a sensor does not see an object that is not in the scene.
     """
     range_m = largest_range_m(survey)
-    media = surfaces.media
+    media = surfaces.media_bodies.static_kinds
     shapes = _shapes(scene.actors, options)
     static_bodies = {caster.bodies.key: caster.bodies.static for caster in known}
 
     @cache
     def vertices() -> Floats:
         # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
-        return surfaces.spread_out(1.5 * _clear_m(scene))
+        return surfaces.media_bodies.spread_out(1.5 * _clear_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
         """Return the bodies of the scene without the static objects of a mask (objects,)."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...columns.part_columns import PartColumns
 from .batch_points import BatchPoints
-from .device import DevicePoints
+from .device_columns import DevicePoints
 
 
 def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:

@@ -58,8 +58,8 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Counters that are not 0, see `Surfaces.counter`, and their hits, (k,) each: counts of all
-        # triangles of the scene would take much memory, since each station of a batch stores them.
+        # Counters that are not 0, see `StoredTriangles.counter`, and their hits, (k,) each: counts
+        # of all triangles would take much memory, since each station of a batch stores them.
         counter_hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
@@ -334,7 +334,7 @@ class BatchPoints:
     @cached_property
     def object(self) -> Ints32:
         """Object of the scene."""
-        return self._surfaces.objects(self.pulse_returns.triangle)
+        return self._surfaces.triangles.objects(self.pulse_returns.triangle)
 
     @cached_property
     def _kinds(self) -> Ints32:
@@ -569,4 +569,4 @@ class BatchPoints:
     @property
     def material_number(self) -> Ints32:
         """Number of the material's name among the names of the scene; -1 without a material."""
-        return self._surfaces.material_numbers(self.pulse_returns.triangle)
+        return self._surfaces.triangle_kinds.material_numbers(self.pulse_returns.triangle)

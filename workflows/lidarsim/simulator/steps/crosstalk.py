@@ -260,7 +260,7 @@ class CrosstalkStep(PulseStep):
         distance = hits.distance
         triangle = hits.triangle
         if self.caster.unseen is not None:  # spots on objects that this sensor does not see
-            seen = np.flatnonzero(~self.caster.unseen[self.surfaces.objects(triangle)])
+            seen = np.flatnonzero(~self.caster.unseen[self.surfaces.triangles.objects(triangle)])
             ray = ray[seen]
             distance = distance[seen]
             triangle = triangle[seen]

@@ -92,7 +92,7 @@ def velocities_of_ends(
     for begin in range(0, len(end_velocities), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
         points = origins[block] + distance[block, None] * directions[block]
-        end_velocities[block] = surfaces.velocities(
+        end_velocities[block] = surfaces.on_actors.velocities(
             triangle[block], points, times[block], actor_trajectories
         )
     return end_velocities

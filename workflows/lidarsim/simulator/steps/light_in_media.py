@@ -180,8 +180,8 @@ class Media:
         self.refracts = bool(table.refracts.any())
         self.mirrors = table.refracts & (table.specular > 0)  # surfaces that refract and mirror
         self.grids = surfaces.grids
-        self.instances = surfaces.instances
-        owners = surfaces.material_kinds.object
+        self.instances = surfaces.triangles.instances
+        owners = surfaces.triangle_kinds.material_kinds.object
         # (kinds + 1,): whether the leaves are in grids of voxels; the last entry is of kind -1.
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
@@ -191,11 +191,11 @@ class Media:
             for values in (table.leaf_area, table.refractive_index, table.attenuation)
         )
         self._angle = np.append(table.leaf_angle, 0)
-        closed, self._inwards = surfaces.solids
+        closed, self._inwards = surfaces.media_bodies.solids
         for number in np.flatnonzero(table.leafy).tolist():
             if not closed[number]:
                 raise LidarError(
-                    f"materials: {surfaces.material_kinds.describe(number)} has a "
+                    f"materials: {surfaces.triangle_kinds.material_kinds.describe(number)} has a "
                     "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
                     "or a sphere."
                 )

@@ -193,7 +193,7 @@ def _retro_clusters(
     Objects of the mask `unseen` (objects,) are left out.
     """
     retro = surfaces.materials.retro
-    owners = surfaces.material_kinds.object
+    owners = surfaces.triangle_kinds.material_kinds.object
     if unseen is not None:
         retro = retro & ~unseen[owners]
     has_retro = np.zeros(len(scene.all_names), np.bool_)  # by objects

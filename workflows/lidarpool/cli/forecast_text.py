@@ -22,7 +22,7 @@ from ..report.output import SurveyOutput
 from ..run.forecast import forecast
 from ..run.job_source import fields_of, identity_of
 from ..run.options import RunOptions
-from ..run.pipeline.names import GPU
+from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter

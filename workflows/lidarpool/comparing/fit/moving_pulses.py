@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Indices, Ints
-from lidarsim.base.sampling import even_indices
+from lidarsim.base.even_samples import even_indices
 from lidarsim.columns.table import NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Pose
@@ -23,8 +23,7 @@ from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
 
 from ...clouds.recording import FiredPoints, Read, Recording, rings_of
-from .stack import MAX_KINK_M, SweepStack
-from .surfaces import (
+from .smooth_surfaces import (
     ASSUMED_DIRECTION_NOISE_RAD,
     MAX_KINK_PER_M,
     MAX_SIGMAS,
@@ -35,6 +34,7 @@ from .surfaces import (
     SmoothRays,
     among_smooth,
 )
+from .stack import MAX_KINK_M, SweepStack
 
 _MAX_PULSES = 1 << 17  # that are fitted, chosen evenly
 _SAME_RANGE_M = 1e-3  # difference of the ranges of a return, as rounded

@@ -115,8 +115,8 @@ class SeenBodies:
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
         self.caster = caster
-        self.rows = caster.body_rows  # rows in `Surfaces.bodies`
-        self.table = bodies[self.rows]  # as in `Surfaces.bodies`; all actors are the last body
+        self.rows = caster.body_rows  # rows in `StoredTriangles.bodies`
+        self.table = bodies[self.rows]  # all actors are the last body
         self.counters = caster.counters()
         self.device_table: Any = None
         self.device_normal_matrices: Any = None
@@ -146,7 +146,7 @@ class DeviceColumns:
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
         # Whether NumPy computes energies of hits on actors, which the device computes of others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
-        bodies, _ = surfaces.bodies()
+        bodies, _ = surfaces.triangles.bodies()
         seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
         self._seen_bodies = [seen[caster] for caster in casters]  # by sensors
         self._surface_tables: tuple[Any, ...] | None = None
@@ -252,11 +252,11 @@ class DeviceColumns:
     def tables(self, cupy: Any, seen: SeenBodies) -> tuple[Any, ...]:
         """Return the tables of surfaces that columns.cu reads, on the caster's device."""
         if self._surface_tables is None:
-            surfaces = self._surfaces
+            triangles = self._surfaces.triangles
             materials = self._surfaces.materials
-            normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
+            normals = triangles.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
-                surfaces.owners,
+                triangles.owners,
                 normals,
                 materials.reflectance,
                 materials.retro.astype(np.uint8),
@@ -266,7 +266,7 @@ class DeviceColumns:
         if seen.device_table is None:
             seen.device_table = to_device(cupy, seen.table)
         if seen.device_normal_matrices is None:
-            normal_matrices = self._surfaces.bodies()[1][seen.rows]
+            normal_matrices = self._surfaces.triangles.bodies()[1][seen.rows]
             seen.device_normal_matrices = to_device(cupy, normal_matrices)
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 

@@ -15,7 +15,7 @@ from trimesh import creation
 
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
-from lidarpool.scenario.placing import place_sensor, poses_around
+from lidarpool.scenario.default_poses import place_sensor, poses_around
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city

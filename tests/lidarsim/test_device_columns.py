@@ -39,7 +39,7 @@ from lidarsim.sensor.models import load_sensor
 from lidarsim.sensor.optics import Returns
 from lidarsim.simulator.memory import cast_bytes
 from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.points.device import OPTIONS, DevicePoints
+from lidarsim.simulator.points.device_columns import OPTIONS, DevicePoints
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends, registry
 

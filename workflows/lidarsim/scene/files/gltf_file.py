@@ -1,0 +1,233 @@
+"""Content of a glTF 2.0 file by its indices: parts, accessors, buffers and images."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import struct
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+
+from ...base.allowance import Allowance
+from ...base.arrays import AnyArray
+from ...base.input_files import read_input
+from ...base.words import listed, printable
+from .companions import image_file, named_file
+from .gltf_draco import DRACO
+from .scene_graph import MeshFileError, ReadOptions
+
+INSTANCING = "EXT_mesh_gpu_instancing"
+VISIBILITY = "KHR_node_visibility"  # of nodes, and of all nodes below
+# Extensions that do not change shapes, or that are supported here.
+_READ = re.compile(
+    r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization|"
+    rf"({DRACO}|{INSTANCING}|{VISIBILITY})$"
+)
+# Extensions that change neither shapes nor colours, and are not worth a note.
+_WITHOUT_SHAPE = re.compile(
+    r"(KHR_xmp(_json_ld)?|KHR_node_(selectability|hoverability)|KHR_audio_emitter|EXT_lights_\w+|"
+    r"EXT_(structural_metadata|mesh_features|instance_features)|CESIUM_primitive_outline)$"
+)
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
+V = TypeVar("V")
+
+
+def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the JSON object, and the binary buffer of a .glb."""
+    body = b""
+    if data[:4] == b"glTF" and len(data) >= 20:
+        version, total, size = struct.unpack_from("<III", data, 4)
+        if version == 1:
+            raise MeshFileError(_OLD)
+        if len(data) < total:
+            raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
+        body = data[28 + size : total]
+        data = data[20 : 20 + size].rstrip(b"\0")  # with which some programs pad it
+    elif data[:1] not in b"{[ \t\r\n":
+        raise MeshFileError("is not glTF")
+    try:
+        header = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise MeshFileError(f"holds no valid JSON ({error})") from error
+    if not isinstance(header, dict):
+        raise MeshFileError("holds no glTF object")
+    return header, body
+
+
+def check_readable(header: dict[str, Any]) -> None:
+    """Check that a file is glTF 2.0 and requires no unknown extension; MeshFileError if not."""
+    # Version 1.0 names parts, instead of numbering them.
+    if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
+        header.get("nodes"), dict
+    ):
+        raise MeshFileError(_OLD)
+    for name in map(str, header.get("extensionsRequired", ())):
+        if not _READ.match(name):
+            raise MeshFileError(f"needs {name}, which cannot be read: export without it")
+
+
+def extension_notes(header: dict[str, Any]) -> list[str]:
+    """Return a note on the extensions that a file uses and does not require, if any is unknown."""
+    names = dict.fromkeys(printable(str(name))[:60] for name in header.get("extensionsUsed", ()))
+    unknown = [name for name in names if not (_READ.match(name) or _WITHOUT_SHAPE.match(name))]
+    return [f"uses extensions that are not read: {listed(unknown, 8)}"] if unknown else []
+
+
+def root_nodes(header: dict[str, Any]) -> list[int]:
+    """Return the indices of the outermost nodes."""
+    nodes = header.get("nodes", ())
+    if scenes := header.get("scenes"):
+        return list(scenes[header.get("scene", 0)].get("nodes", ()))
+    inner = {child for node in nodes for child in node.get("children", ())}
+    return [index for index in range(len(nodes)) if index not in inner]
+
+
+class GltfFile:
+    """Parts, numbers, buffers and images of a file by their indices; each is read once."""
+
+    def __init__(
+        self,
+        header: dict[str, Any],
+        body: bytes,
+        path: Path,
+        options: ReadOptions,
+        allowance: Allowance,
+    ) -> None:
+        self.header = header
+        self.path = path
+        self.allowance = allowance
+        self._body = body
+        self._options = options
+        self.accessor = cache(self._read_accessor)
+        self._buffer_file = cache(self._read_buffer_file)
+        self._buffer = cache(self._read_buffer)
+
+    def part(self, kind: str, index: Any) -> dict[str, Any]:
+        """Return a part of the file by its index; ValueError without such a part."""
+        parts: list[dict[str, Any]] = self.header.get(kind, [])
+        number = natural(index)
+        if number >= len(parts):
+            raise ValueError(f"it refers to number {number} of its {kind}, of {len(parts)}")
+        return parts[number]
+
+    def _read_accessor(self, index: int) -> AnyArray:
+        """Return the numbers (count, width) of an accessor, if possible without a copy."""
+        accessor = self.part("accessors", index)
+        count = natural(accessor["count"])
+        if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
+            raise ValueError(
+                f"accessor {index} has the type {accessor['type']!r} of "
+                f"{accessor['componentType']!r}, which glTF does not know"
+            )
+        width = _WIDTHS[accessor["type"]]
+        kind = np.dtype(_TYPES[accessor["componentType"]])
+        sparse = accessor.get("sparse")
+        if sparse:
+            self.allowance.take(count * width * kind.itemsize)
+        if "bufferView" in accessor:
+            numbers = self._array(accessor, kind, count, width)
+        elif sparse:
+            numbers = np.zeros((count, width), kind)
+        else:
+            raise ValueError(f"accessor {index} has no content")
+        if sparse:
+            changed = sparse["indices"]
+            values = sparse["values"]
+            index_type = np.dtype(_TYPES[changed["componentType"]])
+            rows = self._array(changed, index_type, sparse["count"], 1)[:, 0]
+            numbers = numbers.copy()
+            numbers[rows] = self._array(values, kind, sparse["count"], width)
+        return self.normalised(numbers) if accessor.get("normalized") else numbers
+
+    def normalised(self, numbers: AnyArray) -> AnyArray:
+        """Return the fractions that integers encode; glTF 2.0, 3.6.2.2."""
+        if numbers.dtype.kind not in "iu":
+            return numbers
+        self.allowance.take(8 * numbers.size)
+        return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
+
+    def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
+        """Return numbers (count, width) of a buffer view, from `part['byteOffset']` on."""
+        row = kind.itemsize * width
+        stride = self.part("bufferViews", part["bufferView"]).get("byteStride", row)
+        view = self.view(part["bufferView"])[part.get("byteOffset", 0) :]
+        if not count:
+            return np.empty((0, width), kind)
+        if stride * (count - 1) + row > len(view):
+            raise ValueError(f"{count:,} elements announced, {len(view):,} bytes there")
+        return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
+
+    def view(self, index: int) -> memoryview:
+        """Return the bytes of a buffer view."""
+        view = self.part("bufferViews", index)
+        start = view.get("byteOffset", 0)
+        return memoryview(self._buffer(view["buffer"]))[start : start + view["byteLength"]]
+
+    def _read_buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer, of the file itself, a data URI or a further file."""
+        buffer = self.part("buffers", index)
+        uri = buffer.get("uri")
+        if uri is None:
+            if index:
+                raise MeshFileError("has a buffer without content, as packed files have: unpack it")
+            content = self._body
+        elif uri.startswith("data:"):
+            content = _inline(uri)
+        else:
+            content = self._buffer_file(uri)
+        if len(content) < buffer["byteLength"]:
+            raise MeshFileError(
+                f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
+                f"which is cut short: it has {len(content):,}"
+            )
+        return content
+
+    def _read_buffer_file(self, uri: str) -> bytes:
+        """Return the bytes of a buffer file."""
+        target = named_file(self.path, uri, self._options, allow_moved=False)
+        if target is None:
+            raise MeshFileError(
+                f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
+                "as .glb"
+            )
+        self.allowance.add_file(target)
+        return read_input(target)
+
+    def image(self, index: int, read: Callable[[Path | bytes, Allowance], V]) -> V:
+        """Return an image, decoded by `read`."""
+        image = self.part("images", index)
+        if "bufferView" in image:
+            return read(bytes(self.view(image["bufferView"])), self.allowance)
+        uri = image["uri"]
+        if uri.startswith("data:"):
+            return read(_inline(uri), self.allowance)
+        return read(image_file(self.path, uri, self._options, self.allowance), self.allowance)
+
+
+def _inline(uri: str) -> bytes:
+    """Return the content of a data URI."""
+    kind, _, text = uri.partition(",")
+    content = unquote_to_bytes(text)
+    return base64.b64decode(content) if kind.endswith(";base64") else content
+
+
+def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the data of an extension of a part, or {}."""
+    content: dict[str, Any] = part.get("extensions", {}).get(name, {})
+    return content
+
+
+def natural(number: Any) -> int:
+    """Return a count or an index; ValueError for a negative number or no integer."""
+    if type(number) is not int or number < 0:
+        raise ValueError(f"{number!r} is given as an index or a count")
+    return number

@@ -1,0 +1,158 @@
+"""Surfaces of actors, which move and may deform: their corners, and points on them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...base.arrays import Floats, Indices, Integers, Ints
+from ...base.vectors import applied, into_axes, products
+from ...motion.trajectory import velocities
+from .actor_trajectories import ActorTrajectories
+from .stored_triangles import StoredTriangles
+
+_NO_ROWS = np.zeros(0, np.intp)
+
+
+class DeformedCorners(NamedTuple):
+    """Corners of triangles of actors that deform, in the frames of the actors: (n, 3, 3) each."""
+
+    corners: Floats  # metres
+    velocities: Floats  # m/s
+    at_rest: Floats  # corners of the mesh at rest
+
+
+class ActorSurfaces:
+    """Triangles of the actors of a scene, at times."""
+
+    def __init__(self, triangles: StoredTriangles) -> None:
+        self._triangles = triangles
+
+    def deformed(
+        self,
+        rows: Indices,
+        actors: Integers,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
+    ) -> DeformedCorners:
+        """Return the corners of triangles of actors that deform, at times (n,), nanoseconds.
+
+        `rows` (n,) are rows of stored triangles, and `actors` (n,) their actors.
+        """
+        corners, corner_velocities, at_rest = np.empty((3, len(rows), 3, 3))
+        frames, frame_rates = trajectories.played(actors, times)
+        mesh_numbers = self._triangles.actor_mesh[actors]
+        for mesh_number in np.unique(mesh_numbers).tolist():
+            mesh = self._triangles.meshes[mesh_number]
+            with_mesh = np.flatnonzero(mesh_numbers == mesh_number)
+            assert mesh.animation is not None
+            vertex_rows = mesh.faces[rows[with_mesh] - self._triangles.mesh_starts[mesh_number]]
+            corners[with_mesh], steps = mesh.animation.vertices_at(frames[with_mesh], vertex_rows)
+            corner_velocities[with_mesh] = steps * frame_rates[with_mesh, None, None]
+            at_rest[with_mesh] = mesh.vertices[vertex_rows]
+        return DeformedCorners(corners, corner_velocities, at_rest)
+
+    def _actor_rows(
+        self, triangle: Integers, trajectories: ActorTrajectories
+    ) -> tuple[Indices, Integers]:
+        """Return the indices in `triangle` (n,) of actors' triangles, and the actors: (k,) each.
+
+        Without trajectories, there are no actors, and the arrays are empty.
+        """
+        if not trajectories:
+            return _NO_ROWS, _NO_ROWS
+        rows = np.flatnonzero(triangle >= self._triangles.instance_starts[-1])
+        return rows, self._triangles.objects(triangle[rows]) - self._triangles.static_objects
+
+    def move_to_rest(
+        self,
+        points: Floats,
+        triangle: Integers,
+        rows: Indices,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
+    ) -> None:
+        """Move the points on actors, among points (n, 3), to the actors' meshes at rest, in place.
+
+        Points are in the scene frame before, and in the frames of the actors afterwards. `triangle`
+        (n,) are the triangles of all points, `rows` (n,) the stored rows of the triangles, and
+        `times` (n,) are nanoseconds.
+        """
+        on_actors, actor = self._actor_rows(triangle, trajectories)
+        if not len(on_actors):
+            return
+        positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
+        points[on_actors] = into_axes(points[on_actors] - positions, rotations)
+        if len(deforming := trajectories.deforming(actor)):
+            deformed_rows = on_actors[deforming]
+            deformed = self.deformed(
+                rows[deformed_rows], actor[deforming], times[deformed_rows], trajectories
+            )
+            weights = _weights(deformed.corners, points[deformed_rows])
+            points[deformed_rows] = applied(deformed.at_rest.transpose(0, 2, 1), weights)
+
+    def velocities(
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
+        trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the velocities of points (n, 3) on triangles (n,) in the scene frame, m/s: (n, 3).
+
+        Actors have their poses at times (n,), nanoseconds.
+        """
+        result = np.zeros((len(triangle), 3))
+        on_actors, actor = self._actor_rows(triangle, trajectories)
+        for number in np.unique(actor).tolist():
+            trajectory = trajectories[number]
+            rows = on_actors[actor == number]
+            if trajectory.moves:
+                times_ns = times[rows].astype(np.float64)
+                positions, _ = trajectory.poses(0, times_ns)
+                velocity, rate = velocities(trajectory, 0, times_ns)
+                result[rows] = velocity + np.cross(rate, points[rows] - positions)
+        if len(deforming := trajectories.deforming(actor)):
+            rows = on_actors[deforming]
+            result[rows] += self._deformation_velocities(
+                triangle[rows], points[rows], times[rows], actor[deforming], trajectories
+            )
+        return result
+
+    def _deformation_velocities(
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
+        actor: Integers,
+        trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the velocities of points by the deformation of actors: (n, 3), m/s.
+
+        Points (n, 3) and velocities are in the scene frame; `actor` (n,) are the deforming actors.
+        """
+        times_ns = times.astype(np.float64)
+        positions, rotations = trajectories.poses(actor, times_ns)
+        deformed = self.deformed(
+            self._triangles.locate(triangle).row, actor, times_ns, trajectories
+        )
+        weights = _weights(deformed.corners, into_axes(points - positions, rotations))
+        return applied(rotations, applied(deformed.velocities.transpose(0, 2, 1), weights))
+
+
+def _weights(corners: Floats, points: Floats) -> Floats:
+    """Return weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on triangles."""
+    a, b, c = corners.transpose(1, 2, 0)
+    edge_1 = b - a
+    edge_2 = c - a
+    offset = points.T - a
+    square_1 = products(edge_1, edge_1)
+    edge_product = products(edge_1, edge_2)
+    square_2 = products(edge_2, edge_2)
+    product_1 = products(offset, edge_1)
+    product_2 = products(offset, edge_2)
+    area = np.maximum(square_1 * square_2 - edge_product * edge_product, 1e-300)
+    v = (square_2 * product_1 - edge_product * product_2) / area
+    w = (square_1 * product_2 - edge_product * product_1) / area
+    return np.stack([1 - v - w, v, w], axis=1)

@@ -1,0 +1,197 @@
+"""Triangles of a scene: their numbers, owners, and the stored triangles that copies share."""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...base.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
+from ...base.vectors import inverse, length
+from ...scene.actors import distinct_meshes
+from ...scene.colours import Colours
+from ...scene.scene import Scene
+
+if TYPE_CHECKING:
+    from .surface_loops import TriangleNumbers, TriangleOwners
+
+BLOCK_FACES = 1 << 18  # triangles whose normals are computed at a time
+
+
+class StoredTriangles:
+    """Numbers and owners of the triangles of a scene, and the triangles that are stored.
+
+    Triangles are numbered by the scene's faces, then instance by instance, then by actors. Stored
+    triangles are the scene's faces, then the distinct meshes of actors, then the parts of meshes
+    that instances place, each once: instances of a part share its stored triangles. Objects of
+    actors follow the static objects.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.static_objects = len(scene.names)  # objects
+        self.counters = scene.counters
+        instances = scene.instances
+        face_count = len(scene.faces)
+        instance_sizes = np.zeros(0, np.int64) if instances is None else instances.sizes
+        # First triangle of each instance, and of actors.
+        self.instance_starts = face_count + np.cumsum([0, *instance_sizes])
+        actor_sizes = [len(actor.mesh.faces) for actor in scene.actors]
+        self.meshes, self.actor_mesh = distinct_meshes(scene.actors)
+        mesh_sizes = [len(mesh.faces) for mesh in self.meshes]
+        self.mesh_starts = mesh_starts = face_count + np.cumsum([0, *mesh_sizes])
+        actor_starts = self.instance_starts[-1] + np.cumsum([0, *actor_sizes])[:-1]
+        # (actors,): add to the number of an actor's triangle for its row among stored triangles.
+        self._actor_shifts = mesh_starts[self.actor_mesh] - actor_starts
+        self._parts_start = int(mesh_starts[-1])
+        owners = np.arange(
+            self.static_objects, self.static_objects + len(actor_sizes), dtype=np.int32
+        )
+        # Objects of the triangles of faces and of actors; the last is of no triangle.
+        objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
+        self.owners = np.concatenate(objects)
+
+    @cached_property
+    def normal_matrices(self) -> Floats:
+        """Matrices (n, 3, 3) from normals of parts to normals of instances, of any length."""
+        instances = self._scene.instances
+        if instances is None:
+            return np.zeros((0, 3, 3))
+        return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
+
+    def moved(self, scene: Scene) -> StoredTriangles:
+        """Return the triangles of a scene in which instances have new transforms."""
+        triangles = copy(self)
+        triangles._scene = scene
+        vars(triangles).pop("normal_matrices", None)
+        return triangles
+
+    def locate(self, triangle: Integers) -> TriangleOwners:
+        """Return the stored rows, objects and instances of triangles (n,)."""
+        from . import surface_loops  # not before: numba takes half a second to import
+
+        count = len(triangle)
+        row, instance = np.empty((2, count), np.int64)
+        located = surface_loops.TriangleOwners(row, np.empty(count, np.int32), instance)
+        surface_loops.find_owners(owned(triangle, np.int32), self._triangle_numbers, located)
+        return located
+
+    @cached_property
+    def _triangle_numbers(self) -> TriangleNumbers:
+        """Numbers of triangles, objects and instances, for loops."""
+        from .surface_loops import TriangleNumbers
+
+        instances = self._scene.instances
+        no_instances = np.zeros(0, np.int64)
+        return TriangleNumbers(
+            instance_starts=owned(self.instance_starts, np.int64),
+            owners=owned(self.owners, np.int32),
+            instance_objects=owned(
+                no_instances if instances is None else instances.owner, np.int32
+            ),
+            instance_rows=owned(
+                no_instances if instances is None else self.part_starts[instances.part], np.int64
+            ),
+            actor_shifts=owned(self._actor_shifts, np.int64),
+            static_objects=self.static_objects,
+        )
+
+    def bodies(self) -> tuple[Ints, Floats]:
+        """Return the bodies to which triangles belong, in the order of `SceneCaster`.
+
+        Returns
+        -------
+        bodies
+            (b, 3): the scene's faces, unless there are no faces, each instance, and all actors as
+            one body. Columns are the first triangle; the object, or -1 if `owners` has the object
+            of each triangle; and the row of the first normal in `unit_normals`, or -1 for actors,
+            which share normals. In `owners`, actors follow the scene's faces.
+        normal_matrices
+            (b, 3, 3): matrices from normals in `unit_normals` to normals in the scene frame, of any
+            length.
+        """
+        face_count, actors_start = self.instance_starts[[0, -1]]
+        identity = np.eye(3)[None]
+        bodies: list[Any] = [[[actors_start - face_count, -1, -1]]]
+        normal_matrices = [identity]
+        if (instances := self._scene.instances) is not None:
+            first_rows = self.part_starts[instances.part]
+            bodies.insert(
+                0, np.stack([self.instance_starts[:-1], instances.owner, first_rows], axis=1)
+            )
+            normal_matrices.insert(0, self.normal_matrices)
+        if face_count:
+            bodies.insert(0, [[0, -1, 0]])
+            normal_matrices.insert(0, identity)
+        return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
+
+    def objects(self, triangle: Integers) -> Ints32:
+        """Return the objects of triangles (n,): (n,); -1 without a surface."""
+        if self._scene.instances is None:
+            return self.owners[triangle]
+        return self.locate(triangle).object
+
+    def instances(self, triangle: Integers) -> Indices:
+        """Return the instances of triangles (n,), which all belong to instances: (n,)."""
+        return np.searchsorted(self.instance_starts, triangle, side="right") - 1
+
+    def counter(self, triangle: Integers) -> Integers:
+        """Return the rows of hit counters (n,), in which hits on triangles (n,) are counted.
+
+        Each of the scene's faces has a counter, each instance has a single counter for all its
+        triangles, and each triangle of an actor has a counter, in this order: `Scene.counters`.
+        """
+        if self._scene.instances is None:
+            return triangle
+        face_count, actors_start = self.instance_starts[[0, -1]]
+        instance = self.locate(triangle).instance
+        # Triangles of instances, less one counter for each instance.
+        shift = actors_start - face_count - (len(self.instance_starts) - 1)
+        face_or_actor = np.where(triangle >= actors_start, triangle - shift, triangle)
+        return np.where(instance >= 0, face_count + instance, face_or_actor)
+
+    def count(self, triangle: Integers) -> Ints:
+        """Return the number of hits on triangles (n,) by counters: (counters,), see `counter`."""
+        return np.bincount(self.counter(triangle), minlength=self.counters)
+
+    @property
+    def stored_bodies(self) -> list[tuple[Floats, Integers, Colours | None]]:
+        """Vertices, faces and colours of stored triangles: scene, meshes of actors, and parts."""
+        scene = self._scene
+        bodies: list[tuple[Floats, Integers, Colours | None]] = [
+            (scene.vertices, scene.faces, scene.colours)
+        ]
+        bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self.meshes]
+        if scene.instances is not None:
+            parts = scene.instances.parts
+            bodies += [(part.vertices, part.faces, part.colours) for part in parts]
+        return bodies
+
+    @cached_property
+    def unit_normals(self) -> Floats32:
+        """Unit normals of the stored triangles: (f, 3)."""
+        bodies = self.stored_bodies
+        normals = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
+        row = 0
+        for vertices, faces, _ in bodies:
+            for begin in range(0, len(faces), BLOCK_FACES):
+                block = faces[begin : begin + BLOCK_FACES]
+                normals[row : row + len(block)] = normals_of(vertices[block])
+                row += len(block)
+        return normals
+
+    @cached_property
+    def part_starts(self) -> Indices:
+        """Stored row of the first triangle of each part of instances."""
+        assert self._scene.instances is not None
+        sizes = [len(part.faces) for part in self._scene.instances.parts]
+        return self._parts_start + np.cumsum([0, *sizes[:-1]])
+
+
+def normals_of(corners: Floats) -> Floats32:
+    """Return unit normals (n, 3) of triangles (n, 3, 3), in single precision."""
+    a, b, c = corners.transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    return (normals / np.maximum(length(normals)[:, None], 1e-300)).astype(np.float32)

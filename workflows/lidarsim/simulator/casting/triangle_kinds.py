@@ -1,0 +1,127 @@
+"""Kinds of surfaces of triangles: an object, or a material of an object with several materials."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ...base.arrays import Indices, Integers, Ints32
+from ...media.materials import Material, SurfaceKinds, first_matches
+from ...scene.face_materials import FaceMaterials
+from ...scene.scene import Scene
+from .stored_triangles import StoredTriangles
+
+
+class TriangleKinds:
+    """Kinds of surfaces, rows of the table of materials, of the triangles of a scene.
+
+    A kind of surface is an object, or a material of an object whose files have several materials.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        kinds: SurfaceKinds,
+        materials: tuple[Material, ...],
+        triangles: StoredTriangles,
+    ) -> None:
+        self._scene = scene
+        self._materials = materials
+        self._triangles = triangles
+        self.material_kinds = kinds
+
+    def of_triangles(self, triangle: Integers) -> Ints32:
+        """Return the kinds of surfaces of triangles (n,): (n,); -1 without a surface.
+
+        Names of materials that match the same material of the survey, in an object, are one kind.
+        """
+        if self._kind_in_object is None:
+            return self._triangles.objects(triangle)
+        rows, objects, _ = self._triangles.locate(triangle)
+        return self.of_rows(rows, objects)
+
+    def of_rows(self, rows: Indices, objects: Ints32) -> Ints32:
+        """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
+
+        Objects are an argument because instances that share stored triangles may differ in object.
+        """
+        if self._kind_in_object is None:
+            return objects
+        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
+        return np.where(objects < 0, np.int32(-1), self._material_kind[kinds])
+
+    @cached_property
+    def _kind_in_object(self) -> Ints32 | None:
+        """Kind of each stored triangle, numbered within its object: (f,).
+
+        None if each object has a single kind, which has the number of the object.
+        """
+        if len(self.material_kinds.object) == len(self.material_kinds.names):
+            return None
+        scene = self._scene
+        parts = () if scene.instances is None else scene.instances.parts
+        meshes = [(len(mesh.faces), mesh.materials) for mesh in self._triangles.meshes]
+        meshes += [(len(part.faces), part.materials) for part in parts]
+        face_materials = None if scene.materials is None else scene.materials.index
+        numbers = [
+            np.zeros(len(scene.faces), np.int32) if face_materials is None else face_materials
+        ]
+        for size, materials in meshes:
+            index = None if materials is None else materials.index
+            numbers.append(np.zeros(size, np.int32) if index is None else index)
+        return np.concatenate(numbers)
+
+    def material_numbers(self, triangle: Integers) -> Ints32:
+        """Return the materials of triangles, as numbers of `Scene.material_names`; -1 for none."""
+        rows, objects, _ = self._triangles.locate(triangle)
+        kinds = self.material_kinds.first[:-1][objects]
+        if self._kind_in_object is not None:
+            kinds = kinds + self._kind_in_object[rows]
+        return np.where(objects < 0, np.int32(-1), self._number_of_kind[kinds])
+
+    @cached_property
+    def _number_of_kind(self) -> Ints32:
+        """Number of the name of each kind's material; -1 for none."""
+        numbers = {name: number for number, name in enumerate(self._scene.material_names)}
+        return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
+
+    @cached_property
+    def _material_kind(self) -> Ints32:
+        """First kind of the same object that has the same material, for each kind: (kinds,).
+
+        Several names of materials in an object's files may match a single material of the survey.
+        Their faces are then a single kind, so that a body of water or leaves whose faces have
+        several names is closed.
+        """
+        kinds = self.material_kinds
+        first = first_matches(self._materials, self.material_kinds)
+        keys = np.stack([kinds.object, first], axis=1)
+        _, rows, combination = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        return rows[combination.reshape(-1)].astype(np.int32)
+
+    @cached_property
+    def _faces_by_object(self) -> tuple[Indices, Indices]:
+        """Rows of the scene's faces by objects, and where each object starts in this order."""
+        owners = self._scene.face_object
+        order = np.argsort(owners, kind="stable")
+        return order, np.searchsorted(owners[order], np.arange(self._triangles.static_objects + 1))
+
+    def faces_of(self, kind: int) -> Integers:
+        """Return the scene's faces of a kind of surface, (f, 3)."""
+        order, starts = self._faces_by_object
+        owner = int(self.material_kinds.object[kind])
+        rows = order[starts[owner] : starts[owner + 1]]
+        if self._scene.materials is None:
+            return self._scene.faces[rows]
+        materials = self._scene.materials.of_object(owner, rows)
+        return self.select(kind, self._scene.faces[rows], materials)
+
+    def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
+        """Select the faces of a kind of surface from faces of an object, (f, 3)."""
+        if self._kind_in_object is None:
+            return faces
+        kinds = self.material_kinds
+        index = 0 if materials is None or materials.index is None else materials.index
+        face_kinds = self._material_kind[kinds.first[kinds.object[kind]] + index]
+        return faces[np.broadcast_to(face_kinds == kind, len(faces))]
