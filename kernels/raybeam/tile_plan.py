@@ -96,7 +96,7 @@ def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[floa
         Angle between firings, and between rings, radians.
     """
     axis = np.cross(first, second).sum(axis=0)
-    rings = np.argsort(first @ axis, kind="stable")
+    rings = np.argsort((first * axis).sum(axis=1), kind="stable")
     ahead = (second - first)[rings]
     squared = np.maximum((ahead * ahead).sum(axis=1), 1e-24)
     steps = np.diff(first[rings], axis=0)
@@ -155,7 +155,8 @@ def _square(
     rings = 1
     while rings <= min(beams, most_rings):
         firings = beams // rings
-        difference = abs(np.log(rings * ring_spacing / (firings * firing_spacing)))
+        ratio = rings * ring_spacing / (firings * firing_spacing)
+        difference = max(ratio, 1 / ratio)
         if firings <= most_firings and difference < least:
             least = difference
             best = rings, firings

@@ -556,7 +556,7 @@ WRONG = {
     ),
     "an actor": (lambda s: replace(CAR, trajectory=Mirrored()), "Matrix 0 of a pose mirrors"),
     "row": (lambda s: s.ranges(np.ones((1, 4, 4))), "last row"),
-    "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="embre"), "'embre'. Did you mean"),
+    "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="tile"), "'tile'. Did you mean"),
     "fine": (
         lambda s: Scanner(FAR, GRID, precision_m=1e-6).sweep((2990, 0, 1)),
         "precision_m 1e-06 is too fine for points 2",
