@@ -225,22 +225,25 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-def callback(signature: Any) -> Callable[[Any], Any]:
-    """Compile a function that C calls."""
+def part(signature: Any) -> Callable[[Any], Any]:
+    """Compile a function that compiled code calls by its address.
+
+    As a stage it would be compiled again with each of its callers, and with the callers of these.
+    """
 
     def make(function: Any) -> Any:
         kinds = (signature.args, signature.return_type)
         c_function = _cached(CFunc(function, kinds, {}, {"error_model": "numpy"}), function)
         c_function.compile()
-        return c_function
+        _parts.append(c_function)
+        name = f"raybeam_{function.__module__}_{function.__name__}"
+        add_symbol(name, c_function.address)
+        return ExternalFunction(name, c_function._sig)
 
     return make
 
 
-def external(name: str, c_function: Any) -> Any:
-    """Return a function that compiled code can call, for a callback, under a name."""
-    add_symbol(name, c_function.address)
-    return ExternalFunction(name, c_function._sig)
+_parts: list[Any] = []  # whose addresses compiled code holds
 
 
 def inlined(function: Any) -> Any:

@@ -11,12 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
+from numba import carray, types
 
 from . import cast_memory as memory
 from .arrays import Floats, Ints
-from .cast_memory import float64s, int64s
-from .compiled import compiled, inlined, stage
+from .cast_memory import casts_at, float64s, int64s
+from .compiled import compiled, inlined, part, stage
 from .mesh import NEAR
 from .pattern import Pattern
 from .poses import Poses
@@ -428,14 +428,28 @@ def _copy_out(tile, rays, first_row, address, total, count):  # type: ignore[no-
             vectors[k + 2 * total] = floats[source + 2 * rays + lane]
 
 
-@stage
-def make_rays(cast, tile, rays, first, count):  # type: ignore[no-untyped-def]
+@inlined
+def first_ray(cast, ray):  # type: ignore[no-untyped-def]
+    """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
+    total = cast.rows * cast.subrays
+    rays_per_pose = cast.rays_per_pose
+    pose = ray // rays_per_pose
+    within = ray - pose * rays_per_pose
+    return FirstRay((cast.first + ray) % total, pose, within, ray)
+
+
+@part(types.void(types.int64, types.int64, types.int64, types.int64))
+def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays of a tile in local coordinates, by their numbers in the call.
 
-    `first` is the `FirstRay` of the call, `count` the number of its rays. Rays outside the call are
+    `address` is of the `CAST`, `start` the number of the call's first ray in the scan, and `count`
+    the number of the call's rays. Rays outside the call are
     neighbours of its rays, if these have one pose. Origins that all rays share are computed for the
     first tile: `share_origin`. Rays are also written to the outputs of rays of the cast, if any.
     """
+    cast = carray(casts_at(address), 1)[0]
+    tile = cast.tile
+    first = first_ray(cast, start)
     _find_rows(tile, rays, first.row, cast.rows * cast.subrays)
     if cast.shares_origin == 0:
         _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
@@ -470,16 +484,6 @@ def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def first_ray(cast, ray):  # type: ignore[no-untyped-def]
-    """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
-    total = cast.rows * cast.subrays
-    rays_per_pose = cast.rays_per_pose
-    pose = ray // rays_per_pose
-    within = ray - pose * rays_per_pose
-    return FirstRay((cast.first + ray) % total, pose, within, ray)
-
-
-@inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
     """Return the larger of `entry` and the distance at which a ray enters a slab of the box."""
     component = d
@@ -506,6 +510,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
     """Write the directions (3, m), and the origins unless (3, 0), of rays with numbers (m,)."""
     cast = casts[0]
+    address = casts.ctypes.data
     tile = cast.tile
     lanes = cast.tile_rays
     each = cast.lanes_per_beam
@@ -523,7 +528,7 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
             first_of_beam = number - (cast.first + number) % cast.subrays
             for lane in range(each):
                 numbers[number_at + k * each + lane] = first_of_beam + min(lane, cast.subrays - 1)
-        make_rays(cast, tile, lanes, first_ray(cast, 0), 0)
+        make_rays(address, 0, lanes, 0)
         for k in range(min(beams, count - start)):
             number = rays[start + k]
             lane = k * each + (cast.first + number) % cast.subrays

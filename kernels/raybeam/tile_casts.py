@@ -28,7 +28,7 @@ from .moving_loops import (
     pose_rotation,
     to_body_axes,
 )
-from .ray_loops import first_ray, make_rays, share_origin
+from .ray_loops import make_rays, share_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
 from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, row_at
@@ -91,6 +91,7 @@ def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Cast rays `start` to `stop` of a `CAST`; write the hits in ray order, return their number."""
     cast = casts[0]
+    address = casts.ctypes.data
     tile = cast.tile
     rays = cast.tile_rays
     instances = cast.instances
@@ -108,7 +109,6 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 
     instance_out = int32s(cast.instance)
     if cast.shares_origin != 0:
         share_origin(cast, tile, rays)
-    first = first_ray(cast, start)
     lead = (cast.first + start) % firing  # the call may start within a firing
     firing_count = -(-(count + lead) // firing)
     max_shift = np.int64(0)
@@ -118,7 +118,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 
         for group in range(cast.groups):
             number = (column * cast.firings - shifts[group]) * firing - lead
             if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
-                make_rays(cast, tile, rays, first, count)
+                make_rays(address, start, rays, count)
                 _reset(tile, rays, cast.t_max)
                 cast_tile(tile, rays, cast.mesh, instances, cast.top, rays, cast.t_min)
                 _keep_hits(tile, rays, cast.hits, count)

@@ -35,6 +35,7 @@ point to this memory as float32, int32, int64 and float64. `mesh` is the address
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
 from . import tile_memory as memory
 from .cast_memory import (
@@ -47,7 +48,7 @@ from .cast_memory import (
     int64s,
     uint8s,
 )
-from .compiled import inlined, stage
+from .compiled import inlined, part, stage
 from .mesh_loops import enter_instance, is_opaque
 from .ray_loops import entry_distance
 from .tile_memory import AXIS, ENTRY, IX, KEY, LENGTH, OX, SUBTILES, SX, T, U, at, row_at
@@ -238,7 +239,10 @@ def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PL
         for k in range(subtile * each, (subtile + 1) * each, 8):
             i = direction + k
             du, dv, dm = _turned(
-                axes, _narrowed(floats, i), _narrowed(floats, i + rays), _narrowed(floats, i + 2 * rays)
+                axes,
+                _narrowed(floats, i),
+                _narrowed(floats, i + rays),
+                _narrowed(floats, i + 2 * rays),
             )
             cosine = lower_of(cosine, dm)
             inverse = one / dm
@@ -333,7 +337,7 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a comp
         numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
 
 
-@stage
+@part(types.float32(types.int64, types.int64, types.int64))
 def _limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]
     """Write the greatest depth, rounded up, of the rays of subtiles (a mask), and of each subtile.
 
@@ -365,7 +369,7 @@ def _limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]
     return highest(load(singles, _REACH))
 
 
-@stage
+@part(types.void(types.int64, types.int64, types.int64))
 def _shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the shear of rays, and the common longest axis of each eight rays, -1 if they differ.
 
@@ -530,7 +534,9 @@ def _decide_four(tile, rays, ray, axis, corners, position, key, nested, t_min): 
     t_at = row_at(T, rays) + ray
     nearest = load(floats, t_at)
     # Where det is 0, all areas are 0, so t is NaN and not at least t_min.
-    hit = at_least(lower_of(lower_of(a, b), c), zero) | at_least(zero, higher_of(higher_of(a, b), c))
+    hit = at_least(lower_of(lower_of(a, b), c), zero) | at_least(
+        zero, higher_of(higher_of(a, b), c)
+    )
     hit &= at_least(t, splat(t_min)) & at_least(nearest, t)
     key_at = row_at(KEY, rays) + ray
     tie = hit & at_least(t, nearest)
@@ -577,7 +583,18 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
     return splat(singles[k]), splat(singles[k + 8]), splat(singles[k + 16])
 
 
-@stage
+@part(
+    types.int64(
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.float32,
+        types.float64,
+    )
+)
 def _test_leaf(tile, rays, mesh, nested_key, code, mask, deepest, t_min):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Test the triangles of a leaf and the rays of the subtiles of a mask; return those with hits.
 
@@ -598,9 +615,7 @@ def _test_leaf(tile, rays, mesh, nested_key, code, mask, deepest, t_min):  # typ
     volume = _dot(n[0], n[1], n[2], a[0], a[1], a[2])
     size = _norm(e) + _norm(f)
     floor = splat(_FLOOR)
-    rounding = multiply_add(
-        splat(_EDGE * singles[_SPREAD]) * (splat(_ONE) + _norm(a)), size, floor
-    )
+    rounding = multiply_add(splat(_EDGE * singles[_SPREAD]) * (splat(_ONE) + _norm(a)), size, floor)
     offset = splat(singles[_OFFSET] * singles[_SPREAD])
     margin = multiply_add(offset, size, rounding)
     volume_margin = multiply_add(rounding, size, multiply_add(offset, _norm(n), floor))
@@ -659,7 +674,9 @@ def _test_leaf(tile, rays, mesh, nested_key, code, mask, deepest, t_min):  # typ
         )
         chosen = at_least(least + splat(singles[k + 72]), zero) | -((undecided >> lane) & 1)
         chosen &= mask & at_least(reach, splat(singles[k + 88]))
-        write_word(pairs, _PAIRS + pair_count, numbers[_BITS + chosen] | (0x0808080808080808 * lane))
+        write_word(
+            pairs, _PAIRS + pair_count, numbers[_BITS + chosen] | (0x0808080808080808 * lane)
+        )
         pair_count += bit_count(chosen)
         prefetch(corners, 9 * (first + lane))
         prefetch(corners, 9 * (first + lane) + 8)
@@ -740,7 +757,9 @@ def _sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
         mask = codes[ENTRY * k + 2]
         j = k
         while j > start and stack[ENTRY * (j - 1)] < near:
-            _put(stack, codes, j, stack[ENTRY * (j - 1)], codes[ENTRY * j - 3], codes[ENTRY * j - 2])
+            _put(
+                stack, codes, j, stack[ENTRY * (j - 1)], codes[ENTRY * j - 3], codes[ENTRY * j - 2]
+            )
             j -= 1
         _put(stack, codes, j, near, code, mask)
 
@@ -812,7 +831,7 @@ def _open_node(tile, address, nodes, blocks, node, mask, deepest, count):  # typ
     return count
 
 
-@stage
+@part(types.int64(types.int64, types.int64, types.int64, types.int64, types.int64, types.float64))
 def _walk(tile, rays, mesh, instance, mask, t_min):  # type: ignore[no-untyped-def]
     """Cast the rays of the subtiles of a mask in a mesh; return whether that was done.
 
@@ -847,7 +866,7 @@ def _walk(tile, rays, mesh, instance, mask, t_min):  # type: ignore[no-untyped-d
     return True
 
 
-@stage
+@part(types.int64(types.int64, types.int64, types.int64))
 def _list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
     """Write the instances that a tile may meet, nearest last; return their number.
 
@@ -878,7 +897,7 @@ def _list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
     return met_count
 
 
-@stage
+@part(types.int64(types.int64, types.int64, types.int64, types.int64))
 def _aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
     """Prepare a tile for a traversal in the coordinates of its rays; return whether it is narrow.
 
@@ -989,9 +1008,7 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, t_min, undecided): 
     n2 = a[0] * e[1] - a[1] * e[0]
     n0 = (e[0] * f[1] - e[1] * f[0]) - n1 - n2
     size = _norm(e) + _norm(f)
-    margin = multiply_add(
-        splat(_EDGE + _EDGE) * (splat(_ONE) + _norm(a)), size, splat(_FLOOR)
-    )
+    margin = multiply_add(splat(_EDGE + _EDGE) * (splat(_ONE) + _norm(a)), size, splat(_FLOOR))
     positive = at_least(lower_of(lower_of(n0, n1), n2) + margin, splat(_ZERO))
     negative = at_least(margin, higher_of(higher_of(n0, n1), n2))
     left = (positive | negative | -undecided) & ((2 << (code & _LEAF_MASK)) - 1)
@@ -1004,7 +1021,18 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, t_min, undecided): 
     return closer
 
 
-@stage
+@part(
+    types.void(
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.float64,
+    )
+)
 def _walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting, t_min):  # type: ignore[no-untyped-def]
     """Cast a ray in a mesh; the list of nodes has `waiting` entries of the tree above."""
     floats = float64s(tile)
@@ -1075,7 +1103,7 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]
     floats[i + 5 * rays] = sz
 
 
-@stage
+@part(types.void(types.int64, types.int64, types.int64, types.int64, types.int64, types.float64))
 def _walk_instances_by_one(tile, rays, ray, nodes, instances, t_min):  # type: ignore[no-untyped-def]
     """Cast a ray at all instances; `nodes` is the address of the tree over these."""
     floats = float64s(tile)
@@ -1113,7 +1141,10 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask, t_min):  # type: 
     The shear of the rays is written. `first_row` is the first row of the rays in the mesh's
     coordinates.
     """
-    if _aim(tile, rays, first_row, mask) and _walk(tile, rays, mesh, instance, mask, t_min):
+    if (
+        _aim(tile, rays, first_row, mask) != 0
+        and _walk(tile, rays, mesh, instance, mask, t_min) != 0
+    ):
         return
     each = rays // SUBTILES
     for ray in range(rays):
@@ -1121,7 +1152,7 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask, t_min):  # type: 
             _walk_by_one(tile, rays, ray, first_row, mesh, max(instance, 0), 0, t_min)
 
 
-@stage
+@part(types.void(types.int64, types.int64, types.int64))
 def _enter_all(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write all rays in the coordinates of the mesh of an instance, as `enter_instance`."""
     floats = float64s(tile)
@@ -1167,7 +1198,11 @@ def _before(tile, rays, near, mask):  # type: ignore[no-untyped-def]
     return mask & left
 
 
-@stage
+@part(
+    types.void(
+        types.int64, types.int64, types.int64, types.int64, types.int64, types.int64, types.float64
+    )
+)
 def cast_tile(tile, rays, mesh, instances, top, last, t_min):  # type: ignore[no-untyped-def]
     """Write the closest hits of a tile to its rows `T` and `KEY`, which have reaches and -1.
 
@@ -1187,7 +1222,7 @@ def cast_tile(tile, rays, mesh, instances, top, last, t_min):  # type: ignore[no
         else:
             _cast_in_mesh(tile, rays, OX, mesh, -1, mask, t_min)
         return
-    if few or not _aim(tile, rays, OX, mask):
+    if few or _aim(tile, rays, OX, mask) == 0:
         for ray in range(last):
             _walk_instances_by_one(tile, rays, ray, top, instances, t_min)
         return

@@ -51,9 +51,7 @@ class TilePlan(NamedTuple):
 def consecutive(subrays: int) -> TilePlan:
     """Return tiles of consecutive beams with a number of sub-rays each."""
     beams = np.arange(SUBTILES * _VECTOR)
-    return TilePlan(
-        subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64)
-    )
+    return TilePlan(subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64))
 
 
 def _sub_rays(beams: Ints, subrays: int) -> Ints:
@@ -108,9 +106,7 @@ def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[floa
     return rings, shifts, (float(np.sqrt(np.median(squared))), max(ring_spacing, 1e-12))
 
 
-def _laid_out(
-    rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
-) -> TilePlan:
+def _laid_out(rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int) -> TilePlan:
     """Return tiles whose rays lie in squares, as far as their numbers allow."""
     step = len(rings)
     firing = step * subrays
@@ -132,8 +128,10 @@ def _laid_out(
         ring = (ring[:, None, None] * ring_count + np.arange(ring_count)[:, None]) + np.zeros(
             firing_count, np.int64
         )
-        later = later[:, None, None] * firing_count + np.arange(firing_count) + np.zeros(
-            (ring_count, 1), np.int64
+        later = (
+            later[:, None, None] * firing_count
+            + np.arange(firing_count)
+            + np.zeros((ring_count, 1), np.int64)
         )
         ring = ring.reshape(-1)
         later = later.reshape(-1)

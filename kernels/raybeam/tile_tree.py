@@ -13,7 +13,9 @@ from .tree import LEAF_BITS, WideTree, build_top, build_tree
 
 WIDTH = 8
 NODE = 64  # numbers of a node: lower x, y, z, upper x, y, z and the child, of eight children each
-BLOCK = 80  # numbers of a leaf: corner, two edges, x, y, z of eight triangles; position of the first
+BLOCK = (
+    80  # numbers of a leaf: corner, two edges, x, y, z of eight triangles; position of the first
+)
 _LEAF_SIZE = 8
 # Cost of a further triangle in a leaf, as a share of the cost of a node: eight are tested at once.
 _TRIANGLE_COST = 0.05

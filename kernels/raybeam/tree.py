@@ -118,8 +118,10 @@ def _leaves(
     """
     area = tree.area
     import os
-    nodec=float(os.environ.get('NC','0.5')) if triangle_cost is not None else 1.0
-    if triangle_cost is not None: triangle_cost=float(os.environ.get('TC','0.05'))
+
+    nodec = float(os.environ.get("NC", "0.5")) if triangle_cost is not None else 1.0
+    if triangle_cost is not None:
+        triangle_cost = float(os.environ.get("TC", "0.05"))
     fixed, slope = (0.0, 1.0) if triangle_cost is None else (1.0, triangle_cost)
     count = np.ones(len(area), np.int32)
     cost = area * np.float32(fixed + slope)
@@ -129,7 +131,7 @@ def _leaves(
         second_child = tree.second_child[start:stop]
         count[start:stop] = count[first_child] + count[second_child]
         leaf_cost = area[start:stop] * (fixed + slope * count[start:stop]).astype(np.float32)
-        split_cost = area[start:stop]*np.float32(nodec) + cost[first_child] + cost[second_child]
+        split_cost = area[start:stop] * np.float32(nodec) + cost[first_child] + cost[second_child]
         is_cheaper = (count[start:stop] <= leaf_size) & (leaf_cost <= split_cost)
         leaf[start:stop] = is_cheaper
         cost[start:stop] = np.where(is_cheaper, leaf_cost, split_cost)

@@ -259,9 +259,7 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         address = _at(builder, *arguments, _I8)
-        _call(
-            builder, "llvm.prefetch.p0", ir.VoidType(), [address, _I32(0), _I32(3), _I32(1)]
-        )
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
     return types.void(pointer, types.int64), generate
