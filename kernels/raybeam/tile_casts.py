@@ -32,8 +32,6 @@ from .ray_loops import make_rays, share_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
 from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, row_at
-from .vectors import splat, store
-
 _TILE_RAYS = 8 * SUBTILES  # of rays at bodies
 
 
@@ -56,17 +54,18 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
 
 
 @stage
-def _reset(tile, rays, t_max):  # type: ignore[no-untyped-def]
-    """Write reaches and no hits to the rays of a tile."""
+def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
+    """Write reaches and no hits to the rays of a tile; the reach of rays outside the call is -1."""
     floats = float64s(tile)
     numbers = int64s(tile)
     t_at = row_at(T, rays)
     key_at = row_at(KEY, rays)
     length_at = row_at(LENGTH, rays)
-    for k in range(0, rays, 4):
-        store(floats, t_at + k, splat(t_max))
-        store(floats, length_at + k, splat(1.0))
+    number_at = row_at(NUMBER, rays)
     for k in range(rays):
+        number = numbers[number_at + k]
+        floats[t_at + k] = t_max if (number >= 0) & (number < count) else -1.0
+        floats[length_at + k] = 1.0
         numbers[key_at + k] = -1
 
 
@@ -119,7 +118,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 
             number = (column * cast.firings - shifts[group]) * firing - lead
             if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
                 make_rays(address, start, rays, count)
-                _reset(tile, rays, cast.t_max)
+                _reset(tile, rays, cast.t_max, count)
                 cast_tile(tile, rays, cast.mesh, instances, cast.top, rays, cast.t_min)
                 _keep_hits(tile, rays, cast.hits, count)
     hit_count = 0
@@ -173,8 +172,17 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 @inlined
 def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
-    """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays."""
+    """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays.
+
+    Their reach is -1. All rays have no hits.
+    """
     floats = float64s(tile)
+    numbers = int64s(tile)
+    for lane in range(_TILE_RAYS):
+        numbers[row_at(KEY, _TILE_RAYS) + lane] = -1
+        floats[row_at(LENGTH, _TILE_RAYS) + lane] = 1.0
+    for lane in range(filled, _TILE_RAYS):
+        floats[row_at(T, _TILE_RAYS) + lane] = -1.0
     for field in range(6):
         k = row_at(OX + field, _TILE_RAYS)
         for lane in range(filled, _TILE_RAYS):
@@ -230,6 +238,7 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
     corners = box_corners(float64s(crossing.box.ctypes.data))
     pair_at = row_at(NUMBER, _TILE_RAYS)
     norm_at = row_at(NORM, _TILE_RAYS)
+    t_at = row_at(T, _TILE_RAYS)
     pair = 0
     while pair < len(row):
         filled = 0
@@ -246,12 +255,13 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
             if passes_box(corners, PADS_M, nearest.distance[k], origin, direction):
                 norm = _write_ray(cast, floats, filled, origin, direction)
                 floats[norm_at + filled] = norm
+                reach = nearest.distance[k] * norm * cast.scale * (1 + 2.0**-40)
+                floats[t_at + filled] = min(reach, cast.t_max)
                 numbers[pair_at + filled] = pair
                 filled += 1
             pair += 1
         if filled != 0:
             _fill_up(tile, filled)
-            _reset(tile, _TILE_RAYS, cast.t_max)
             cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled, cast.t_min)
             _write_hits(cast, crossing, nearest, filled)
 

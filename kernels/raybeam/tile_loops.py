@@ -12,8 +12,8 @@ direction is (su, sv, 1) in the axes (u, v, m), divided by the component along m
 All of that is float32 with margins, and only discards. What is left is decided in float64 by the
 test of triangle.py, in its order of operations, so hits have the bits of the other backends.
 
-A tile that is too wide, too far away, or that meets more leaves than it has rays, is cast ray by
-ray in the same tree.
+A tile that is too wide, too far away, or that meets more leaves than half of its rays, is cast ray
+by ray in the same tree. Rays with a negative reach are not cast.
 
 Margins, with u = 2**-24, local coordinates of boxes within [-1, 1], and `spread` =
 1 + max |su| + max |sv| of the tile:
@@ -33,6 +33,8 @@ point to this memory as float32, int32, int64 and float64. `mesh` is the address
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -89,7 +91,8 @@ _TILE_PLANES = at("tile_planes")
 _EDGES = at("edges")
 _NEAR = at("near")
 _SIDES = at("sides")
-_DIRECTION = at("direction")
+_SKIPS = at("skips")
+_PATIENCE = at("patience")
 _SUMS = at("sums")
 _PAIRS = at("pairs")
 _BITS = at("bits")
@@ -110,6 +113,8 @@ _MAX_START = 64.0  # local: rays that start farther away are cast one by one, fr
 _TINY = np.float32(2.0**-60)
 _ACROSS = 4.0
 _SLACK = 2.0**-20
+_MAX_SKIPS = 31  # tiles that are cast one by one before another trial
+_MAX_ENTRY = 1e9
 _FEW = 6  # rays that are cast one by one
 _LEAF_MASK = (1 << LEAF_BITS) - 1
 
@@ -835,7 +840,7 @@ def _open_node(tile, address, nodes, blocks, node, mask, deepest, count):  # typ
 def _walk(tile, rays, mesh, instance, mask, t_min):  # type: ignore[no-untyped-def]
     """Cast the rays of the subtiles of a mask in a mesh; return whether that was done.
 
-    It is not done if the tile meets more leaves than it has rays.
+    It is not done if the tile meets more leaves than half of its rays.
     """
     singles = float32s(tile)
     address = int64s(tile)[_STACK]
@@ -858,7 +863,7 @@ def _walk(tile, rays, mesh, instance, mask, t_min):  # type: ignore[no-untyped-d
             count = _open_node(tile, address, nodes, blocks, code, subtiles, deepest, count)
             continue
         leaves += 1
-        if leaves > rays:
+        if leaves > rays // 2:
             return False
         changed = _test_leaf(tile, rays, mesh, instance, ~code, subtiles, deepest, t_min)
         if changed != 0:
@@ -915,28 +920,45 @@ def _aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
     return True
 
 
-@inlined
-def _slab(boxes, base, numbers, axis, inverse, shift):  # type: ignore[no-untyped-def]
-    """Return the distances at which a ray meets the nearer and the farther side of eight boxes."""
-    near_at = numbers[_DIRECTION + axis]
-    far_at = 24 + 8 * axis if near_at < 24 else 8 * axis
-    factor = splat(inverse)
-    offset = splat(shift)
-    return (
-        load(boxes, base + near_at) * factor - offset,
-        load(boxes, base + far_at) * factor - offset,
-    )
+class _Start(NamedTuple):
+    """A ray in float32, from where it enters the box of a scene or mesh.
 
-
-@inlined
-def _start_of_ray(tile, rays, ray, first_row):  # type: ignore[no-untyped-def]
-    """Return where a single ray starts for float32: distance from its origin, point, reciprocals.
-
-    A remote ray starts at the box of the scene or of the mesh, which is within [-1, 1] and padding.
+    Attributes
+    ----------
+    entry
+        Distance of the start from the ray's origin, float64; 0 unless the origin is remote.
+    x, y, z, dx, dy, dz
+        Start and direction.
+    ix, iy, iz
+        Reciprocals of the direction.
+    near_x, near_y, near_z
+        Where in a node the coordinates of its children's nearer sides are.
+    undecided
+        Whether the start is too inexact to discard triangles: -1 if so, else 0.
     """
-    floats = float64s(tile)
-    numbers = int64s(tile)
-    k = row_at(first_row, rays) + ray
+
+    entry: float
+    x: float
+    y: float
+    z: float
+    dx: float
+    dy: float
+    dz: float
+    ix: float
+    iy: float
+    iz: float
+    near_x: int
+    near_y: int
+    near_z: int
+    undecided: int
+
+
+@inlined
+def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]
+    """Return the `_Start` of a ray, the first of whose six numbers has index k.
+
+    The box of a scene or mesh is within [-1, 1] and its padding.
+    """
     ox, oy, oz = floats[k], floats[k + rays], floats[k + 2 * rays]
     dx, dy, dz = floats[k + 3 * rays], floats[k + 4 * rays], floats[k + 5 * rays]
     entry = entry_distance(1 + 2.0**-16, (ox, oy, oz), (dx, dy, dz))
@@ -946,10 +968,13 @@ def _start_of_ray(tile, rays, ray, first_row):  # type: ignore[no-untyped-def]
     ix = _ONE / _not_zero(np.float32(dx))
     iy = _ONE / _not_zero(np.float32(dy))
     iz = _ONE / _not_zero(np.float32(dz))
-    numbers[_DIRECTION] = 0 if ix >= 0 else 24
-    numbers[_DIRECTION + 1] = 8 if iy >= 0 else 32
-    numbers[_DIRECTION + 2] = 16 if iz >= 0 else 40
-    return entry, x * ix, y * iy, z * iz, ix, iy, iz
+    near_x = np.int64(0 if ix >= 0 else 24)
+    near_y = np.int64(8 if iy >= 0 else 32)
+    near_z = np.int64(16 if iz >= 0 else 40)
+    # So far away, the start is off by more than the margins of the test in float32.
+    undecided = np.int64(-1 if entry > _MAX_ENTRY else 0)
+    d = np.float32(dx), np.float32(dy), np.float32(dz)
+    return _Start(entry, x, y, z, *d, ix, iy, iz, near_x, near_y, near_z, undecided)
 
 
 @inlined
@@ -966,58 +991,90 @@ def _limit_of(t, entry):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]
-    """Add the children of a node that a ray meets to a list, nearest last; return its length."""
-    numbers = int64s(tile)
+def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untyped-def]
+    """Return the distances at which a ray meets the nearer and the farther side of eight boxes."""
+    far_at = (24 + 16 * axis) - near_at
+    factor = splat(inverse)
+    shift = splat(start * inverse)
+    return (
+        load(boxes, base + near_at) * factor - shift,
+        load(boxes, base + far_at) * factor - shift,
+    )
+
+
+@inlined
+def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Add the children of a node that a ray meets to a list, nearest last; return its length.
+
+    `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
+    at which the ray ends.
+    """
     singles = float32s(tile)
     stack = float32s(address)
     codes = int32s(address)
     boxes = float32s(nodes)
     children = int32s(nodes)
     base = node * NODE
-    _, x, y, z, ix, iy, iz = start
-    near_x, far_x = _slab(boxes, base, numbers, 0, ix, x)
-    near_y, far_y = _slab(boxes, base, numbers, 1, iy, y)
-    near_z, far_z = _slab(boxes, base, numbers, 2, iz, z)
+    near_x, far_x = _slab(boxes, base, start.near_x, 0, start.ix, start.x)
+    near_y, far_y = _slab(boxes, base, start.near_y, 1, start.iy, start.y)
+    near_z, far_z = _slab(boxes, base, start.near_z, 2, start.iz, start.z)
     near = higher_of(higher_of(near_x, near_y), higher_of(near_z, splat(_ZERO)))
     far = lower_of(lower_of(far_x, far_y), lower_of(far_z, splat(limit)))
     hit = at_least(far, near)
     store(singles, _NEAR, near)
     first = count
-    for _ in range(bit_count(hit)):
+    while hit != 0:
         child = lowest_bit(hit)
         hit &= hit - 1
-        _put(stack, codes, count, singles[_NEAR + child], children[base + 48 + child], 0)
+        stack[ENTRY * count] = singles[_NEAR + child]
+        codes[ENTRY * count + 1] = children[base + 48 + child]
         count += 1
-    _sort_farthest_first(address, first, count)
+    if count == first + 2:
+        # Mostly there are one or two, and which is nearer cannot be predicted.
+        k = ENTRY * first
+        here, there = stack[k], stack[k + ENTRY]
+        one, other = codes[k + 1], codes[k + ENTRY + 1]
+        swap = here < there
+        stack[k] = there if swap else here
+        stack[k + ENTRY] = here if swap else there
+        codes[k + 1] = other if swap else one
+        codes[k + ENTRY + 1] = one if swap else other
+    elif count > first + 2:
+        _sort_farthest_first(address, first, count)
     return count
 
 
-@stage
-def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, t_min, undecided):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test the triangles of a leaf and a ray; return whether it has a closer hit.
-
-    The tile's axes are those of the ray. With `undecided`, all triangles are tested in float64.
-    """
-    singles = float32s(tile)
+@inlined
+def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start, t_min):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Test the triangles of a leaf and a ray; return whether it has a closer hit."""
     record = int64s(mesh)
     blocks = float32s(record[6])
     block = (code >> LEAF_BITS) * BLOCK
-    a, e, f = _leaf_edges(singles, blocks, block)
-    n1 = f[0] * a[1] - f[1] * a[0]
-    n2 = a[0] * e[1] - a[1] * e[0]
-    n0 = (e[0] * f[1] - e[1] * f[0]) - n1 - n2
+    ax = load(blocks, block) - splat(start.x)
+    ay = load(blocks, block + 8) - splat(start.y)
+    az = load(blocks, block + 16) - splat(start.z)
+    e = load(blocks, block + 24), load(blocks, block + 32), load(blocks, block + 40)
+    f = load(blocks, block + 48), load(blocks, block + 56), load(blocks, block + 64)
+    d = splat(start.dx), splat(start.dy), splat(start.dz)
+    moment = _cross((ax, ay, az), d)
+    normal = _cross(e, f)
+    n1 = _dot(f[0], f[1], f[2], moment[0], moment[1], moment[2])
+    n2 = splat(_ZERO) - _dot(e[0], e[1], e[2], moment[0], moment[1], moment[2])
+    n0 = (_dot(normal[0], normal[1], normal[2], d[0], d[1], d[2]) - n1) - n2
     size = _norm(e) + _norm(f)
-    margin = multiply_add(splat(_EDGE + _EDGE) * (splat(_ONE) + _norm(a)), size, splat(_FLOOR))
+    distance = splat(_ONE) + _norm((ax, ay, az))
+    margin = multiply_add(splat(_EDGE) * distance, size, splat(_FLOOR))
     positive = at_least(lower_of(lower_of(n0, n1), n2) + margin, splat(_ZERO))
     negative = at_least(margin, higher_of(higher_of(n0, n1), n2))
-    left = (positive | negative | -undecided) & ((2 << (code & _LEAF_MASK)) - 1)
+    left = (positive | negative | start.undecided) & ((2 << (code & _LEAF_MASK)) - 1)
     first = np.int64(int32s(record[6])[block + 72])
-    closer = False
+    closer = np.int64(0)
     while left != 0:
         lane = lowest_bit(left)
         left &= left - 1
-        closer |= _decide_one(tile, rays, ray, mesh, instance, first + lane, t_min)
+        closer |= np.int64(
+            _decide_one(tile, rays, ray, mesh, instance, first + lane, t_min)
+        )
     return closer
 
 
@@ -1036,23 +1093,12 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, t_min, undecided): 
 def _walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting, t_min):  # type: ignore[no-untyped-def]
     """Cast a ray in a mesh; the list of nodes has `waiting` entries of the tree above."""
     floats = float64s(tile)
-    singles = float32s(tile)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
     codes = int32s(address)
     nodes = int64s(mesh)[5]
-    start = _start_of_ray(tile, rays, ray, first_row)
-    k = row_at(first_row, rays) + ray
-    entry = start[0]
-    dx, dy, dz = floats[k + 3 * rays], floats[k + 4 * rays], floats[k + 5 * rays]
-    _set_frame(singles, dx, dy, dz)
-    far = np.int64(0)
-    for axis in range(3):
-        o = floats[k + axis * rays]
-        far |= np.int64(abs(o) > 2.0)
-        o += entry * floats[k + (3 + axis) * rays]
-        singles[_AXES + 9 + axis] = np.float32(o)
-    far = np.int64(0) if far == 0 else np.int64(entry > 1e9)  # where float64 rounds more
+    start = _start_of_ray(floats, row_at(first_row, rays) + ray, rays)
+    entry = start.entry
     t_at = row_at(T, rays) + ray
     length = floats[row_at(LENGTH, rays) + ray]
     limit = _limit_of(floats[t_at] * length, entry)
@@ -1065,7 +1111,7 @@ def _walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting, t_min):  #
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
             count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
-        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, ~code, t_min, far):
+        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, ~code, start, t_min):
             limit = _limit_of(floats[t_at] * length, entry)
 
 
@@ -1111,19 +1157,17 @@ def _walk_instances_by_one(tile, rays, ray, nodes, instances, t_min):  # type: i
     address = numbers[_STACK]
     stack = float32s(address)
     codes = int32s(address)
-    start = _start_of_ray(tile, rays, ray, OX)
-    entry = start[0]
+    start = _start_of_ray(floats, row_at(OX, rays) + ray, rays)
     t_at = row_at(T, rays) + ray
     _put(stack, codes, 0, _ZERO, 0, 0)
     count = np.int64(1)
     while count > 0:
         count -= 1
-        limit = _limit_of(floats[t_at], entry)
+        limit = _limit_of(floats[t_at], start.entry)
         if stack[ENTRY * count] > limit:
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            start = _start_of_ray(tile, rays, ray, OX)  # the mesh has other signs of directions
             count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
             continue
         number = ~code >> LEAF_BITS
@@ -1138,17 +1182,27 @@ def _walk_instances_by_one(tile, rays, ray, nodes, instances, t_min):  # type: i
 def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask, t_min):  # type: ignore[no-untyped-def]
     """Cast the rays of the subtiles of a mask in a mesh, as a tile or one by one.
 
-    The shear of the rays is written. `first_row` is the first row of the rays in the mesh's
+    After a tile that was too wide or met too many leaves, its neighbours are cast one by one; then
+    tiles are tried again. The shear of the rays is written. `first_row` is the first row of the rays in the mesh's
     coordinates.
     """
-    if (
+    numbers = int64s(tile)
+    if numbers[_SKIPS] > 0:
+        numbers[_SKIPS] -= 1
+    elif (
         _aim(tile, rays, first_row, mask) != 0
         and _walk(tile, rays, mesh, instance, mask, t_min) != 0
     ):
+        numbers[_PATIENCE] = 0
         return
+    else:
+        numbers[_PATIENCE] = min(2 * numbers[_PATIENCE] + 1, _MAX_SKIPS)
+        numbers[_SKIPS] = numbers[_PATIENCE]
+    floats = float64s(tile)
     each = rays // SUBTILES
+    t_at = row_at(T, rays)
     for ray in range(rays):
-        if (mask >> (ray // each)) & 1:
+        if (mask >> (ray // each)) & 1 and floats[t_at + ray] >= 0:
             _walk_by_one(tile, rays, ray, first_row, mesh, max(instance, 0), 0, t_min)
 
 
@@ -1224,7 +1278,8 @@ def cast_tile(tile, rays, mesh, instances, top, last, t_min):  # type: ignore[no
         return
     if few or _aim(tile, rays, OX, mask) == 0:
         for ray in range(last):
-            _walk_instances_by_one(tile, rays, ray, top, instances, t_min)
+            if float64s(tile)[row_at(T, rays) + ray] >= 0:
+                _walk_instances_by_one(tile, rays, ray, top, instances, t_min)
         return
     slack = np.float64(singles[_OFFSET] + singles[_OFFSET] + singles[_PADDING])
     count = _list_instances(tile, top, mask)

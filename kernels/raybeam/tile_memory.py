@@ -32,10 +32,9 @@ TILE = np.dtype(
         ("edges", "f4", 14 * 8),  # of the triangles of a leaf, see `_prepare_leaf`
         ("near", "f4", 8),  # depths of the children of a node
         ("sides", "i8", 15),  # of boxes: where the coordinate of the farthest corner is, by plane
-        ("direction", "i8", 3),  # the same for single rays: of the nearest corner
-        ("longest", "i8", 1),
+        ("skips", "i8", 1),  # tiles left that are cast one by one, see `_cast_in_mesh`
+        ("patience", "i8", 1),  # number of such tiles after the last tile that was not cast as one
         ("sums", "f8", 4),
-        ("distance", "f8", 4),
         ("pairs", "u1", 8 * 8 + 8),  # of a triangle and a subtile
         ("bits", "i8", 256),  # numbers of the bits that are set of each byte, a byte each
         ("stack", "i8", 1),  # address of the nodes that wait: `ENTRY` numbers of 4 bytes each
