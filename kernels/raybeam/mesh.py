@@ -144,9 +144,9 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     if len(index) < face_count:
         rows = rows[has_area]
         corners = corners[has_area]
-    used_corners = corners.reshape(-1, 3)
-    lower = used_corners.min(axis=0) - PAD
-    upper = used_corners.max(axis=0) + PAD
+    by_triangle = corners.reshape(-1, 9)
+    lower = by_triangle.min(axis=0).reshape(3, 3).min(axis=0) - PAD
+    upper = by_triangle.max(axis=0).reshape(3, 3).max(axis=0) + PAD
     frame = Frame(centre, scale, lower, upper)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(frame, points, rows, corners, index, face_count, checked)

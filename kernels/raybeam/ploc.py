@@ -12,6 +12,9 @@ a tenth of a second.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +86,12 @@ class _Clusters:
         self.upper = self.upper[:, remains]
         self.node = self.node[remains]
 
+    def keep_first(self, count: int) -> None:
+        """Keep a number of clusters at the front."""
+        self.lower = self.lower[:, :count]
+        self.upper = self.upper[:, :count]
+        self.node = self.node[:count]
+
 
 class _Nodes:
     """Arrays of all nodes of a `BinaryTree` of n boxes, and the boxes under each: (2n-1,)."""
@@ -97,6 +106,18 @@ class _Nodes:
 
     def merge(self, clusters: _Clusters, next_node: int, first: Indices, second: Indices) -> None:
         """Create nodes, from `next_node` on, of pairs of clusters, and replace the clusters."""
+        if loops := _compiled_loops():
+            left = loops.merge_pairs(
+                (clusters.lower, clusters.upper, clusters.node),
+                first,
+                second,
+                next_node,
+                (self.lower, self.upper),
+                (self.first_child, self.second_child),
+                self.count,
+            )
+            clusters.keep_first(left)
+            return
         new = np.arange(next_node, next_node + len(first), dtype=np.int32)
         self.first_child[new] = clusters.node[first]
         self.second_child[new] = clusters.node[second]
@@ -166,9 +187,37 @@ def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
     """Return pairs of positions of mutual best partners, the lower position first."""
     n = lower.shape[1]
     position = np.arange(n)
+    best = np.empty(n, np.int64)
+    if loops := _compiled_loops():
+        loops.best_partners(lower, upper, _RADIUS, best)
+    else:
+        _find_best_partners(lower, upper, best)
+    first = np.flatnonzero((best[best] == position) & (position < best))
+    if (
+        16 * len(first) < n
+    ):  # long chains of ever better partners: do not merge a single pair a round
+        first = position[: n - 1 : 2]
+        return first, first + 1
+    return first, best[first]
+
+
+@cache
+def _compiled_loops() -> Any:
+    """Return the module of compiled loops, which takes a tenth of the time; None without numba."""
+    if find_spec("numba") is None:
+        return None
+    from . import ploc_loops
+
+    return ploc_loops
+
+
+def _find_best_partners(lower: Floats32, upper: Floats32, best: Indices) -> None:
+    """Write the position of each cluster's best partner."""
+    n = lower.shape[1]
+    position = np.arange(n)
     # If all candidates are equally good, as among copies of one triangle, partners must still
     # match: start from the pairs (0, 1), (2, 3), ... and accept only better partners.
-    best = np.minimum(position ^ 1, n - 1)
+    best[:] = np.minimum(position ^ 1, n - 1)
     cost = np.full(n, np.inf, np.float32)
     even = position[: n - 1 : 2]
     cost[even] = _half_area(
@@ -188,13 +237,6 @@ def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
             cheaper = area < cost[cluster]
             cost[cluster[cheaper]] = area[cheaper]
             best[cluster[cheaper]] = neighbour[cheaper]
-    first = np.flatnonzero((best[best] == position) & (position < best))
-    if (
-        16 * len(first) < n
-    ):  # long chains of ever better partners: do not merge a single pair a round
-        first = even
-        return first, first + 1
-    return first, best[first]
 
 
 def _half_area(size: Floats32) -> Floats32:

@@ -32,6 +32,7 @@ from .ray_loops import make_rays, share_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
 from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, row_at
+
 _TILE_RAYS = 8 * SUBTILES  # of rays at bodies
 
 

@@ -1072,9 +1072,7 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start, t_min):  # t
     while left != 0:
         lane = lowest_bit(left)
         left &= left - 1
-        closer |= np.int64(
-            _decide_one(tile, rays, ray, mesh, instance, first + lane, t_min)
-        )
+        closer |= np.int64(_decide_one(tile, rays, ray, mesh, instance, first + lane, t_min))
     return closer
 
 

@@ -13,6 +13,7 @@ at most u.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -59,11 +60,12 @@ def build_tree(
     leaf_size
         Maximum triangles of a leaf, up to ``1 << LEAF_BITS``.
     triangle_cost
-        Cost of each triangle of a leaf, as a share of the cost of a node; the leaf itself costs as
-        much as a node. None for leaves that cost as much as a node for each triangle.
+        Cost of each triangle of a leaf, as a share of the leaf's; a node costs half as much as a
+        leaf. None for leaves that cost as much as a node for each triangle.
     """
-    lower = np.ascontiguousarray((corners.min(axis=1) - PAD).T, dtype=np.float32)
-    upper = np.ascontiguousarray((corners.max(axis=1) + PAD).T, dtype=np.float32)
+    each = corners.transpose(1, 0, 2)  # reduced corner by corner: ten times as fast
+    lower = np.ascontiguousarray((reduce(np.minimum, each) - PAD).T, dtype=np.float32)
+    upper = np.ascontiguousarray((reduce(np.maximum, each) + PAD).T, dtype=np.float32)
     binary = ploc.build(lower, upper)
     count, leaf = _leaves(binary, leaf_size, triangle_cost)
     first = _positions(binary, count)
@@ -117,12 +119,7 @@ def _leaves(
     By the surface area heuristic, with the costs that `build_tree` describes.
     """
     area = tree.area
-    import os
-
-    nodec = float(os.environ.get("NC", "0.5")) if triangle_cost is not None else 1.0
-    if triangle_cost is not None:
-        triangle_cost = float(os.environ.get("TC", "0.05"))
-    fixed, slope = (0.0, 1.0) if triangle_cost is None else (1.0, triangle_cost)
+    fixed, slope, opened = (0.0, 1.0, 1.0) if triangle_cost is None else (1.0, triangle_cost, 0.5)
     count = np.ones(len(area), np.int32)
     cost = area * np.float32(fixed + slope)
     leaf = np.ones(len(area), np.bool_)
@@ -131,7 +128,7 @@ def _leaves(
         second_child = tree.second_child[start:stop]
         count[start:stop] = count[first_child] + count[second_child]
         leaf_cost = area[start:stop] * (fixed + slope * count[start:stop]).astype(np.float32)
-        split_cost = area[start:stop] * np.float32(nodec) + cost[first_child] + cost[second_child]
+        split_cost = area[start:stop] * np.float32(opened) + cost[first_child] + cost[second_child]
         is_cheaper = (count[start:stop] <= leaf_size) & (leaf_cost <= split_cost)
         leaf[start:stop] = is_cheaper
         cost[start:stop] = np.where(is_cheaper, leaf_cost, split_cost)
