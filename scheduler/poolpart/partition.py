@@ -590,7 +590,7 @@ class Partition:
     # -- workers that come and go ------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Let the number of jobs of a `start_partitions` partition follow the work.
+        """Let the number of jobs follow the work, of `start_partitions` or `scale_groups`.
 
         Jobs are started for tasks that can run and have no slot, second by second, and for what
         clients `want`. One is returned, or cancelled while it waits in the queue, when it was not
@@ -608,7 +608,8 @@ class Partition:
         Raises
         ------
         PoolError
-            If the workers were not started by `start_partitions`, or the numbers are not possible.
+            If neither `start_partitions` nor `scale_groups` starts the workers, or the numbers are
+            not possible.
 
         Examples
         --------
@@ -618,7 +619,8 @@ class Partition:
         if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
             raise PoolError(
                 f"Partition {self.name!r} has no jobs that can be started: only partitions of "
-                "start_partitions adapt. Those of a divided pool grow by Partition.grow."
+                "start_partitions and scale_groups adapt. Those of a divided pool grow by "
+                "Partition.grow."
             )
 
     def want(self, slots: int) -> bool:

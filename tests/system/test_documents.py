@@ -31,6 +31,7 @@ import numpy as np
 import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
+from tests import kubernetes
 from tests.clusters import import_jobqueue
 
 import lidarpool
@@ -133,12 +134,14 @@ def in_threads(monkeypatch, cluster_client):
 
 @pytest.mark.extended(every=4)
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
-def test_python_runs(tmp_path, block, in_threads, capsys):
+def test_python_runs(tmp_path, block, in_threads, capsys, monkeypatch):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
     if "dask_jobqueue" in block.code:
         import_jobqueue()
+    if "dask_kubernetes" in block.code:
+        kubernetes.install(monkeypatch)  # a stand-in
     if "Foxglove" in block.code:
         pytest.importorskip("foxglove", reason="needs foxglove-sdk: the extra live")
     if "import mujoco" in block.code:
