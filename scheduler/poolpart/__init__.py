@@ -1,5 +1,6 @@
 """Pool partitions and pipes for Dask clusters."""
 
+from . import extras as extras  # adds its features
 from .background import after_all
 from .cancelling import cancelled
 from .devices import own_device, own_device_share

@@ -18,6 +18,7 @@ from tornado import web
 from tornado.template import Template
 
 from .errors import PoolError
+from .features import FEATURES, Feature
 from .fence import fences_of
 from .html_table import WORDS, shown_seconds
 from .internals.names import PAGE, require
@@ -250,3 +251,14 @@ def close_page(scheduler: Any) -> None:
     if NAME in scheduler.plugins:
         serve_no_longer(scheduler, scheduler.plugins[NAME].page)
         scheduler.remove_plugin(NAME)
+
+
+class _Page(Feature):
+    """Closes the page with the last partition."""
+
+    def end_all(self, scheduler: Any) -> None:
+        """Stop serving the page."""
+        close_page(scheduler)
+
+
+FEATURES.append(_Page())

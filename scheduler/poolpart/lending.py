@@ -323,7 +323,6 @@ class _WaitHooks:
 
 
 WAIT_HOOKS = _WaitHooks()
-slots_lent = WAIT_HOOKS.lent
 
 
 # -- on and off --------------------------------------------------------------------------

@@ -1,0 +1,9 @@
+"""What a program can do without: each module is one idea, for those who ask for it.
+
+The core does not import these modules. `Partition`, `Pool` and `Pipe` hand calls on to them, and
+modules with a `Feature` begin and end with partitions.
+"""
+
+from .. import dashboard_page, inherit, metrics
+
+__all__ = ["dashboard_page", "inherit", "metrics"]
