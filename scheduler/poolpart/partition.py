@@ -14,15 +14,15 @@ from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
-from .background import in_background
-from .cancelling import ask_to_cancel
 from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
-from .for_each import ItemTasks
+from .extras.background import in_background
+from .extras.cancelling import ask_to_cancel
+from .extras.for_each import ItemTasks
+from .extras.notebook import table_of_partition
 from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
-from .notebook import table_of_partition
 from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .rules import check_count

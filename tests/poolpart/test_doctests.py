@@ -8,12 +8,16 @@ import pytest
 
 import poolpart
 
-MODULES = [module.name for module in pkgutil.iter_modules(poolpart.__path__)]
+MODULES = [
+    module.name
+    for package in (poolpart, poolpart.extras)
+    for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")
+]
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings(name):
-    assert doctest.testmod(importlib.import_module(f"poolpart.{name}")).failed == 0
+    assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
 def test_the_public_names_exist():

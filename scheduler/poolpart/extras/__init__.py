@@ -4,6 +4,6 @@ The core does not import these modules. `Partition`, `Pool` and `Pipe` hand call
 modules with a `Feature` begin and end with partitions.
 """
 
-from .. import dashboard_page, inherit, metrics
+from . import dashboard_page, inherit, metrics
 
 __all__ = ["dashboard_page", "inherit", "metrics"]

@@ -26,12 +26,12 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .choosing import WorkerChoice
-from .errors import PoolError
-from .features import FEATURES, Feature
-from .internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
-from .internals.names import CHOOSING, NESTED, SHUFFLES, require
-from .internals.scheduler import Resources, tell_of_plugin
+from ..choosing import WorkerChoice
+from ..errors import PoolError
+from ..features import FEATURES, Feature
+from ..internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
+from ..internals.names import CHOOSING, NESTED, SHUFFLES, require
+from ..internals.scheduler import Resources, tell_of_plugin
 from .lending import lending_plugin
 
 logger = logging.getLogger(__name__)

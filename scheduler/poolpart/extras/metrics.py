@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary
 
 import dask
 
-from .features import FEATURES, Feature
-from .partition_stats import PartitionStats
+from ..features import FEATURES, Feature
+from ..partition_stats import PartitionStats
 
 _LABELS = ["partition"]
 
