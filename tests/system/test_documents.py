@@ -92,7 +92,7 @@ def blocks_of(path: Path) -> list[Block]:
 
 def programs() -> Iterator[Block]:
     """Python of all documents; that of a page which says so is one program."""
-    for path in DOCUMENTS:
+    for path in (*DOCUMENTS, ROOT / "scheduler/README.md"):
         python = [block for block in blocks_of(path) if block.language == "python"]
         if "<!-- one program -->" in path.read_text(encoding="utf-8"):
             code = "\n".join(block.code for block in python)
