@@ -93,7 +93,7 @@ class Advice:
 
 @dataclass(frozen=True)
 class GroupReport:
-    """What the process that scales a group of workers has done so far."""
+    """Report of the process that scales a group of workers."""
 
     size: int  # workers that the group was scaled to
     removed: Sequence[str] = ()  # names of workers that will not come back
@@ -101,7 +101,7 @@ class GroupReport:
 
 @dataclass(frozen=True)
 class GroupAdvice:
-    """What the process that scales a group of workers has to do."""
+    """Order to the process that scales a group of workers."""
 
     size: int  # workers that the group shall have
     leaving: tuple[str, ...] = ()  # names of closed workers, to be removed from the group

@@ -1,4 +1,4 @@
-"""What begins and ends with partitions on a scheduler, without the core knowing how.
+"""Features that begin and end with partitions on a scheduler, unknown to the core.
 
 The core calls `FEATURES` where partitions begin and end, and where tasks are counted. The modules
 of `extras` add themselves: inheritance, the page of partitions, and figures for Prometheus.

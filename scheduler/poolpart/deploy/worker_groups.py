@@ -1,4 +1,4 @@
-"""Partitions whose workers are a group that something else scales, such as Kubernetes.
+"""Partitions whose workers are a group of a deployment that scales groups, such as Kubernetes.
 
 The scheduler decides (`adapting.py`), as for jobs of a queue. Each second a thread of this process
 asks for the size that each group shall have, and passes changes on.
@@ -25,7 +25,7 @@ ADAPT_EVERY_S = 1.0  # seconds between two questions to the scheduler
 
 
 class WorkerGroups(Protocol):
-    """What scales groups of workers: the seam between partitions and their deployment."""
+    """Interface of an object that scales groups of workers, wherever the workers run."""
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> object:
         """Give a group `n` workers.

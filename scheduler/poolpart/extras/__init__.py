@@ -1,4 +1,4 @@
-"""What a program can do without: each module is one idea, for those who ask for it.
+"""Features beside the core: each module is an idea. The README says who asks for each of them.
 
 The core does not import these modules. `Partition`, `Pool` and `Pipe` hand calls on to them, and
 modules with a `Feature` begin and end with partitions.
