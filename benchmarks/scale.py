@@ -22,9 +22,7 @@ work on: what a run takes to start and to finish is no part of them.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
-import logging
 import math
 import multiprocessing
 import tempfile
@@ -36,26 +34,19 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import dask
 import psutil
-from distributed import Client, Scheduler, Worker, get_worker
+from distributed import Client, get_worker
 
 import lidarpool.run.pipeline.rigs
 from benchmarks.campaign import BASE, CAMPAIGN
 from benchmarks.control import single_scans
+from benchmarks.many_workers import process, run_scheduler, run_workers
 from lidarpool import Campaign, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
 from lidarsim.scene.actors import box
 from poolpart import Partition, Pool
 
 NAMES = ("A", "B", "C", "D")
-
-
-async def _scheduler(connection: Connection) -> None:
-    options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
-    async with Scheduler(**options, dashboard=False) as scheduler:
-        connection.send(scheduler.address)
-        await asyncio.to_thread(connection.recv)
 
 
 async def _workers(
@@ -66,15 +57,7 @@ async def _workers(
     seconds: float = 0.0,
     first: int = 0,
 ) -> None:
-    """Run workers, optionally with slots of a partition; batches take `seconds` to cast.
-
-    Their names count from `first` on.
-    """
-    options = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "host": "127.0.0.1"}
-    kind = ""
-    if slots is not None:
-        kind, threads = slots
-        options |= {"resources": {kind: threads}, "nthreads": threads}
+    """Run workers as `run_workers` does; batches take `seconds` to cast."""
     columns_of = lidarpool.run.pipeline.rigs.columns_of
 
     def slowly(points: Any) -> Any:
@@ -82,39 +65,7 @@ async def _workers(
         return columns_of(points)
 
     lidarpool.run.pipeline.rigs.columns_of = slowly
-    workers = [
-        Worker(address, name=f"{kind}{number}", **options) for number in range(first, first + count)
-    ]
-    await asyncio.gather(*workers)
-    connection.send(address)
-    await asyncio.to_thread(connection.recv)
-    await asyncio.gather(*(worker.close(nanny=False) for worker in workers))
-
-
-def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) -> None:
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    # What 200 workers measure of themselves takes more than a core, where they share a process.
-    rarely = {"admin.tick.interval": "10s", "admin.system-monitor.interval": "10s"}
-    rarely |= {"worker.profile.enabled": False}
-    dask.config.set({f"distributed.{name}": value for name, value in rarely.items()})
-    asyncio.run(main(connection, *arguments))
-
-
-@contextmanager
-def process(main: Callable[..., Any], *arguments: Any) -> Iterator[tuple[psutil.Process, str]]:
-    """Run `main` in a new process; yield the process and the address it sends when ready."""
-    context = multiprocessing.get_context("spawn")
-    parent_end, child_end = context.Pipe()
-    child = context.Process(target=_serve, args=(main, child_end, *arguments), daemon=True)
-    child.start()
-    child_end.close()  # so that the end of the process is the end of the pipe
-    try:
-        yield psutil.Process(child.pid), parent_end.recv()
-        parent_end.send(None)
-        child.join(30)
-    finally:
-        child.kill()
-        child.join()
+    await run_workers(connection, address, count, slots, first)
 
 
 def name_of_worker(_: object = None) -> str:
@@ -170,7 +121,7 @@ def processor_s(process: psutil.Process) -> float:
 def measure(workers: int, tasks: int) -> dict[str, Any]:
     """Return the figures of a cluster of `workers` workers."""
     with (
-        process(_scheduler) as (scheduler, address),
+        process(run_scheduler) as (scheduler, address),
         process(_workers, address, workers),
         Client(address) as client,
     ):
@@ -271,7 +222,7 @@ def casting_cluster(
         def start(main: Callable[..., Any], *arguments: Any) -> tuple[psutil.Process, str]:
             return stack.enter_context(process(main, *arguments))
 
-        scheduler, address = start(_scheduler)
+        scheduler, address = start(run_scheduler)
         lidar, _ = start(_workers, address, 1, ("LIDAR", 8 + gpus // GPUS_EACH))
         casting = [
             start(_workers, address, min(WORKERS_PER_PROCESS, gpus - n), ("GPU", 1), seconds, n)[0]

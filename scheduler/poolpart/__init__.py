@@ -1,10 +1,11 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from .background import after_all
-from .cancelling import cancelled
+from . import extras as extras  # adds its features
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
-from .listening import Listener
+from .extras.background import after_all
+from .extras.cancelling import cancelled
+from .extras.listening import Listener
 from .mapping import Results
 from .partition import Partition
 from .partition_stats import PartitionStats, StageStats

@@ -9,6 +9,9 @@ The scheduler decides, because no task can arrive between the moment when the sc
 worker idle and the moment when the worker stops getting tasks. A job that waits in the queue is
 cancelled in the same way: if its worker joins after all, the worker is sent away before it gets a
 task.
+
+A group of workers (`deploy/worker_groups.py`) has jobs without names: each worker is a job, named
+when it joins. Such a job cannot be cancelled before it joins.
 """
 
 from __future__ import annotations
@@ -77,6 +80,7 @@ class JobKind:
     slots: int  # of a worker
     workers: int = 1  # of a job
     bounds: Bounds | None = None  # None for a fixed number of jobs
+    cancellable: bool = True  # before its workers have joined
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,22 @@ class Advice:
 
     jobs_to_start: int = 0
     jobs_to_forget: Sequence[str] = ()  # their workers have ended, or they are to be cancelled
+
+
+@dataclass(frozen=True)
+class GroupReport:
+    """Report of the process that scales a group of workers."""
+
+    size: int  # workers that the group was scaled to
+    removed: Sequence[str] = ()  # names of workers that will not come back
+
+
+@dataclass(frozen=True)
+class GroupAdvice:
+    """Order to the process that scales a group of workers."""
+
+    size: int  # workers that the group shall have
+    leaving: tuple[str, ...] = ()  # names of closed workers, to be removed from the group
 
 
 @dataclass(frozen=True)
@@ -104,6 +124,7 @@ class _Record:
     reported_at: float = 0.0  # when the process that starts jobs reported them
     missing_slots: float = 0.0  # at the last report
     superfluous_since: dict[str, float] = field(default_factory=dict)  # {queued job: time}
+    leaving: set[str] = field(default_factory=set)  # closed workers that a group still has
 
     @property
     def is_current(self) -> bool:
@@ -149,7 +170,20 @@ class Adaptation(SchedulerPlugin):
             if requester == client:
                 del self.requested[partition, requester]
 
-    # -- decisions--------------------------------------------------------------------
+    # -- decisions ---------------------------------------------------------------------
+
+    def group_jobs(self, name: str, report: GroupReport) -> dict[str, list[str]]:
+        """Return {job: names of its workers} of a group: its members, and pending workers."""
+        leaving = self.records[name].leaving
+        leaving.difference_update(report.removed)
+        members = [
+            str(worker.name)
+            for worker in self.scheduler.workers.values()
+            if worker.resources.get(name) and str(worker.name) not in self._cancelled
+        ]
+        pending_count = report.size - len(leaving) - len(members)
+        pending = [f"{name} pending {number}" for number in range(pending_count)]
+        return {job: [job] for job in (*members, *pending)}
 
     def waiting_slots(self) -> dict[str, float]:
         """Return the slots that tasks without a worker wait for, by partition."""
@@ -241,7 +275,7 @@ class Adaptation(SchedulerPlugin):
             upper = bounds.maximum - len(running)
             return max(0, min(max(number, lower), upper))
 
-        superfluous = queued[jobs_needed(missing) :]
+        superfluous = queued[jobs_needed(missing) :] if record.kind.cancellable else []
         record.superfluous_since = {
             job: record.superfluous_since.get(job, decided_at) for job in superfluous
         }
@@ -291,6 +325,8 @@ class Adaptation(SchedulerPlugin):
         except (OSError, TimeoutError):  # stopped, or leaving by itself
             busy = True
         if not busy and await retire(self.scheduler, workers):
+            # The container of a worker of Kubernetes is started again until it is removed.
+            self._cancelled.update(str(worker.name) for worker in workers)
             return True
         for worker in workers:
             reopen(self.scheduler, worker)
@@ -344,6 +380,27 @@ async def look(
         if closed:
             forgotten = [*advice[name].jobs_to_forget, job]
             advice[name] = replace(advice[name], jobs_to_forget=forgotten)
+    return advice
+
+
+async def look_at_groups(
+    reports: Mapping[str, GroupReport], dask_scheduler: Any = None
+) -> dict[str, GroupAdvice]:
+    """Return the sizes that groups of workers shall have, by partition; close idle workers first.
+
+    Closed workers are named again until a report says that they were removed: an earlier answer may
+    not have arrived.
+    """
+    adaptation = _adaptation_of(dask_scheduler)
+    if adaptation is None:
+        return {}
+    jobs = {name: adaptation.group_jobs(name, report) for name, report in reports.items()}
+    advice: dict[str, GroupAdvice] = {}
+    for name, change in (await look(jobs, dask_scheduler)).items():
+        leaving = adaptation.records[name].leaving
+        leaving.update(change.jobs_to_forget)
+        size = len(jobs[name]) + change.jobs_to_start - len(change.jobs_to_forget)
+        advice[name] = GroupAdvice(size, tuple(sorted(leaving)))
     return advice
 
 

@@ -14,10 +14,9 @@ from typing import Any
 
 from distributed import Client
 
-from .dashboard_page import close_page
 from .errors import PoolError
+from .features import FEATURES, begin_features, features_settled, names_with_features
 from .fence import enclose, lower
-from .inherit import begin_inheritance, inherited_names, workers_informed
 from .internals.scheduler import asks_for, lift_restrictions
 from .membership import release
 from .registration import forget_registrations
@@ -138,7 +137,7 @@ async def declare(
         steward.enter(name, rule)
         for worker in chosen[name]:
             steward.put(seats[worker.address], name, rule.slots_of(worker))
-    await workers_informed()  # before the members get tasks, which lend slots
+    await features_settled()  # before the members get tasks, which lend slots
     members = [seats[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: "; ".join(filter(None, (notes.get(name), common_note))) for name in rules}
@@ -183,14 +182,13 @@ async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
     """Prepare the scheduler for tasks of new partitions; return a remark for users, or "".
 
-    From now on, tasks that a task of a partition submits inherit the partition (`inherit.py`),
-    fences keep other tasks off exclusive partitions (`fence.py`), and tasks are counted
-    (`stats.py`). The remark names features that this version of Dask lacks. PoolError if it lacks
-    fences, and a rule is exclusive.
+    From now on, features such as inheritance are on (`features.py`), fences keep other tasks off
+    exclusive partitions (`fence.py`), and tasks are counted (`stats.py`). The remark names features
+    that this version of Dask lacks. PoolError if it lacks fences, and a rule is exclusive.
     """
     scheduler = steward.scheduler
     try:
-        note = begin_inheritance(rules, scheduler)
+        note = begin_features(scheduler, rules)
         for name, rule in rules.items():
             if rule.exclusive:
                 enclose(scheduler, name)
@@ -333,14 +331,15 @@ async def dissolve(
         lower(scheduler, name)
     release(scheduler, dissolved, client_id, had_rule=True)
     if names is None:  # also in partitions that workers were started with, which have no rule
-        release(scheduler, inherited_names(scheduler), client_id)
+        release(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
-        close_page(scheduler)
+        for feature in FEATURES:
+            feature.end_all(scheduler)
         forget_statistics(scheduler)
     for seat in seats:
         steward.put(seat, None)
     lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
-    await workers_informed()  # that tasks lend no more
+    await features_settled()  # that tasks lend no more
     # An absent worker comes back as it was started.
     present = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):

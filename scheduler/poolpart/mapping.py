@@ -26,8 +26,7 @@ from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
-from .internals.client import when_done
-from .lending import slots_lent
+from .internals.client import slots_lent, when_done
 from .membership import Prospects, prospects
 from .worker_wait import WAIT_S, WorkerWait, check_wait
 

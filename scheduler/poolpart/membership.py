@@ -1,8 +1,8 @@
 """Tasks that could never run are refused by the scheduler, so that submitting asks nothing.
 
 A client registers with the scheduler before its first task for a partition (`register`). From then
-on, tasks from inside tasks of the partition belong to the partition (`inherit.py`), and a rule
-looks at each graph of the client when the graph arrives. Tasks for a partition that was dissolved,
+on, features such as inheritance are on in the partition (`features.py`), and a rule looks at each
+graph of the client when the graph arrives. Tasks for a partition that was dissolved,
 for more slots than any worker of the partition has, or for a worker outside the partition fail with
 a `PoolError`; otherwise they would wait for ever. Tasks of other clients are not looked at.
 
@@ -26,7 +26,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .adapting import expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
-from .inherit import begin_inheritance, end_inheritance, inherited_names, workers_informed
+from .features import begin_features, end_features, features_settled, names_with_features
 from .internals.method_rules import Rules, rule_for_arriving_graphs
 from .internals.names import REFUSING, require
 from .internals.placing import has_worker_for, workers_declaring
@@ -138,7 +138,7 @@ class Registrations(SchedulerPlugin):
         clients.pop(client, None)
         if not has_rule(self.scheduler, name) and not any(clients.values()):
             clients.clear()
-            end_inheritance(self.scheduler, name)
+            end_features(self.scheduler, name)
         if not clients:
             del self.clients[name]
             self.with_rule.discard(name)
@@ -195,12 +195,12 @@ async def _register(
     if not objection and client_id in dask_scheduler.clients:
         # A worker's client closes only with the worker, so that it must not prolong an inheritance
         # that other clients have begun.
-        keeps = not (in_task and (ruled or name in inherited_names(dask_scheduler)))
+        keeps = not (in_task and (ruled or name in names_with_features(dask_scheduler)))
         registrations = registrations or Registrations(dask_scheduler)
         registrations.add(name, client_id, keeps, has_or_had_rule)
         if not ruled:  # or the division of the pool has begun it
-            begin_inheritance([name], dask_scheduler)
-        await workers_informed()
+            begin_features(dask_scheduler, [name])
+        await features_settled()
     return has_or_had_rule, objection
 
 
@@ -216,7 +216,7 @@ def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None)
 
 
 def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False) -> None:
-    """End inheritance in partitions without a rule, unless further clients are registered.
+    """End features in partitions without a rule, unless further clients are registered.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bo
     for name in names:
         registrations: Registrations | None = scheduler.plugins.get(NAME)
         if registrations is None or name not in registrations.clients:
-            end_inheritance(scheduler, name)
+            end_features(scheduler, name)
             continue
         if had_rule:
             registrations.with_rule.add(name)

@@ -14,15 +14,15 @@ from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
-from .background import in_background
-from .cancelling import ask_to_cancel
 from .division import ask, ask_to_dissolve, grow, shrink
 from .errors import PoolError
-from .for_each import ItemTasks
+from .extras.background import in_background
+from .extras.cancelling import ask_to_cancel
+from .extras.for_each import ItemTasks
+from .extras.notebook import table_of_partition
 from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
-from .notebook import table_of_partition
 from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .rules import check_count
@@ -590,7 +590,7 @@ class Partition:
     # -- workers that come and go ------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Let the number of jobs of a `start_partitions` partition follow the work.
+        """Let the number of jobs follow the work, of `start_partitions` or `scale_groups`.
 
         Jobs are started for tasks that can run and have no slot, second by second, and for what
         clients `want`. One is returned, or cancelled while it waits in the queue, when it was not
@@ -608,7 +608,8 @@ class Partition:
         Raises
         ------
         PoolError
-            If the workers were not started by `start_partitions`, or the numbers are not possible.
+            If neither `start_partitions` nor `scale_groups` starts the workers, or the numbers are
+            not possible.
 
         Examples
         --------
@@ -618,7 +619,8 @@ class Partition:
         if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
             raise PoolError(
                 f"Partition {self.name!r} has no jobs that can be started: only partitions of "
-                "start_partitions adapt. Those of a divided pool grow by Partition.grow."
+                "start_partitions and scale_groups adapt. Those of a divided pool grow by "
+                "Partition.grow."
             )
 
     def want(self, slots: int) -> bool:

@@ -31,12 +31,12 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 
 from .errors import PipeClosed, PipeFailed
+from .extras.listening import Listener
+from .extras.notebook import table_of_pipe
 from .internals.client import ask
 from .internals.names import PIPES, require
 from .internals.queues import Packed, unpack
 from .internals.worker import task_of_thread
-from .listening import Listener
-from .notebook import table_of_pipe
 from .pipe_states import (
     CHANGE,
     PUT,

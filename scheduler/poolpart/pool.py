@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Self
 from distributed import Client
 
 from .adapting import adaptive_names
-from .dashboard_page import leave_page, partitions_page
 from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
-from .notebook import table_of_partitions
+from .extras.dashboard_page import leave_page, partitions_page
+from .extras.notebook import table_of_partitions
 from .partition import Partition
 from .pipe_states import names_of_pipes
 from .probe import worker_gpus

@@ -16,8 +16,8 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .features import FEATURES
 from .fence import fences_of
-from .metrics import PartitionCollector, publish, withdraw
 from .partition_stats import PartitionStats, StageStats
 from .task_table import KEPT, TaskRow, moment
 
@@ -46,7 +46,8 @@ class Statistics(SchedulerPlugin):
         # {partition: its tasks that have ended, newest first}
         self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=KEPT))
         self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
-        self._collector: PartitionCollector | None = publish(self._all_stats)
+        for feature in FEATURES:
+            feature.begin_counting(self)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
@@ -97,7 +98,7 @@ class Statistics(SchedulerPlugin):
             )
         )
 
-    def _all_stats(self) -> list[PartitionStats]:
+    def all_stats(self) -> list[PartitionStats]:
         """Return the statistics of each partition, and of tasks without a partition."""
         names = {name for name, _ in self.ended}
         for worker in self.scheduler.workers.values():
@@ -105,9 +106,9 @@ class Statistics(SchedulerPlugin):
         return stats_of(sorted(names | {""}), self.scheduler)
 
     def stop(self) -> None:
-        """Withdraw the figures from ``/metrics``."""
-        withdraw(self._collector)
-        self._collector = None
+        """End what features do with the counts."""
+        for feature in FEATURES:
+            feature.end_counting(self)
 
     async def close(self) -> None:
         """Stop with the scheduler."""

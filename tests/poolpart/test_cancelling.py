@@ -122,7 +122,7 @@ def get_name():
 
 
 def test_a_worker_that_does_not_answer_is_not_restarted(processes, event, monkeypatch):
-    monkeypatch.setattr("poolpart.cancelling.ANSWER_S", 0.1)
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 0.1)
     gpu = Partition("GPU", processes)
     pid = gpu.submit(os.getpid).result(LONG_S)
     started, ended = event(processes), event(processes)

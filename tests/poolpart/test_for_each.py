@@ -44,7 +44,7 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
-    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.05)
+    monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.05)
     client = start({"a": {"resources": {"A": 1}}, "b": {}})
     leave(client, "a")
     pipe = Pipe("of-nobody", 3, client).create()
@@ -57,14 +57,14 @@ def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
 
 
 def test_of_a_partition_that_is_empty_for_a_while(start, monkeypatch, pool, wait_until):
-    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.0)
     looks = []
 
     def look(*args):
         looks.append(args)
         return prospects(*args)
 
-    monkeypatch.setattr("poolpart.for_each.prospects", look)
+    monkeypatch.setattr("poolpart.extras.for_each.prospects", look)
     client = start({"b": {}})
     pipe = Pipe("of-nobody", 3, client).create()
     # Nothing waits for a worker before the first item.

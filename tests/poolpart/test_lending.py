@@ -25,8 +25,9 @@ from distributed import (
 )
 from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, wait_for, worker_name
 
-from poolpart import Partition, Pipe, Pool, PoolError, inherit, rest
-from poolpart.lending import lending_plugin
+from poolpart import Partition, Pipe, Pool, PoolError, rest
+from poolpart.extras import inherit
+from poolpart.extras.lending import lending_plugin
 from poolpart.pipe import forget_pipes
 
 
@@ -441,7 +442,7 @@ def stop():
 @pytest.fixture
 def warned(monkeypatch):
     """Return the texts of warnings to a cluster's clients; nested tasks wait for a moment first."""
-    monkeypatch.setattr("poolpart.lending.WARN_AFTER_S", 0.2)
+    monkeypatch.setattr("poolpart.extras.lending.WARN_AFTER_S", 0.2)
     return lambda client: [pickle.loads(event["message"]) for _, event in client.get_events("warn")]
 
 

@@ -75,7 +75,7 @@ def test_a_pipe_that_fails_is_an_error(client, make_pipe):
 
 
 def test_a_block_that_raises_does_not_wait_for_the_pipe(client, make_pipe, monkeypatch):
-    monkeypatch.setattr("poolpart.listening._LOOK_S", 0.05)
+    monkeypatch.setattr("poolpart.extras.listening._LOOK_S", 0.05)
     pipe = make_pipe(client)
     items = []
     with pytest.raises(ZeroDivisionError), pipe.listen(items.append):

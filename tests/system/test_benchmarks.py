@@ -5,7 +5,17 @@ import re
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import control, decoders, effects, formats, gpu, model, scale, submitting
+from benchmarks import (
+    beside_dask,
+    control,
+    decoders,
+    effects,
+    formats,
+    gpu,
+    model,
+    scale,
+    submitting,
+)
 from distributed import Client
 from docs.pictures import adapting as adapting_picture
 from docs.pictures.effects import __main__ as pictures
@@ -54,6 +64,16 @@ def test_submitting(tmp_path, capsys, kind):
     assert json.loads(path.read_text()) == figures
     assert figures["Partition.submit sending"] > 0
     assert "ratio: " in capsys.readouterr().out
+
+
+def test_beside_dask(tmp_path, capsys):
+    path = tmp_path / "figures.json"
+    rows = beside_dask.main(["--quick", "--json", str(path)])
+    assert json.loads(path.read_text()) == rows
+    small, wide = {"submit", "map", "map_items", "pipe"}, {"wide_submit", "wide_map"}
+    assert rows.keys() == small | wide
+    assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
+    assert capsys.readouterr().out.count("beside Dask") == 6
 
 
 def test_adapting(tmp_path, capsys):

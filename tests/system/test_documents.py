@@ -31,6 +31,7 @@ import numpy as np
 import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
+from tests import kubernetes
 from tests.clusters import import_jobqueue
 
 import lidarpool
@@ -91,7 +92,7 @@ def blocks_of(path: Path) -> list[Block]:
 
 def programs() -> Iterator[Block]:
     """Python of all documents; that of a page which says so is one program."""
-    for path in DOCUMENTS:
+    for path in (*DOCUMENTS, ROOT / "scheduler/README.md"):
         python = [block for block in blocks_of(path) if block.language == "python"]
         if "<!-- one program -->" in path.read_text(encoding="utf-8"):
             code = "\n".join(block.code for block in python)
@@ -133,12 +134,14 @@ def in_threads(monkeypatch, cluster_client):
 
 @pytest.mark.extended(every=4)
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
-def test_python_runs(tmp_path, block, in_threads, capsys):
+def test_python_runs(tmp_path, block, in_threads, capsys, monkeypatch):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
     if "dask_jobqueue" in block.code:
         import_jobqueue()
+    if "dask_kubernetes" in block.code:
+        kubernetes.install(monkeypatch)  # a stand-in
     if "Foxglove" in block.code:
         pytest.importorskip("foxglove", reason="needs foxglove-sdk: the extra live")
     if "import mujoco" in block.code:

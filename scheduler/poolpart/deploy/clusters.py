@@ -139,7 +139,7 @@ class _PartitionJobs:
         cluster_options = dict(options)
         slots = cluster_options.pop("slots", 1)
         check_count(f"The number of slots of partition {name!r}", slots)
-        bounds = _take_bounds(name, cluster_options)
+        bounds = take_bounds(name, cluster_options)
         try:
             if bounds is not None:
                 count = bounds.minimum
@@ -176,7 +176,7 @@ class _PartitionJobs:
         }
 
 
-def _take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
+def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
     """Remove `adapt` and `idle_s` from the options of a partition; return None if absent."""
     adapt = options.pop("adapt", None)
     idle_s = options.pop("idle_s", None)

@@ -12,8 +12,8 @@ from typing import Any
 
 from distributed import Client
 
-from ..background import in_background
 from ..errors import PoolError
+from ..extras.background import in_background
 from ..internals.scheduler import number_of_transitions
 from ..pipe_states import names_of_pipes
 from ..stats import statistics_of

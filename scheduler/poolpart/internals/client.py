@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any, Protocol
 
@@ -29,6 +29,9 @@ class WaitHooks(Protocol):
         """Lend the slots within the block, if the task waits."""
 
 
+_hooks: list[WaitHooks] = []  # of `let_waits_lend`
+
+
 @cache  # once: another library may have wrapped the same since, and goes on calling this
 def let_waits_lend(hooks: WaitHooks) -> None:
     """Wrap the waits of Dask's clients so that waiting tasks of this process lend slots.
@@ -42,6 +45,7 @@ def let_waits_lend(hooks: WaitHooks) -> None:
     from distributed.actor import ActorFuture
     from distributed.utils import SyncMethodMixin
 
+    _hooks.append(hooks)
     of_future = (Future._result, Future._exception, Future._traceback)
     waits_for_futures = {*of_future, Client._gather, distributed.client._wait}
     sync = SyncMethodMixin.sync
@@ -90,6 +94,11 @@ def let_waits_lend(hooks: WaitHooks) -> None:
     SyncMethodMixin.sync = sync_lending
     ActorFuture.result = result_of_actor_lending
     as_completed.__next__ = as_completed.next = next_lending
+
+
+def slots_lent(waits: bool) -> AbstractContextManager[None]:
+    """Lend the slots of this thread's task within the block, if it waits, and tasks lend here."""
+    return _hooks[0].lent(waits) if _hooks else nullcontext()
 
 
 def when_done(future: Future, function: Callable[[Future], Any]) -> None:

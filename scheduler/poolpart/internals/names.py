@@ -256,6 +256,9 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}.retire_workers",
             f"{_SCHEDULER}.close_worker",
             f"{_SCHEDULER}.unrunnable",
+            f"{_SCHEDULER}.resources",
+            f"{_SCHEDULER_WORKER}.resources",
+            f"{_SCHEDULER_WORKER}.used_resources",
             f"{_SCHEDULER_WORKER}.processing",
             f"{_SCHEDULER_WORKER}.long_running",
             f"{_SCHEDULER_WORKER}.has_what",
@@ -269,6 +272,7 @@ PRIVATE_NAMES = (
             "test_adapting.py::test_no_task_is_lost_or_run_again_while_workers_come_and_go",
             "test_adapting.py::test_a_worker_is_kept_for_what_would_be_lost_with_it",
             "test_adapting.py::test_a_worker_whose_job_was_cancelled_too_late_gets_no_task",
+            "test_worker_groups.py::test_a_container_of_a_closed_worker_gets_no_task_and_is_removed",
         ),
     ),
     PrivateNames(

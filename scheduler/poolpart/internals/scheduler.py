@@ -212,8 +212,10 @@ async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
 
 
 def turn_away(scheduler: Any, worker: Any) -> None:
-    """Close a joining worker before the worker gets tasks."""
+    """Close a joining worker before the worker gets tasks of a partition."""
     shut(scheduler, worker)
+    # A worker that joins says that it is running before it reads that it has to close.
+    show(scheduler, worker, {})
     scheduler.close_worker(worker.address)
 
 

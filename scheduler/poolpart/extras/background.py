@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from distributed import Future
 
-from .internals.client import when_done
+from ..internals.client import when_done
 
 Result = TypeVar("Result")
 

@@ -17,24 +17,25 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
 from tornado.template import Template
 
-from .errors import PoolError
-from .fence import fences_of
-from .html_table import WORDS, shown_seconds
-from .internals.names import PAGE, require
-from .internals.scheduler import serve, serve_no_longer
-from .other_sites import names_of_machine, refusal
-from .partition_stats import COUNTS, StageStats
-from .pipe_states import pipes_of
-from .stats import NAME as STATISTICS
-from .stats import (
+from ..errors import PoolError
+from ..features import FEATURES, Feature
+from ..fence import fences_of
+from ..html_table import WORDS, shown_seconds
+from ..internals.names import PAGE, require
+from ..internals.scheduler import serve, serve_no_longer
+from ..partition_stats import COUNTS, StageStats
+from ..pipe_states import pipes_of
+from ..stats import NAME as STATISTICS
+from ..stats import (
     forget_statistics,
     running_on,
     slots_of,
     statistics_of,
     stats_of,
 )
-from .steward import NAME as STEWARD
-from .workers import check_client, on_scheduler
+from ..steward import NAME as STEWARD
+from ..workers import check_client, on_scheduler
+from .other_sites import names_of_machine, refusal
 
 NAME = "poolpart-page"
 PATH = "partitions"
@@ -250,3 +251,14 @@ def close_page(scheduler: Any) -> None:
     if NAME in scheduler.plugins:
         serve_no_longer(scheduler, scheduler.plugins[NAME].page)
         scheduler.remove_plugin(NAME)
+
+
+class _Page(Feature):
+    """Closes the page with the last partition."""
+
+    def end_all(self, scheduler: Any) -> None:
+        """Stop serving the page."""
+        close_page(scheduler)
+
+
+FEATURES.append(_Page())

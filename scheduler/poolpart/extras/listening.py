@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from dask.utils import funcname
 
+from ..errors import PipeClosed, PipeFailed
 from .background import in_background
-from .errors import PipeClosed, PipeFailed
 
 if TYPE_CHECKING:
-    from .pipe import Pipe
+    from ..pipe import Pipe
 
 _LOOK_S = 1.0  # between looks whether the listener was stopped
 

@@ -21,16 +21,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .choosing import WorkerChoice
-from .errors import PoolError
-from .internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
-from .internals.names import CHOOSING, NESTED, SHUFFLES, require
-from .internals.scheduler import Resources, tell_of_plugin
+from ..choosing import WorkerChoice
+from ..errors import PoolError
+from ..features import FEATURES, Feature
+from ..internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
+from ..internals.names import CHOOSING, NESTED, SHUFFLES, require
+from ..internals.scheduler import Resources, tell_of_plugin
 from .lending import lending_plugin
 
 logger = logging.getLogger(__name__)
@@ -88,35 +89,43 @@ class Inheritance(SchedulerPlugin):
         self.scheduler.remove_plugin(NAME)
 
 
-def begin_inheritance(names: Iterable[str], scheduler: Any) -> str:
-    """Have nested tasks and shuffles of partitions stay in their partition.
+class _Inheriting(Feature):
+    """Begins and ends inheritance with partitions."""
 
-    Returns a remark for users on features that this version of Dask lacks, or "".
-    """
-    rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
-    for name in names:
-        if name not in rule.names:
-            rule.names.add(name)
-            if rule.lends:
-                _inform_workers(scheduler, name, lending_plugin(name))
-    return rule.note
+    def begin(self, scheduler: Any, names: Iterable[str]) -> str:
+        """Have nested tasks and shuffles of partitions stay in their partition."""
+        rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
+        for name in names:
+            if name not in rule.names:
+                rule.names.add(name)
+                if rule.lends:
+                    _inform_workers(scheduler, name, lending_plugin(name))
+        return rule.note
+
+    def end(self, scheduler: Any, name: str) -> None:
+        """End inheritance in a partition."""
+        rule: Inheritance | None = scheduler.plugins.get(NAME)
+        if rule is None or name not in rule.names:
+            return
+        rule.names.discard(name)
+        _inform_workers(scheduler, name, None)
+        if not rule.names:
+            rule.uninstall()
+
+    def names(self, scheduler: Any) -> Set[str]:
+        """Return the partitions whose nested tasks belong to them."""
+        rule: Inheritance | None = scheduler.plugins.get(NAME)
+        return frozenset() if rule is None else rule.names
+
+    async def settle(self) -> None:
+        """Wait until the workers have begun or ended to lend, at most `ANSWER_S` seconds."""
+        loop = asyncio.get_running_loop()
+        requests = {request for request in _requests if request.get_loop() is loop}
+        if requests:
+            await asyncio.wait(requests, timeout=ANSWER_S)
 
 
-def inherited_names(scheduler: Any) -> frozenset[str]:
-    """Return the partitions whose nested tasks belong to them."""
-    rule: Inheritance | None = scheduler.plugins.get(NAME)
-    return frozenset() if rule is None else frozenset(rule.names)
-
-
-def end_inheritance(scheduler: Any, name: str) -> None:
-    """End inheritance in a partition."""
-    rule: Inheritance | None = scheduler.plugins.get(NAME)
-    if rule is None or name not in rule.names:
-        return
-    rule.names.discard(name)
-    _inform_workers(scheduler, name, None)
-    if not rule.names:
-        rule.uninstall()
+FEATURES.append(_Inheriting())
 
 
 # -- workers, which lend -------------------------------------------------------------------
@@ -129,11 +138,3 @@ def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
     for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
         _requests.add(request)
         request.add_done_callback(_requests.discard)
-
-
-async def workers_informed() -> None:
-    """Wait until the workers have begun or ended to lend, at most `ANSWER_S` seconds."""
-    loop = asyncio.get_running_loop()
-    requests = {request for request in _requests if request.get_loop() is loop}
-    if requests:
-        await asyncio.wait(requests, timeout=ANSWER_S)

@@ -44,9 +44,9 @@ from distributed import Status, rejoin, secede
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
-from .internals.client import let_waits_lend
-from .internals.scheduler import Resources, Submitter, call
-from .internals.worker import (
+from ..internals.client import let_waits_lend
+from ..internals.scheduler import Resources, Submitter, call
+from ..internals.worker import (
     free_slots,
     is_running,
     resources_of,
@@ -323,7 +323,6 @@ class _WaitHooks:
 
 
 WAIT_HOOKS = _WaitHooks()
-slots_lent = WAIT_HOOKS.lent
 
 
 # -- on and off --------------------------------------------------------------------------
@@ -362,8 +361,8 @@ def lending_plugin(name: str) -> bytes:
 
         def setup(self, worker: Any) -> None:
             try:
+                from poolpart.extras.lending import begin_lending
                 from poolpart.internals.names import NESTED, missing_names
-                from poolpart.lending import begin_lending
             except ImportError:
                 return
             if not missing_names(NESTED):  # another version of Dask than the scheduler's
@@ -371,7 +370,7 @@ def lending_plugin(name: str) -> bytes:
 
         def teardown(self, worker: Any) -> None:
             if self.lender is not None:
-                from poolpart.lending import end_lending
+                from poolpart.extras.lending import end_lending
                 from poolpart.registration import forget_registrations
 
                 end_lending(worker, name)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import dask
 
-from .partition_stats import PartitionStats
+from ..features import FEATURES, Feature
+from ..partition_stats import PartitionStats
 
 _LABELS = ["partition"]
 
@@ -65,20 +67,29 @@ class PartitionCollector:
         yield from (*gauges.values(), tasks, ended, running, waiting)
 
 
-def publish(collect_stats: Callable[[], list[PartitionStats]]) -> PartitionCollector | None:
-    """Add the figures to ``/metrics``; None where prometheus-client is not installed."""
-    try:
-        from prometheus_client import REGISTRY
-    except ImportError:
-        return None
-    collector = PartitionCollector(collect_stats)
-    REGISTRY.register(collector)
-    return collector
+class _Metrics(Feature):
+    """Publishes the figures while a scheduler counts its tasks."""
+
+    def __init__(self) -> None:
+        self._collectors: WeakKeyDictionary[Any, PartitionCollector] = WeakKeyDictionary()
+
+    def begin_counting(self, statistics: Any) -> None:
+        """Add the figures to ``/metrics``, where prometheus-client is installed."""
+        try:
+            from prometheus_client import REGISTRY
+        except ImportError:
+            return
+        collector = PartitionCollector(statistics.all_stats)
+        self._collectors[statistics] = collector
+        REGISTRY.register(collector)
+
+    def end_counting(self, statistics: Any) -> None:
+        """Remove the figures."""
+        collector = self._collectors.pop(statistics, None)
+        if collector is not None:
+            from prometheus_client import REGISTRY
+
+            REGISTRY.unregister(collector)
 
 
-def withdraw(collector: PartitionCollector | None) -> None:
-    """Remove the figures."""
-    if collector is not None:
-        from prometheus_client import REGISTRY
-
-        REGISTRY.unregister(collector)
+FEATURES.append(_Metrics())

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from distributed import Future, Status
 
-from .errors import PoolError
-from .fetch import holds_for_driver
-from .internals.scheduler import asks_for, call, cancel_keys, holds_nothing, reopen, restart, shut
-from .internals.worker import running_keys, task_of_thread
-from .workers import on_scheduler
+from ..errors import PoolError
+from ..fetch import holds_for_driver
+from ..internals.scheduler import asks_for, call, cancel_keys, holds_nothing, reopen, restart, shut
+from ..internals.worker import running_keys, task_of_thread
+from ..workers import on_scheduler
 
 if TYPE_CHECKING:
-    from .partition import Partition
+    from ..partition import Partition
 
 Outcomes = dict[Any, str]  # {key of a task: what happened}
 

@@ -8,15 +8,15 @@ from typing import Any
 from distributed import Client
 from tornado.template import Template
 
-from .adapting import adaptive_names
+from ..adapting import adaptive_names
+from ..errors import PoolError
+from ..html_table import html_paragraph, html_table
+from ..membership import has_rule
+from ..partition_stats import COUNTS, PartitionStats
+from ..pipe_states import pipes_of
+from ..stats import stats_of
+from ..workers import on_scheduler
 from .dashboard_page import is_open, page_link
-from .errors import PoolError
-from .html_table import html_paragraph, html_table
-from .membership import has_rule
-from .partition_stats import COUNTS, PartitionStats
-from .pipe_states import pipes_of
-from .stats import stats_of
-from .workers import on_scheduler
 
 _LINK = Template("""\
 {% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Page of partitions</a></p>\
