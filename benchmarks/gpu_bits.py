@@ -73,7 +73,7 @@ def scattered_instances(shear: float) -> Iterator[Instance]:
 
 
 def bits(session: Session) -> Rows:
-    """Count values of sample rays that differ from NumPy's or those of tiles in any bit; 0 expected."""
+    """Count values of sample rays that differ from those of numpy or tiles; 0 expected."""
     step = max(1, session.sizes.rays // session.sizes.sample)
     sample = revolution(session.sizes.rays)[::step]
     other = "numpy" if available_backends()["tiles"] else "tiles"

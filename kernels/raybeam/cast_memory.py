@@ -52,7 +52,7 @@ CAST = np.dtype(
         ("t_min", "f8"),  # closest and farthest distance of a hit, local
         ("t_max", "f8"),
         ("index", "i8"),  # int32: row in the caller's faces, by row of the corners; 0 to write rows
-        ("hits", "i8"),  # float64, then int64: distances and keys of the rays of a call, and one more
+        ("hits", "i8"),  # float64, then int64: distances and keys of a call's rays, and one more
         ("first_ray", "i8"),  # the ray whose number is written as 0
         ("ray", "i8"),  # output of hits: uint32
         ("distance", "i8"),  # float64, metres
@@ -68,10 +68,13 @@ CAST = np.dtype(
 # 0 if the mesh is opaque, and width; addresses of the arrays of its `TileTree`.
 MESH = np.dtype(
     [
-        ("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("mask_height", "i8"), ("mask_width", "i8"),
+        ("corners", "i8"), ("uv", "i8"),
+        ("mask", "i8"), ("mask_height", "i8"), ("mask_width", "i8"),
         ("nodes", "i8"), ("blocks", "i8"), ("leaf_corners", "i8"), ("order", "i8"),
     ]
 )  # fmt: skip
+# Of `MESH`: index of fields, in 8 bytes.
+MASK_HEIGHT, NODES, BLOCKS, LEAF_CORNERS, ORDER = 3, 5, 6, 7, 8
 INSTANCE = np.dtype(
     [
         ("matrix", "f8", 12),  # to the mesh's coordinates

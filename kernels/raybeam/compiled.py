@@ -19,7 +19,7 @@ except ImportError:  # Windows: each process compiles for itself
 
 try:
     from llvmlite.binding import add_symbol
-    from numba import njit
+    from numba import njit, types
     from numba.core.ccallback import CFunc
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.runtime.nrt import rtsys
@@ -243,6 +243,7 @@ def part(signature: Any) -> Callable[[Any], Any]:
     return make
 
 
+WHOLE = (types.int64,) if njit is not None else ()  # argument of a part: a number or an address
 _parts: list[Any] = []  # whose addresses compiled code holds
 
 

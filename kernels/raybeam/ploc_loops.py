@@ -39,7 +39,7 @@ def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
 
 
 @compiled()
-def merge_pairs(  # type: ignore[no-untyped-def]  # noqa: PLR0917 - a compiled loop
+def merge_pairs(  # type: ignore[no-untyped-def]
     clusters, first, second, next_node, boxes, children, count
 ):
     """Create nodes of pairs of clusters, and replace the clusters; return how many are left.

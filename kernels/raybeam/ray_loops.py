@@ -16,7 +16,7 @@ from numba import carray, types
 from . import cast_memory as memory
 from .arrays import Floats, Ints
 from .cast_memory import casts_at, float64s, int64s
-from .compiled import compiled, inlined, part, stage
+from .compiled import WHOLE, compiled, inlined, part, stage
 from .mesh import NEAR
 from .pattern import Pattern
 from .poses import Poses
@@ -147,7 +147,7 @@ def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the directions of a tile's sub-rays, and their starts relative to the beams' origins.
 
     The rows of the sub-rays become rows of their beams. `lanes_per_beam` consecutive lanes are of a
@@ -307,7 +307,7 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
 
 
 @stage
-def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]
+def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Rotate vectors of a tile by the angular rates of their poses, as `PoseMotion` describes."""
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -438,7 +438,7 @@ def first_ray(cast, ray):  # type: ignore[no-untyped-def]
     return FirstRay((cast.first + ray) % total, pose, within, ray)
 
 
-@part(types.void(types.int64, types.int64, types.int64, types.int64))
+@part(types.void(*4 * WHOLE))
 def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays of a tile in local coordinates, by their numbers in the call.
 

@@ -169,7 +169,7 @@ class TileBackend(Backend):
 
     @staticmethod
     def _reach(limits: tuple[float, float], scale: float) -> tuple[float, float]:
-        """Return the limits of distances, local; the farthest finite, so that infinity is no hit."""
+        """Return the limits of distances, local; the farthest is finite: infinity is no hit."""
         t_min, t_max = limits
         return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
 

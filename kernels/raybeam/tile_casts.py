@@ -31,8 +31,9 @@ from .moving_loops import (
 from .ray_loops import make_rays, share_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
-from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, row_at
+from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, at, row_at
 
+_T_MIN = at("t_min")
 _TILE_RAYS = 8 * SUBTILES  # of rays at bodies
 
 
@@ -88,7 +89,7 @@ def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
-def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Cast rays `start` to `stop` of a `CAST`; write the hits in ray order, return their number."""
     cast = casts[0]
     address = casts.ctypes.data
@@ -100,6 +101,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 
     index = int32s(cast.index)
     indexed = cast.index != 0
     shifts = int64s(cast.shifts)
+    float64s(tile)[_T_MIN] = cast.t_min
     count = stop - start
     distances = float64s(cast.hits)
     keys = int64s(cast.hits + 8 * (count + 1))
@@ -120,7 +122,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914 
             if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
                 make_rays(address, start, rays, count)
                 _reset(tile, rays, cast.t_max, count)
-                cast_tile(tile, rays, cast.mesh, instances, cast.top, rays, cast.t_min)
+                cast_tile(tile, rays, cast.mesh, instances, cast.top, rays)
                 _keep_hits(tile, rays, cast.hits, count)
     hit_count = 0
     for k in range(count):
@@ -236,6 +238,7 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
     poses = crossing.poses
     row = crossing.row
     bodies = crossing.body
+    floats[_T_MIN] = cast.t_min
     corners = box_corners(float64s(crossing.box.ctypes.data))
     pair_at = row_at(NUMBER, _TILE_RAYS)
     norm_at = row_at(NORM, _TILE_RAYS)
@@ -263,7 +266,7 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
             pair += 1
         if filled != 0:
             _fill_up(tile, filled)
-            cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled, cast.t_min)
+            cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled)
             _write_hits(cast, crossing, nearest, filled)
 
 

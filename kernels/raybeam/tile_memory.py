@@ -12,8 +12,7 @@ import threading
 import numpy as np
 
 from .compiled import inlined
-from .tile_plan import SUBTILES
-
+from .tile_plan import SUBTILES as SUBTILES
 
 # Fields of a tile. float32 unless stated; vectors of eight numbers, if not one for each subtile.
 TILE = np.dtype(
@@ -23,7 +22,7 @@ TILE = np.dtype(
         ("padding", "f4", 1),  # of depths
         ("offset", "f4", 1),  # maximum offset of a ray from the tile's point, as `aim` describes
         ("spread", "f4", 2),  # factor of errors, see `aim`; and a gap
-        ("bounds", "f4", 4 * SUBTILES),  # of each subtile: lowest and highest su, lowest, highest sv
+        ("bounds", "f4", 4 * SUBTILES),  # of subtiles: lowest and highest su, lowest, highest sv
         ("tile_bounds", "f4", 8),  # of the tile, and a gap
         ("reach", "f4", SUBTILES),  # greatest depth of a subtile's rays
         ("planes", "f4", 4 * 7 * SUBTILES),  # of a subtile: normal above 0, below 0, and constant
@@ -32,6 +31,8 @@ TILE = np.dtype(
         ("edges", "f4", 14 * 8),  # of the triangles of a leaf, see `_prepare_leaf`
         ("near", "f4", 8),  # depths of the children of a node
         ("sides", "i8", 15),  # of boxes: where the coordinate of the farthest corner is, by plane
+        ("t_min", "f8", 1),  # closest distance of a hit, local
+        ("nested", "i8", 1),  # whether the mesh at hand has a transform
         ("skips", "i8", 1),  # tiles left that are cast one by one, see `_cast_in_mesh`
         ("patience", "i8", 1),  # number of such tiles after the last tile that was not cast as one
         ("sums", "f8", 4),

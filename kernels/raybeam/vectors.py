@@ -24,7 +24,7 @@ _I32 = ir.IntType(32)
 _I64 = ir.IntType(64)
 
 
-class Vector(types.Type):  # type: ignore[misc]
+class Vector(types.Type):
     """The numba type of a vector of `count` numbers of a type."""
 
     def __init__(self, element: Any, count: int) -> None:
@@ -40,7 +40,7 @@ _VECTOR = {types.float32: single8, types.float64: double4}
 
 
 @register_model(Vector)
-class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _LLVM[kind])
 
@@ -49,14 +49,12 @@ def _define_operator(function: Any, instruction: str) -> None:
     """Define an operator for two vectors of a type by an instruction of LLVM."""
 
     @infer_global(function)
-    class _Typing(AbstractTemplate):  # type: ignore[misc]
+    class _Typing(AbstractTemplate):
         def generic(self, arguments: Any, keywords: Any) -> Any:
-            if len(arguments) == 2 and isinstance(arguments[0], Vector):
-                if arguments[0] == arguments[1]:
-                    return signature(arguments[0], *arguments)
-            return None
+            first, *others = arguments
+            return signature(first, *arguments) if others == [first] else None
 
-    @lower_builtin(function, Vector, Vector)  # type: ignore[untyped-decorator]
+    @lower_builtin(function, Vector, Vector)
     def _lower(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return getattr(builder, instruction)(*arguments)
 
@@ -89,8 +87,9 @@ def load(context: Any, pointer: Any, index: Any) -> Any:
     kind = _VECTOR[pointer.dtype]
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
+        pointer, index = arguments
         align = kind.element.bitwidth // 8
-        return builder.load(_at(builder, *arguments, _LLVM[kind]), align=align)
+        return builder.load(_at(builder, pointer, index, _LLVM[kind]), align=align)
 
     return kind(pointer, types.int64), generate
 
@@ -258,7 +257,8 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
     """Fetch the line of an element to the cache."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
-        address = _at(builder, *arguments, _I8)
+        pointer, index = arguments
+        address = _at(builder, pointer, index, _I8)
         _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
@@ -297,7 +297,7 @@ def write_word(context: Any, pointer: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat_bits(context: Any, number: Any) -> Any:
-    """Return four copies of an int64, as the float64 with its bits: to be stored, not computed with."""
+    """Return four copies of an int64, as the float64 with its bits: to be stored only."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _splat(builder, builder.bitcast(arguments[0], ir.DoubleType()), _LLVM[double4])

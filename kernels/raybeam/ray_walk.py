@@ -1,0 +1,290 @@
+"""A single ray's way down the trees that tiles descend."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import types
+
+from .cast_memory import (
+    BLOCKS,
+    INSTANCE_BYTES,
+    KEYS_PER_INSTANCE,
+    MESH_FIELD,
+    NODES,
+    float32s,
+    float64s,
+    int32s,
+    int64s,
+)
+from .compiled import WHOLE, inlined, part, stage
+from .mesh_loops import enter_instance
+from .ray_loops import entry_distance
+from .tile_exact import decide_one
+from .tile_frame import ONE, ZERO, cross, dot
+from .tile_leaf import EDGE, FLOOR, LEAF_MASK, norm
+from .tile_memory import AXIS, ENTRY, IX, LENGTH, OX, T, U, at, row_at
+from .tile_tree import BLOCK, NODE
+from .tile_walk import put, sort_farthest_first
+from .tree import LEAF_BITS
+from .triangle_loops import shear
+from .vectors import at_least, higher_of, load, lower_of, lowest_bit, multiply_add, splat, store
+
+_NEAR = at("near")
+_STACK = at("stack")
+_TINY = np.float32(2.0**-60)
+_ACROSS = 4.0
+SLACK = 2.0**-20
+_MAX_ENTRY = 1e9
+
+
+class _Start(NamedTuple):
+    """A ray in float32, from where it enters the box of a scene or mesh.
+
+    Attributes
+    ----------
+    entry
+        Distance of the start from the ray's origin, float64; 0 unless the origin is remote.
+    x, y, z, dx, dy, dz
+        Start and direction.
+    ix, iy, iz
+        Reciprocals of the direction.
+    near_x, near_y, near_z
+        Where in a node the coordinates of its children's nearer sides are.
+    undecided
+        Whether the start is too inexact to discard triangles: -1 if so, else 0.
+    """
+
+    entry: float
+    x: np.float32
+    y: np.float32
+    z: np.float32
+    dx: np.float32
+    dy: np.float32
+    dz: np.float32
+    ix: np.float32
+    iy: np.float32
+    iz: np.float32
+    near_x: int
+    near_y: int
+    near_z: int
+    undecided: int
+
+
+@inlined
+def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the `_Start` of a ray, the first of whose six numbers has index k.
+
+    The box of a scene or mesh is within [-1, 1] and its padding.
+    """
+    ox = floats[k]
+    oy = floats[k + rays]
+    oz = floats[k + 2 * rays]
+    dx = floats[k + 3 * rays]
+    dy = floats[k + 4 * rays]
+    dz = floats[k + 5 * rays]
+    entry = entry_distance(1 + 2.0**-16, (ox, oy, oz), (dx, dy, dz))
+    x = np.float32(min(max(ox + entry * dx, -2.0), 2.0))
+    y = np.float32(min(max(oy + entry * dy, -2.0), 2.0))
+    z = np.float32(min(max(oz + entry * dz, -2.0), 2.0))
+    ix = ONE / _not_zero(np.float32(dx))
+    iy = ONE / _not_zero(np.float32(dy))
+    iz = ONE / _not_zero(np.float32(dz))
+    near_x = 0 if ix >= 0 else 24
+    near_y = 8 if iy >= 0 else 32
+    near_z = 16 if iz >= 0 else 40
+    # So far away, the start is off by more than the margins of the test in float32.
+    undecided = -1 if entry > _MAX_ENTRY else 0
+    d = np.float32(dx), np.float32(dy), np.float32(dz)
+    return _Start(entry, x, y, z, *d, ix, iy, iz, near_x, near_y, near_z, undecided)
+
+
+@inlined
+def _not_zero(component):  # type: ignore[no-untyped-def]
+    if abs(component) < _TINY:
+        return -_TINY if component < 0 else _TINY
+    return component
+
+
+@inlined
+def _limit_of(t, entry):  # type: ignore[no-untyped-def]
+    """Return a distance after the entry as float32, never less than the exact distance."""
+    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -_ACROSS), _ACROSS))
+
+
+@inlined
+def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untyped-def]
+    """Return the distances at which a ray meets the nearer and the farther side of eight boxes."""
+    far_at = (24 + 16 * axis) - near_at
+    factor = splat(inverse)
+    shift = splat(start * inverse)
+    return (
+        load(boxes, base + near_at) * factor - shift,
+        load(boxes, base + far_at) * factor - shift,
+    )
+
+
+@inlined
+def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Add the children of a node that a ray meets to a list, nearest last; return its length.
+
+    `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
+    at which the ray ends.
+    """
+    singles = float32s(tile)
+    stack = float32s(address)
+    codes = int32s(address)
+    boxes = float32s(nodes)
+    children = int32s(nodes)
+    base = node * NODE
+    near_x, far_x = _slab(boxes, base, start.near_x, 0, start.ix, start.x)
+    near_y, far_y = _slab(boxes, base, start.near_y, 1, start.iy, start.y)
+    near_z, far_z = _slab(boxes, base, start.near_z, 2, start.iz, start.z)
+    near = higher_of(higher_of(near_x, near_y), higher_of(near_z, splat(ZERO)))
+    far = lower_of(lower_of(far_x, far_y), lower_of(far_z, splat(limit)))
+    hit = at_least(far, near)
+    store(singles, _NEAR, near)
+    first = count
+    while hit != 0:
+        child = lowest_bit(hit)
+        hit &= hit - 1
+        stack[ENTRY * count] = singles[_NEAR + child]
+        codes[ENTRY * count + 1] = children[base + 48 + child]
+        count += 1
+    if count == first + 2:
+        # Mostly there are one or two, and which is nearer cannot be predicted.
+        k = ENTRY * first
+        here = stack[k]
+        there = stack[k + ENTRY]
+        one = codes[k + 1]
+        other = codes[k + ENTRY + 1]
+        swap = here < there
+        stack[k] = there if swap else here
+        stack[k + ENTRY] = here if swap else there
+        codes[k + 1] = other if swap else one
+        codes[k + ENTRY + 1] = one if swap else other
+    elif count > first + 2:
+        sort_farthest_first(address, first, count)
+    return count
+
+
+@inlined
+def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Test the triangles of a leaf and a ray; return whether it has a closer hit."""
+    record = int64s(mesh)
+    blocks = float32s(record[BLOCKS])
+    block = (code >> LEAF_BITS) * BLOCK
+    ax = load(blocks, block) - splat(start.x)
+    ay = load(blocks, block + 8) - splat(start.y)
+    az = load(blocks, block + 16) - splat(start.z)
+    e = load(blocks, block + 24), load(blocks, block + 32), load(blocks, block + 40)
+    f = load(blocks, block + 48), load(blocks, block + 56), load(blocks, block + 64)
+    d = splat(start.dx), splat(start.dy), splat(start.dz)
+    moment = cross((ax, ay, az), d)
+    normal = cross(e, f)
+    n1 = dot(f[0], f[1], f[2], moment[0], moment[1], moment[2])
+    n2 = splat(ZERO) - dot(e[0], e[1], e[2], moment[0], moment[1], moment[2])
+    n0 = (dot(normal[0], normal[1], normal[2], d[0], d[1], d[2]) - n1) - n2
+    size = norm(e) + norm(f)
+    distance = splat(ONE) + norm((ax, ay, az))
+    margin = multiply_add(splat(EDGE) * distance, size, splat(FLOOR))
+    positive = at_least(lower_of(lower_of(n0, n1), n2) + margin, splat(ZERO))
+    negative = at_least(margin, higher_of(higher_of(n0, n1), n2))
+    left = (positive | negative | start.undecided) & ((2 << (code & LEAF_MASK)) - 1)
+    first = np.int64(int32s(record[BLOCKS])[block + 72])
+    closer = np.int64(0)
+    while left != 0:
+        lane = lowest_bit(left)
+        left &= left - 1
+        closer |= np.int64(decide_one(tile, rays, ray, mesh, instance, first + lane))
+    return closer
+
+
+@part(types.void(*7 * WHOLE))
+def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
+    """Cast a ray in a mesh; the list of nodes has `waiting` entries of the tree above."""
+    floats = float64s(tile)
+    address = int64s(tile)[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    nodes = int64s(mesh)[NODES]
+    start = _start_of_ray(floats, row_at(first_row, rays) + ray, rays)
+    entry = start.entry
+    t_at = row_at(T, rays) + ray
+    length = floats[row_at(LENGTH, rays) + ray]
+    limit = _limit_of(floats[t_at] * length, entry)
+    put(stack, codes, waiting, ZERO, 0, 0)
+    count = waiting + 1
+    while count > waiting:
+        count -= 1
+        if stack[ENTRY * count] > limit:
+            continue
+        code = np.int64(codes[ENTRY * count + 1])
+        if code >= 0:
+            count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
+        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, ~code, start):
+            limit = _limit_of(floats[t_at] * length, entry)
+
+
+@stage
+def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write a ray in the coordinates of the mesh of an instance, whose record is at an address."""
+    floats = float64s(tile)
+    numbers = int64s(tile)
+    k = row_at(OX, rays) + ray
+    i = row_at(IX, rays) + ray
+    ox, oy, oz, dx, dy, dz, length = enter_instance(
+        float64s(instance),
+        floats[k],
+        floats[k + rays],
+        floats[k + 2 * rays],
+        floats[k + 3 * rays],
+        floats[k + 4 * rays],
+        floats[k + 5 * rays],
+    )
+    floats[i] = ox
+    floats[i + rays] = oy
+    floats[i + 2 * rays] = oz
+    floats[i + 3 * rays] = dx
+    floats[i + 4 * rays] = dy
+    floats[i + 5 * rays] = dz
+    floats[row_at(LENGTH, rays) + ray] = length
+    axis, u, v, w, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
+    numbers[row_at(AXIS, rays) + ray] = axis
+    i = row_at(U, rays) + ray
+    floats[i] = u
+    floats[i + rays] = v
+    floats[i + 2 * rays] = w
+    floats[i + 3 * rays] = sx
+    floats[i + 4 * rays] = sy
+    floats[i + 5 * rays] = sz
+
+
+@part(types.void(*5 * WHOLE))
+def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
+    """Cast a ray at all instances; `nodes` is the address of the tree over these."""
+    floats = float64s(tile)
+    numbers = int64s(tile)
+    address = numbers[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    start = _start_of_ray(floats, row_at(OX, rays) + ray, rays)
+    t_at = row_at(T, rays) + ray
+    put(stack, codes, 0, ZERO, 0, 0)
+    count = np.int64(1)
+    while count > 0:
+        count -= 1
+        limit = _limit_of(floats[t_at], start.entry)
+        if stack[ENTRY * count] > limit:
+            continue
+        code = np.int64(codes[ENTRY * count + 1])
+        if code >= 0:
+            count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
+            continue
+        number = ~code >> LEAF_BITS
+        record = instances + INSTANCE_BYTES * number
+        _enter(tile, rays, ray, record)
+        mesh = int64s(record)[MESH_FIELD]
+        key = KEYS_PER_INSTANCE * number
+        walk_by_one(tile, rays, ray, IX, mesh, key, count)

@@ -1,0 +1,324 @@
+"""A tile's axes, and its rays, sides and depths in them.
+
+A ray becomes a point (su, sv) of a plane across the tile's mean direction m: its direction is
+(su, sv, 1) in the axes (u, v, m), divided by the component along m. The margins are those of
+tile_loops.py, which also describes the parameters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from . import tile_memory as memory
+from .cast_memory import float32s, float64s, int64s
+from .compiled import WHOLE, inlined, part, stage
+from .tile_memory import LENGTH, SUBTILES, T, at, row_at
+from .vectors import (
+    absolute,
+    higher_of,
+    highest,
+    load,
+    lower_of,
+    lowest,
+    multiply_add,
+    narrow,
+    splat,
+    store,
+)
+
+_AXES = at("axes")
+_PADDING = at("padding")
+_OFFSET = at("offset")
+_SPREAD = at("spread")
+_BOUNDS = at("bounds")
+_TILE_BOUNDS = at("tile_bounds")
+_REACH = at("reach")
+_PLANES = at("planes")
+_TILE_PLANES = at("tile_planes")
+_SIDES = at("sides")
+_SUMS = at("sums")
+ZERO = np.float32(0)
+ONE = np.float32(1)
+FAR = np.float32(1e30)
+_UNIT = 2.0**-24
+_SIDE = np.float32(64 * _UNIT)
+_REACH_FACTOR = np.float32(1 + 2.0**-19)
+_REACH_MARGIN = np.float32(2.0**-19)
+_NARROW = np.float32(0.6)  # least cosine between m and a ray of a tile
+_MAX_START = 64.0  # local: rays that start farther away are cast one by one, from the scene's box
+
+
+@inlined
+def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
+    """Return the scalar products of vectors, by components."""
+    return multiply_add(ax, bx, multiply_add(ay, by, az * bz))
+
+
+@inlined
+def cross(a, b):  # type: ignore[no-untyped-def]
+    """Return the cross products of vectors, by components."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@inlined
+def tile_axes(singles):  # type: ignore[no-untyped-def]
+    """Return the tile's axes u, v, m as vectors of equal numbers: three components each."""
+    k = _AXES
+    u = splat(singles[k]), splat(singles[k + 1]), splat(singles[k + 2])
+    v = splat(singles[k + 3]), splat(singles[k + 4]), splat(singles[k + 5])
+    m = splat(singles[k + 6]), splat(singles[k + 7]), splat(singles[k + 8])
+    return u, v, m
+
+
+@inlined
+def turned(axes, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the components of vectors along the axes of the tile."""
+    u, v, m = axes
+    return (
+        dot(x, y, z, u[0], u[1], u[2]),
+        dot(x, y, z, v[0], v[1], v[2]),
+        dot(x, y, z, m[0], m[1], m[2]),
+    )
+
+
+@inlined
+def _narrowed(floats, k):  # type: ignore[no-untyped-def]
+    """Return eight float64 as float32."""
+    return narrow(load(floats, k), load(floats, k + 4))
+
+
+@stage
+def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
+    """Write the axes of a tile and the point that they start from; return its largest coordinate.
+
+    `first_row` is the first of six rows with origins and directions.
+    """
+    singles = float32s(tile)
+    floats = float64s(tile)
+    direction = row_at(first_row + 3, rays)
+    for axis in range(3):
+        total = splat(0.0)
+        for k in range(0, rays, 4):
+            total = total + load(floats, direction + axis * rays + k)
+        store(floats, _SUMS, total)
+        singles[_AXES + 6 + axis] = np.float32(
+            (floats[_SUMS] + floats[_SUMS + 1]) + (floats[_SUMS + 2] + floats[_SUMS + 3])
+        )
+    x = np.float64(singles[_AXES + 6])
+    y = np.float64(singles[_AXES + 7])
+    z = np.float64(singles[_AXES + 8])
+    start = _set_frame(singles, x, y, z)
+    for axis in range(3):
+        origin = row_at(first_row + axis, rays)
+        o = 0.5 * floats[origin] + 0.5 * floats[origin + rays - 1]
+        singles[_AXES + 9 + axis] = np.float32(o)
+        start = max(start, abs(o))
+    return start
+
+
+@inlined
+def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
+    """Write the three axes about a direction of any length but zero; return 0."""
+    norm = 1 / np.sqrt((x * x + y * y) + z * z)
+    x *= norm
+    y *= norm
+    z *= norm
+    a, b, c = 0.0, -z, y
+    if abs(z) < 0.9:
+        a, b, c = -y, x, 0.0
+    norm = 1 / np.sqrt((a * a + b * b) + c * c)
+    a *= norm
+    b *= norm
+    c *= norm
+    singles[_AXES] = np.float32(a)
+    singles[_AXES + 1] = np.float32(b)
+    singles[_AXES + 2] = np.float32(c)
+    singles[_AXES + 3] = np.float32(y * c - z * b)
+    singles[_AXES + 4] = np.float32(z * a - x * c)
+    singles[_AXES + 5] = np.float32(x * b - y * a)
+    singles[_AXES + 6] = np.float32(x)
+    singles[_AXES + 7] = np.float32(y)
+    singles[_AXES + 8] = np.float32(z)
+    return 0.0
+
+
+@stage
+def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Write su, sv and the depths of a tile's rays, and their bounds; return the least cosine to m.
+
+    `offset` becomes the maximum, over all rays, of the distance across m between the ray and the
+    ray with the same (su, sv) from the tile's point, and of the distance along m.
+    """
+    singles = float32s(tile)
+    floats = float64s(tile)
+    axes = tile_axes(singles)
+    origin = row_at(first_row, rays)
+    direction = row_at(first_row + 3, rays)
+    su_at = 2 * row_at(memory.SU, rays)
+    sv_at = 2 * row_at(memory.SV, rays)
+    dm_at = 2 * row_at(memory.DM, rays)
+    wm_at = 2 * row_at(memory.WM, rays)
+    px = splat(np.float64(singles[_AXES + 9]))
+    py = splat(np.float64(singles[_AXES + 10]))
+    pz = splat(np.float64(singles[_AXES + 11]))
+    one = splat(ONE)
+    offset = splat(ZERO)
+    cosine = splat(ONE)
+    each = rays // SUBTILES
+    for subtile in range(SUBTILES):
+        low_u = splat(FAR)
+        high_u = splat(-FAR)
+        low_v = splat(FAR)
+        high_v = splat(-FAR)
+        for k in range(subtile * each, (subtile + 1) * each, 8):
+            i = direction + k
+            du, dv, dm = turned(
+                axes,
+                _narrowed(floats, i),
+                _narrowed(floats, i + rays),
+                _narrowed(floats, i + 2 * rays),
+            )
+            cosine = lower_of(cosine, dm)
+            inverse = one / dm
+            su = du * inverse
+            sv = dv * inverse
+            store(singles, su_at + k, su)
+            store(singles, sv_at + k, sv)
+            store(singles, dm_at + k, dm)
+            low_u = lower_of(low_u, su)
+            high_u = higher_of(high_u, su)
+            low_v = lower_of(low_v, sv)
+            high_v = higher_of(high_v, sv)
+            i = origin + k
+            wu, wv, wm = turned(
+                axes,
+                narrow(load(floats, i) - px, load(floats, i + 4) - px),
+                narrow(load(floats, i + rays) - py, load(floats, i + rays + 4) - py),
+                narrow(load(floats, i + 2 * rays) - pz, load(floats, i + 2 * rays + 4) - pz),
+            )
+            store(singles, wm_at + k, wm)
+            across = absolute(wu - wm * su) + absolute(wv - wm * sv)
+            offset = higher_of(offset, across + absolute(wm))
+        singles[_BOUNDS + subtile] = lowest(low_u)
+        singles[_BOUNDS + SUBTILES + subtile] = highest(high_u)
+        singles[_BOUNDS + 2 * SUBTILES + subtile] = lowest(low_v)
+        singles[_BOUNDS + 3 * SUBTILES + subtile] = highest(high_v)
+    singles[_TILE_BOUNDS] = lowest(load(singles, _BOUNDS))
+    singles[_TILE_BOUNDS + 1] = highest(load(singles, _BOUNDS + SUBTILES))
+    singles[_TILE_BOUNDS + 2] = lowest(load(singles, _BOUNDS + 2 * SUBTILES))
+    singles[_TILE_BOUNDS + 3] = highest(load(singles, _BOUNDS + 3 * SUBTILES))
+    singles[_OFFSET] = highest(offset)
+    return lowest(cosine)
+
+
+@stage
+def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Write the sides of the tile and of its subtiles, with margins, and the padding of depths."""
+    singles = float32s(tile)
+    numbers = int64s(tile)
+    u, v, m = tile_axes(singles)
+    ox = splat(singles[_AXES + 9])
+    oy = splat(singles[_AXES + 10])
+    oz = splat(singles[_AXES + 11])
+    zero = splat(ZERO)
+    b = _TILE_BOUNDS
+    spread = (
+        ONE
+        + max(abs(singles[b]), abs(singles[b + 1]))
+        + max(abs(singles[b + 2]), abs(singles[b + 3]))
+    )
+    start = abs(singles[_AXES + 9]) + abs(singles[_AXES + 10]) + abs(singles[_AXES + 11])
+    padding = _SIDE * spread * (np.float32(2) + start)
+    singles[_SPREAD] = spread
+    singles[_PADDING] = padding
+    offset = singles[_OFFSET]
+    slack = splat(padding + np.float32(4) * offset)
+    for plane in range(5):
+        nx, ny, nz = m
+        constant = splat(-padding - np.float32(2) * offset)
+        if plane < 4:
+            x, y, z = u if plane < 2 else v
+            sign = splat(ONE if plane % 2 == 0 else -ONE)
+            bound = load(singles, _BOUNDS + SUBTILES * plane)
+            nx = (x - bound * m[0]) * sign
+            ny = (y - bound * m[1]) * sign
+            nz = (z - bound * m[2]) * sign
+            k = _PLANES + 7 * SUBTILES * plane
+            store(singles, k, higher_of(nx, zero))
+            store(singles, k + 8, higher_of(ny, zero))
+            store(singles, k + 16, higher_of(nz, zero))
+            store(singles, k + 24, lower_of(nx, zero))
+            store(singles, k + 32, lower_of(ny, zero))
+            store(singles, k + 40, lower_of(nz, zero))
+            store(singles, k + 48, slack - dot(nx, ny, nz, ox, oy, oz))
+            bound = splat(singles[_TILE_BOUNDS + plane])
+            nx = (x - bound * m[0]) * sign
+            ny = (y - bound * m[1]) * sign
+            nz = (z - bound * m[2]) * sign
+            constant = slack
+        constant = constant - dot(nx, ny, nz, ox, oy, oz)
+        x1 = lowest(nx)
+        y1 = lowest(ny)
+        z1 = lowest(nz)
+        k = _TILE_PLANES + 4 * plane
+        singles[k] = x1
+        singles[k + 1] = y1
+        singles[k + 2] = z1
+        singles[k + 3] = lowest(constant)
+        far = plane < 4  # of a side the farthest corner of a box counts, of the depth the nearest
+        numbers[_SIDES + 3 * plane] = 24 if (x1 >= 0) == far else 0
+        numbers[_SIDES + 3 * plane + 1] = 32 if (y1 >= 0) == far else 8
+        numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
+
+
+@part(types.float32(*3 * WHOLE))
+def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the greatest depth, rounded up, of the rays of subtiles (a mask), and of each subtile.
+
+    Returns the greatest depth of all subtiles.
+    """
+    singles = float32s(tile)
+    floats = float64s(tile)
+    t_at = row_at(T, rays)
+    length_at = row_at(LENGTH, rays)
+    dm_at = 2 * row_at(memory.DM, rays)
+    wm_at = 2 * row_at(memory.WM, rays)
+    depth_at = 2 * row_at(memory.DEPTH, rays)
+    far = splat(1e30)
+    factor = splat(_REACH_FACTOR)
+    margin = splat(_REACH_MARGIN + np.float32(2) * singles[_PADDING])
+    each = rays // SUBTILES
+    for subtile in range(SUBTILES):
+        if (subtiles >> subtile) & 1 == 0:
+            continue
+        greatest = splat(-FAR)
+        for k in range(subtile * each, (subtile + 1) * each, 8):
+            first = lower_of(load(floats, t_at + k) * load(floats, length_at + k), far)
+            second = lower_of(load(floats, t_at + k + 4) * load(floats, length_at + k + 4), far)
+            along = narrow(first, second) * load(singles, dm_at + k)
+            depth = multiply_add(along, factor, load(singles, wm_at + k) + margin)
+            store(singles, depth_at + k, depth)
+            greatest = higher_of(greatest, depth)
+        singles[_REACH + subtile] = highest(greatest)
+    return highest(load(singles, _REACH))
+
+
+@part(types.int64(*4 * WHOLE))
+def aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
+    """Prepare a tile for a traversal in the coordinates of its rays; return whether it is narrow.
+
+    `first_row` is the first of six rows with origins and directions, `mask` of subtiles to cast.
+    """
+    singles = float32s(tile)
+    if _set_axes(tile, rays, first_row) > _MAX_START:
+        return False
+    if not _flatten(tile, rays, first_row) > _NARROW:
+        return False
+    _set_planes(tile)
+    for subtile in range(SUBTILES):
+        singles[_REACH + subtile] = -FAR
+    limit_depths(tile, rays, mask)
+    return True

@@ -1,0 +1,195 @@
+"""A tile's way down a tree: eight children of a node, then eight subtiles, at a time.
+
+A box is outside the tile if it is outside one of its four sides, and outside a subtile likewise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from .cast_memory import BLOCKS, NODES, float32s, int32s, int64s, uint8s
+from .compiled import WHOLE, inlined, part
+from .tile_frame import FAR, ZERO, limit_depths
+from .tile_leaf import test_leaf
+from .tile_memory import ENTRY, SUBTILES, at
+from .tile_tree import BLOCK, NODE
+from .tree import LEAF_BITS
+from .vectors import (
+    at_least,
+    bit_count,
+    highest,
+    load,
+    lower_of,
+    lowest_bit,
+    multiply_add,
+    prefetch,
+    splat,
+    store,
+)
+
+_REACH = at("reach")
+_PLANES = at("planes")
+_TILE_PLANES = at("tile_planes")
+_NEAR = at("near")
+_SIDES = at("sides")
+_STACK = at("stack")
+_MET = at("met")
+
+
+@inlined
+def put(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
+    """Write entry k of a list: depth, code and mask of subtiles."""
+    stack[ENTRY * k] = near
+    codes[ENTRY * k + 1] = np.int32(code)
+    codes[ENTRY * k + 2] = np.int32(mask)
+
+
+@inlined
+def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
+    """Sort entries `start` to `stop` of a list at an address, the nearest last."""
+    stack = float32s(address)
+    codes = int32s(address)
+    for k in range(start + 1, stop):
+        near = stack[ENTRY * k]
+        code = codes[ENTRY * k + 1]
+        mask = codes[ENTRY * k + 2]
+        j = k
+        while j > start and stack[ENTRY * (j - 1)] < near:
+            put(stack, codes, j, stack[ENTRY * (j - 1)], codes[ENTRY * j - 3], codes[ENTRY * j - 2])
+            j -= 1
+        put(stack, codes, j, near, code, mask)
+
+
+@inlined
+def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Add the children of a node that the tile meets to the waiting ones, nearest last.
+
+    There were `count` of them; returns how many there are. `nodes` and `blocks` are addresses.
+    """
+    singles = float32s(tile)
+    numbers = int64s(tile)
+    address = numbers[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    boxes = float32s(nodes)
+    children = int32s(nodes)
+    base = node * NODE
+    inside = splat(FAR)
+    for plane in range(4):
+        k = _TILE_PLANES + 4 * plane
+        s = _SIDES + 3 * plane
+        side = multiply_add(
+            splat(singles[k]), load(boxes, base + numbers[s]), splat(singles[k + 3])
+        )
+        side = multiply_add(splat(singles[k + 1]), load(boxes, base + numbers[s + 1]), side)
+        side = multiply_add(splat(singles[k + 2]), load(boxes, base + numbers[s + 2]), side)
+        inside = lower_of(side, inside)
+    k = _TILE_PLANES + 16
+    depth = multiply_add(
+        splat(singles[k]), load(boxes, base + numbers[_SIDES + 12]), splat(singles[k + 3])
+    )
+    depth = multiply_add(splat(singles[k + 1]), load(boxes, base + numbers[_SIDES + 13]), depth)
+    depth = multiply_add(splat(singles[k + 2]), load(boxes, base + numbers[_SIDES + 14]), depth)
+    zero = splat(ZERO)
+    hit = at_least(inside, zero) & at_least(splat(deepest), depth)
+    store(singles, _NEAR, depth)
+    reach = load(singles, _REACH)
+    start = count
+    for _ in range(bit_count(hit)):
+        child = lowest_bit(hit)
+        hit &= hit - 1
+        k = base + child
+        lx = splat(boxes[k])
+        ly = splat(boxes[k + 8])
+        lz = splat(boxes[k + 16])
+        hx = splat(boxes[k + 24])
+        hy = splat(boxes[k + 32])
+        hz = splat(boxes[k + 40])
+        inside = splat(FAR)
+        for plane in range(4):
+            p = _PLANES + 7 * SUBTILES * plane
+            upper = multiply_add(load(singles, p), hx, load(singles, p + 48))
+            lower = load(singles, p + 24) * lx
+            upper = multiply_add(load(singles, p + 8), hy, upper)
+            lower = multiply_add(load(singles, p + 32), ly, lower)
+            upper = multiply_add(load(singles, p + 16), hz, upper)
+            lower = multiply_add(load(singles, p + 40), lz, lower)
+            inside = lower_of(upper + lower, inside)
+        near = singles[_NEAR + child]
+        subtiles = mask & at_least(inside, zero) & at_least(reach, splat(near))
+        code = np.int64(children[k + 48])
+        put(stack, codes, count, near, code, subtiles)
+        count += np.int64(subtiles != 0)  # no branch: it would often be mispredicted
+        leaf = blocks + 4 * BLOCK * (~code >> LEAF_BITS)
+        line = uint8s(nodes + 4 * NODE * code if code >= 0 else leaf)
+        for byte in range(0, 4 * BLOCK, 64):
+            prefetch(line, byte)
+    sort_farthest_first(address, start, count)
+    return count
+
+
+@part(types.int64(*5 * WHOLE))
+def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
+    """Cast the rays of the subtiles of a mask in a mesh; return whether that was done.
+
+    It is not done if the tile meets more leaves than half of its rays.
+    """
+    singles = float32s(tile)
+    address = int64s(tile)[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    nodes = int64s(mesh)[NODES]
+    blocks = int64s(mesh)[BLOCKS]
+    deepest = highest(load(singles, _REACH))
+    leaves = 0
+    put(stack, codes, 0, -FAR, 0, mask)
+    count = np.int64(1)
+    while count > 0:
+        count -= 1
+        near = stack[ENTRY * count]
+        code = np.int64(codes[ENTRY * count + 1])
+        subtiles = codes[ENTRY * count + 2] & at_least(load(singles, _REACH), splat(near))
+        if subtiles == 0:
+            continue
+        if code >= 0:
+            count = _open_node(tile, nodes, blocks, code, subtiles, deepest, count)
+            continue
+        leaves += 1
+        if leaves > rays // 2:
+            return False
+        changed = test_leaf(tile, rays, mesh, instance, ~code, subtiles, deepest)
+        if changed != 0:
+            deepest = limit_depths(tile, rays, changed)
+    return True
+
+
+@part(types.int64(*3 * WHOLE))
+def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
+    """Write the instances that a tile may meet, nearest last; return their number.
+
+    `nodes` is the address of the tree over the instances, `mask` of the subtiles to cast.
+    """
+    singles = float32s(tile)
+    numbers = int64s(tile)
+    address = numbers[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    met = float32s(numbers[_MET])
+    met_codes = int32s(numbers[_MET])
+    deepest = highest(load(singles, _REACH))
+    put(stack, codes, 0, -FAR, 0, mask)
+    count = np.int64(1)
+    met_count = np.int64(0)
+    while count > 0:
+        count -= 1
+        near = stack[ENTRY * count]
+        code = np.int64(codes[ENTRY * count + 1])
+        subtiles = codes[ENTRY * count + 2]
+        if code >= 0:
+            count = _open_node(tile, nodes, nodes, code, subtiles, deepest, count)
+        else:
+            put(met, met_codes, met_count, near, ~code >> LEAF_BITS, subtiles)
+            met_count += 1
+    sort_farthest_first(numbers[_MET], 0, met_count)
+    return met_count
