@@ -34,7 +34,7 @@ RAISED = 12.0  # metres above the ground with the last colour
 
 def cast(sweeps: int, triangles: int, connection: Connection) -> None:
     """Cast a sweep to compile, then send the points of `sweeps` sweeps."""
-    sweep = cases(city(triangles), "embree", (100,), "ouster/os1-64")["real"]
+    sweep = cases(city(triangles), "tiles", (100,), "ouster/os1-64")["real"]
     connection.send(len(sweep(0)))
     connection.recv()
     for number in range(sweeps):

@@ -187,15 +187,15 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
     for number in range(pair_count):
         pair = np.int64(pairs[_PAIRS + number])
         subtile = pair & 7
-        lane = pair >> 3
-        k = _EDGES + lane
+        triangle = pair >> 3
+        k = _EDGES + triangle
         n1 = _splat_three(singles, k)
         n2 = _splat_three(singles, k + 24)
         n0 = _splat_three(singles, k + 48)
         limit = splat(singles[k + 72])
         bias = splat(singles[k + 80])
         rounding = splat(singles[k + 96])
-        every = -((undecided >> lane) & 1) & 255
+        every = -((undecided >> triangle) & 1) & 255
         for i in range(subtile * each, (subtile + 1) * each, 8):
             su = load(singles, su_at + i)
             sv = load(singles, sv_at + i)
@@ -205,9 +205,9 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
             before = multiply_add(load(singles, depth_at + i), (e0 + e1) + (e2 + rounding), bias)
             passing = at_least(lower_of(lower_of(lower_of(e0, e1), e2) + limit, before), zero)
             passing |= every
-            numbers[survivors + survivor_count] = i << 8 | lane << 4 | (passing & 15)
+            numbers[survivors + survivor_count] = i << 8 | triangle << 4 | (passing & 15)
             survivor_count += np.int64((passing & 15) != 0)
-            numbers[survivors + survivor_count] = (i + 4) << 8 | lane << 4 | passing >> 4
+            numbers[survivors + survivor_count] = (i + 4) << 8 | triangle << 4 | passing >> 4
             survivor_count += np.int64(passing > 15)
     # Last, the test in float64 of these.
     eight_at = row_at(memory.AXIS_OF_EIGHT, rays)
