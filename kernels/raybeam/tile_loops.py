@@ -12,8 +12,8 @@ direction is (su, sv, 1) in the axes (u, v, m), divided by the component along m
 All of that is float32 with margins, and only discards. What is left is decided in float64 by the
 test of triangle.py, in its order of operations, so hits have the bits of the other backends.
 
-A tile that is too wide, too far away, or that meets more leaves than half of its rays, is cast ray
-by ray in the same tree. Rays with a negative reach are not cast.
+A tile that is too wide or too far away is cast ray by ray in the same tree, and so is the rest of a
+tile that meets more leaves than it has rays. Rays with a negative reach are not cast.
 
 Margins, with u = 2**-24, local coordinates of boxes within [-1, 1], and `spread` =
 1 + max |su| + max |sv| of the tile:
@@ -52,7 +52,7 @@ from .tile_exact import shear_rays
 from .tile_frame import aim
 from .tile_memory import ENTRY, IX, LENGTH, OX, SUBTILES, T, at, row_at
 from .tile_walk import list_instances, walk
-from .vectors import higher_of, highest, load, splat, square_root, store
+from .vectors import bit_count, higher_of, highest, load, splat, square_root, store
 
 _PADDING = at("padding")
 _OFFSET = at("offset")
@@ -75,12 +75,16 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[
     numbers = int64s(tile)
     if numbers[_SKIPS] > 0:
         numbers[_SKIPS] -= 1
-    elif aim(tile, rays, first_row, mask) != 0 and walk(tile, rays, mesh, instance, mask) != 0:
-        numbers[_PATIENCE] = 0
-        return
     else:
-        numbers[_PATIENCE] = min(2 * numbers[_PATIENCE] + 1, _MAX_SKIPS)
-        numbers[_SKIPS] = numbers[_PATIENCE]
+        if aim(tile, rays, first_row, mask) != 0:
+            mask = walk(tile, rays, mesh, instance, mask)
+        if bit_count(mask) > SUBTILES // 2:
+            numbers[_PATIENCE] = min(2 * numbers[_PATIENCE] + 1, _MAX_SKIPS)
+            numbers[_SKIPS] = numbers[_PATIENCE]
+        else:
+            numbers[_PATIENCE] = 0
+        if mask == 0:
+            return
     floats = float64s(tile)
     each = rays // SUBTILES
     t_at = row_at(T, rays)

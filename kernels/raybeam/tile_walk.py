@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 
 from .cast_memory import BLOCKS, NODES, float32s, int32s, int64s, uint8s
-from .compiled import WHOLE, inlined, part
+from .compiled import WHOLE, inlined, part, stage
 from .tile_frame import FAR, ZERO, limit_depths
 from .tile_leaf import test_leaf
 from .tile_memory import ENTRY, SUBTILES, at
@@ -129,11 +129,25 @@ def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore
     return count
 
 
+@stage
+def _unfinished(tile, count):  # type: ignore[no-untyped-def]
+    """Return the mask of the subtiles that reach one of the first `count` waiting nodes."""
+    reach = load(float32s(tile), _REACH)
+    address = int64s(tile)[_STACK]
+    stack = float32s(address)
+    codes = int32s(address)
+    subtiles = np.int64(0)
+    for k in range(count):
+        subtiles |= codes[ENTRY * k + 2] & at_least(reach, splat(stack[ENTRY * k]))
+    return subtiles
+
+
 @part(types.int64(*5 * WHOLE))
 def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of the subtiles of a mask in a mesh; return whether that was done.
+    """Cast the rays of the subtiles of a mask in a mesh; return the mask of unfinished subtiles.
 
-    It is not done if the tile meets more leaves than half of its rays.
+    The walk ends early if the tile meets more leaves than it has rays: then the subtiles that may
+    meet a node that still waits are unfinished.
     """
     singles = float32s(tile)
     address = int64s(tile)[_STACK]
@@ -156,12 +170,12 @@ def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
             count = _open_node(tile, nodes, blocks, code, subtiles, deepest, count)
             continue
         leaves += 1
-        if leaves > rays // 2:
-            return False
+        if leaves > rays:
+            return _unfinished(tile, count + 1)
         changed = test_leaf(tile, rays, mesh, instance, ~code, subtiles, deepest)
         if changed != 0:
             deepest = limit_depths(tile, rays, changed)
-    return True
+    return np.int64(0)
 
 
 @part(types.int64(*3 * WHOLE))
