@@ -188,13 +188,13 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         pair = np.int64(pairs[_PAIRS + number])
         subtile = pair & 7
         triangle = pair >> 3
-        k = _EDGES + triangle
-        n1 = _splat_three(singles, k)
-        n2 = _splat_three(singles, k + 24)
-        n0 = _splat_three(singles, k + 48)
-        limit = splat(singles[k + 72])
-        bias = splat(singles[k + 80])
-        rounding = splat(singles[k + 96])
+        edges = _EDGES + triangle
+        n1 = _splat_three(singles, edges)
+        n2 = _splat_three(singles, edges + 24)
+        n0 = _splat_three(singles, edges + 48)
+        limit = splat(singles[edges + 72])
+        bias = splat(singles[edges + 80])
+        rounding = splat(singles[edges + 96])
         every = -((undecided >> triangle) & 1) & 255
         for i in range(subtile * each, (subtile + 1) * each, 8):
             su = load(singles, su_at + i)
