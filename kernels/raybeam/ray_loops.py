@@ -117,15 +117,6 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
 
 
 @stage
-def _use_one_pose(tile, rays):  # type: ignore[no-untyped-def]
-    """Write pose 0 for all rays of a tile."""
-    numbers = int64s(tile)
-    pose_at = row_at(POSE, rays)
-    for lane in range(rays):
-        numbers[pose_at + lane] = 0
-
-
-@stage
 def _look_up_beams(tile, rays, directions, rows):  # type: ignore[no-untyped-def]
     """Write the directions of a tile's rays, by their rows in the pattern."""
     numbers = int64s(tile)
@@ -274,6 +265,18 @@ def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
     )
 
 
+@inlined
+def _turn_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
+    """Rotate the vector with first component i by matrix k of n matrices."""
+    p = floats[i]
+    q = floats[i + rays]
+    r = floats[i + 2 * rays]
+    floats[i] = (p * matrices[k] + q * matrices[k + n]) + r * matrices[k + 2 * n]
+    floats[i + rays] = (p * matrices[k + 3 * n] + q * matrices[k + 4 * n]) + r * matrices[k + 5 * n]
+    i += 2 * rays
+    floats[i] = (p * matrices[k + 6 * n] + q * matrices[k + 7 * n]) + r * matrices[k + 8 * n]
+
+
 @stage
 def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
     """Rotate vectors of a tile, in three rows from `first_row` on, to the scene's axes.
@@ -290,20 +293,14 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
         for lane in range(0, rays, 4):
             _turn(floats, target + lane, rays, matrix)
         return
-    for lane in range(rays):
-        i = target + lane
-        p = floats[i]
-        q = floats[i + rays]
-        r = floats[i + 2 * rays]
-        k = numbers[pose_at + lane]
-        n = poses
-        floats[i] = (p * matrices[k] + q * matrices[k + n]) + r * matrices[k + 2 * n]
-        floats[i + rays] = (p * matrices[k + 3 * n] + q * matrices[k + 4 * n]) + r * matrices[
-            k + 5 * n
-        ]
-        floats[i + 2 * rays] = (p * matrices[k + 6 * n] + q * matrices[k + 7 * n]) + r * matrices[
-            k + 8 * n
-        ]
+    for start in range(0, rays, 4):
+        k = numbers[pose_at + start]
+        others = numbers[pose_at + start + 1], numbers[pose_at + start + 2]
+        if others[0] == k and others[1] == k and numbers[pose_at + start + 3] == k:
+            _turn(floats, target + start, rays, _matrix(matrices, k, poses))
+            continue
+        for lane in range(start, start + 4):
+            _turn_one(floats, target + lane, rays, matrices, numbers[pose_at + lane], poses)
 
 
 @stage
@@ -345,6 +342,18 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
         floats[target + lane] += vectors[k]
         floats[target + rays + lane] += vectors[k + count]
         floats[target + 2 * rays + lane] += vectors[k + 2 * count]
+
+
+@stage
+def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
+    """Add the position of the only pose, whose address is given, to the origins."""
+    floats = float64s(tile)
+    vector = float64s(position)
+    target = row_at(OX, rays)
+    for axis in range(3):
+        number = splat(vector[axis])
+        for k in range(target + axis * rays, target + (axis + 1) * rays, 4):
+            store(floats, k, load(floats, k) + number)
 
 
 @stage
@@ -391,7 +400,10 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
             _rotate(tile, rays, OX, cast.rotations, cast.poses)
         if cast.delays != 0:
             _apply_rates(tile, rays, OX, cast)
-    _add_to_origins(tile, rays, cast.positions, cast.poses, POSE)
+    if cast.poses == 1:
+        _add_position(tile, rays, cast.positions)
+    else:
+        _add_to_origins(tile, rays, cast.positions, cast.poses, POSE)
     if cast.delays != 0:
         _apply_velocities(tile, rays, cast)
 
@@ -451,7 +463,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     tile = cast.tile
     first = first_ray(cast, start)
     _find_rows(tile, rays, first.row, cast.rows * cast.subrays)
-    if cast.shares_origin == 0:
+    if cast.poses > 1 or cast.delays != 0:
         _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
     if cast.shares != 0:
         if cast.lanes_per_beam == 1:
@@ -478,7 +490,6 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
 @stage
 def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
     """Write the origin that all rays of a cast share to the rays of a tile, for all tiles."""
-    _use_one_pose(tile, rays)
     _write_origins(tile, rays, cast)
     _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 
