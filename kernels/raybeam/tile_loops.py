@@ -126,7 +126,10 @@ def _enter_all(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: P
 
 @stage
 def _before(tile, rays, near, mask):  # type: ignore[no-untyped-def]
-    """Return the subtiles of a mask with a ray that reaches a depth along the scene's axis m."""
+    """Return the subtiles of a mask with a ray that reaches a depth along the tile's axis m.
+
+    The depth is of the scene: a distance there is at least as long as its depth.
+    """
     floats = float64s(tile)
     t_at = row_at(T, rays)
     each = rays // SUBTILES
