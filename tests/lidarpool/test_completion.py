@@ -68,6 +68,10 @@ OS1 = ["ouster/os1-128", "ouster/os1-32", "ouster/os1-64"]
         ("lidarpool demo --live re", ["rerun"]),
         ("lidarpool play out --as ", [*BRIDGES]),
         ("lidarpool compare a b --match ", ["order", "time"]),
+        ("lidarpool sensors vlp16 --as m", ["mujoco", "mjcf"]),
+        ("lidarpool sensors vlp16 --out a.XML --as ", ["mjcf", "helios"]),
+        ("lidarpool sensors vlp16 --out out/a.p", ["out/a.py", "out/a.parquet", "out/a.png"]),
+        ("lidarpool sensors vlp16 --as livox --out a.", ["a.csv"]),
         ("lidarpool scene points a.ply b.glb --colour i", ["intensity"]),
     ],
 )
@@ -77,6 +81,7 @@ def test_values_are_completed(line, values):
 
 def test_names_of_files_are_completed_where_a_sensor_or_scenario_may_be_a_file():
     assert offers_files("lidarpool sensors my")
+    assert offers_files("lidarpool sensors vlp16 --out ")
     assert offers_files("lidarpool run hall.glb --sensor ")
     assert offers_files("lidarpool run --live hal")  # alone, before a scenario
     assert not offers_files("lidarpool demo --live ")

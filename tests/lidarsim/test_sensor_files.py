@@ -114,6 +114,16 @@ def test_livox_lists_have_the_rays_that_the_plug_in_casts(tmp_path):
     assert np.array_equal(back.times_ns(firings)[:, 0], file.rays.times_ns)
 
 
+def test_times_of_livox_lists_are_exact_from_the_first_ray_on(tmp_path):
+    beams = Beams(np.zeros(2), time_ns=np.array([501.0, 1000.0]))
+    file = export_sensor(Sensor(beams), tmp_path / "r.csv", format="livox", seconds=0.3)
+    assert file.rays.times_ns[:3].tolist() == [501, 1000, 100_501]
+    assert np.array_equal(read_rays(tmp_path / "r.csv").times_ns, file.rays.times_ns)
+    rows = ["86400.000000501,0,90", "86400.000001,1,90", "86400.000100501,2,90"]
+    (tmp_path / "clock.csv").write_text("\n".join(["Time/s,Azimuth/deg,Zenith/deg", *rows]))
+    assert read_rays(tmp_path / "clock.csv").times_ns.tolist() == [0, 499, 100_000]
+
+
 WORLD = """
 <mujoco>
   {}
@@ -161,6 +171,18 @@ def test_mujoco_casts_the_rays_of_angles_as_we_do(tmp_path):
     assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
     assert np.array_equal(back.times_ns(firings)[:, 0], file.rays.times_ns)
     assert back.max_range_m == 80
+
+
+def test_a_python_file_returns_the_angles_of_each_frame_for_mujoco(tmp_path):
+    path = tmp_path / "mid360.py"
+    file = export_sensor(load_sensor("livox/mid360"), path, format="mujoco", revolutions=2)
+    module = runpy.run_path(str(path))
+    theta, phi = module["angles"](frame=3)  # frame 3 of 2 is frame 1
+    rays = slice(20_000, 40_000)
+    assert np.array_equal(theta, np.radians(file.rays.azimuths_deg[rays]))
+    assert np.array_equal(phi, np.radians(file.rays.elevations_deg[rays]))
+    assert np.array_equal(module["times_ns"](1), file.rays.times_ns[rays])
+    assert "Not in this file: channels" in module["__doc__"] and module["MAX_RANGE_M"] == 70
 
 
 def test_rangefinders_measure_what_a_scanner_does(tmp_path):

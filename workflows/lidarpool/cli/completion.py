@@ -14,6 +14,7 @@ from click.shell_completion import CompletionItem
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
+from lidarsim.sensor_files.format_table import FORMATS
 
 from ..clouds.format_table import EXPORTS, GROUP
 from ..showing.playback.bridge_table import BRIDGES
@@ -66,6 +67,27 @@ def format_name(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     """Complete a format of clouds."""
     del ctx, param
     return starting_with(incomplete, EXPORTS) or starting_with(incomplete, _plugin_formats())
+
+
+def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a format of sensors; with --out, of the formats that have its ending."""
+    del param
+    file = ctx.params.get("out")
+    rows = [row for row in FORMATS if file is None or file.suffix.lower() in row.endings]
+    return starting_with(incomplete, (row.name for row in rows))
+
+
+def sensor_file(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete the ending of a sensor's file, with --as of its format, or the name of a file."""
+    del param
+    stem, dot, _ = incomplete.rpartition(".")
+    name = ctx.params.get("file_format")
+    rows = [row for row in FORMATS if name in (None, row.name)]
+    endings = [ending for row in rows for ending in row.endings]
+    if name is None:
+        endings.append(".png")
+    matches = starting_with(incomplete, dict.fromkeys(f"{stem}{ending}" for ending in endings))
+    return [CompletionItem(incomplete, type="file"), *(matches if dot else ())]
 
 
 def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:

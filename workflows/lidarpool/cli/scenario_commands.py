@@ -123,7 +123,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a survey of another program as a scenario.
 
-    Surveys of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, models of
+    Surveys and scanners of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, models of
     MuJoCo (.xml) with their rangefinders, rays of a sensor (.csv, .npz, .parquet), OmniLidar prims
     (.usd, .usda), and surveys for which a plug-in is installed. Unsupported features are listed,
     one line each. Mesh files stay where they are.
@@ -135,10 +135,11 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import worlds/house.sdf --assets models
       lidarpool import robot.xml
       lidarpool import mid360.csv
+      lidarpool import scanners_tls.xml#vlp16
     """  # noqa: D301 - click wants the character, not its name
     from lidarscenes.files.formats import WORLDS
     from lidarscenes.gazebo.import_world import import_world
-    from lidarscenes.helios import import_survey
+    from lidarscenes.helios import import_scanner, import_survey, is_scanner
     from lidarscenes.mujoco.import_model import import_model
     from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
@@ -155,6 +156,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         left_out = import_whole(import_world, survey, folder, assets, check)
     elif is_mujoco_model(survey):
         left_out = import_whole(import_model, survey, folder, assets, check)
+    elif is_scanner(survey):
+        left_out = import_whole(import_scanner, survey, folder, assets, check)
     elif (plugin := importer_of(survey)) is not None:
         left_out = import_by(plugin, survey, folder, assets, check=check)
     elif survey.suffix.lower() in ENDINGS:
@@ -434,8 +437,15 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     metavar="FILE",
     help="Write the sensor for other programs, in the format of the ending or of --as; .png draws "
     "its beams.",
+    shell_complete=completion.sensor_file,
 )
-@click.option("--as", "file_format", metavar="FORMAT", help=_SENSOR_FORMATS)
+@click.option(
+    "--as",
+    "file_format",
+    metavar="FORMAT",
+    help=_SENSOR_FORMATS,
+    shell_complete=completion.sensor_formats,
+)
 @click.option(
     "--seconds",
     type=click.FloatRange(0, 1e6, min_open=True),
@@ -523,7 +533,8 @@ def _write_sensor(
     if out.exists() and not overwrite:
         raise LidarError(f"{out} exists: give another name, or --overwrite.")
     file = export_sensor(sensor, out, format=file_format, seconds=seconds, revolutions=revolutions)
-    click.echo(f"{plural(len(file.rays), 'ray')}: {click.format_filename(out)}")
+    size = plural(len(file.rays), "ray") if len(file.rays) else plural(sensor.channels, "channel")
+    click.echo(f"{size}: {click.format_filename(out)}")
     if file.left_out:
         click.echo(f"not in the file: {'; '.join(file.left_out)}")
 

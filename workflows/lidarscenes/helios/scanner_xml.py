@@ -190,9 +190,9 @@ class _Head(NamedTuple):
 
 def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
     """Return a sensor whose head turns; LidarError if the head cannot turn as the settings say."""
-    tilt = _tilt(rotation(scanner.child("beamOrigin")))
+    aim = _aim(rotation(scanner.child("beamOrigin")))
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
-    if line is None or tilt is None or not vertical:
+    if line is None or aim is None or not vertical:
         raise LidarError(
             f"the head of {scanner.name} turns; only one with rotating optics may, whose lines "
             "hold the axis z that it turns about."
@@ -202,14 +202,23 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
             f"the head of {scanner.name} turns at {head.deg_per_s:g} degrees a second from "
             f"{head.start_deg:g}, never to {head.start_deg + head.range_deg:g}."
         )
-    return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, tilt), _HEAD
+    return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
 
 
-def _tilt(emitter: Floats) -> float | None:
-    """Return the angle of a rotation (3, 3) about x, degrees; None for another axis."""
-    if not np.allclose(emitter[0], [1, 0, 0], atol=1e-12):
+class _Aim(NamedTuple):
+    """Rotation of an emitter: first about x, then about z."""
+
+    tilt_deg: float
+    azimuth_deg: float
+
+
+def _aim(emitter: Floats) -> _Aim | None:
+    """Return the angles of a rotation (3, 3); None if the rotation rolls."""
+    if abs(emitter[2, 0]) > 1e-12:
         return None
-    return float(np.degrees(np.arctan2(emitter[2, 1], emitter[1, 1])))
+    tilt = np.arctan2(emitter[2, 1], emitter[2, 2])
+    azimuth = np.arctan2(emitter[1, 0], emitter[0, 0])
+    return _Aim(float(np.degrees(tilt)), float(np.degrees(azimuth)))
 
 
 def _exact_us(pulses: int, pulse_hz: float) -> int | str:
@@ -292,30 +301,34 @@ class _Line:
         middle = self.first_deg + width / 2
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
-    def turning(self, deg_per_s: float, tilt: float) -> dict[str, Any]:
-        """Return a sensor with a head, whose firings are lines; `tilt` of the lines in degrees."""
+    def turning(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
+        """Return a sensor with a head, whose firings are lines that an emitter aims."""
         between_us = 1e6 / self.pulse_hz
         last = clean((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
             "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
             "rate_hz": abs(deg_per_s) / 360,
-            "beams": self._elevations(tilt) | times,
+            "beams": self._angles(aim) | times,
         }
         return data if deg_per_s > 0 else {"clockwise": True, **data}
 
-    def _elevations(self, tilt: float) -> dict[str, Any]:
+    def _angles(self, aim: _Aim) -> dict[str, Any]:
         """Return the angles of the pulses; pulses beyond the zenith have the opposite azimuth."""
-        angles = self.first_deg + tilt + self.step_deg * np.arange(self.count)
+        angles = self.first_deg + aim.tilt_deg + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
             first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
-            return {"elevation_deg": {"first": first, "last": last, "count": self.count}}
+            elevations_deg = {"first": first, "last": last, "count": self.count}
+            if not clean(aim.azimuth_deg):
+                return {"elevation_deg": elevations_deg}
+            azimuths_deg = clean(np.full(self.count, aim.azimuth_deg))
+            return {"elevation_deg": elevations_deg, "azimuth_deg": azimuths_deg}
         angles = (angles + 180) % 360 - 180
         behind = np.abs(angles) > 90
         elevations = np.where(behind, np.copysign(180, angles) - angles, angles)
         return {
             "elevation_deg": clean(elevations),
-            "azimuth_deg": clean(np.where(behind, 180.0, 0.0)),
+            "azimuth_deg": clean(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
         }
 
 

@@ -39,7 +39,7 @@ from .scene_xml import HeliosScene, SurfelMaker
 
 SCENARIO_FILE = "scenario.yaml"
 # Carriers look along x, the platforms of HELIOS++ along y.
-_AHEAD = rotation_about((0, 0, 1), -90)
+AHEAD = rotation_about((0, 0, 1), -90)
 
 
 @dataclass
@@ -244,7 +244,7 @@ class _Import:
         """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
         step_deg, steps = mounted.steps(stretch.seconds)
         min_range_m, max_range_m = mounted.range_m
-        pose = Pose.from_rotation((0, 0, 0), _AHEAD @ mount @ mounted.rotation)
+        pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
         angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
         return {
             "model": self._file_of(mounted.data),
@@ -311,13 +311,10 @@ class _Import:
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
         waveform_settings = self._full_waveform()
-        quality = number(waveform_settings, "beamSampleQuality", 3.0)
         sections = {
-            "returns": {
-                "mode": "first" if scanner.number("maxNOR") == 1 else "all",
-                "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
-                **waveform(waveform_settings, scanner.number("pulseLength_ns", 4)),
-            },
+            "returns": returns_section(
+                waveform_settings, scanner.number("maxNOR"), scanner.number("pulseLength_ns", 4)
+            ),
             "noise": {
                 "range_m": clean(
                     number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
@@ -331,6 +328,18 @@ class _Import:
             for field, name in ranges.items()
             if name in detector_settings
         }
+
+
+def returns_section(
+    settings: dict[str, str], max_returns: float, pulse_ns: float
+) -> dict[str, Any]:
+    """Return the section `returns` by FWFSettings, maxNOR and the length of a pulse."""
+    quality = number(settings, "beamSampleQuality", 3.0)
+    return {
+        "mode": "first" if max_returns == 1 else "all",
+        "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
+        **waveform(settings, pulse_ns),
+    }
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:

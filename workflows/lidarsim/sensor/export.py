@@ -34,7 +34,7 @@ class SensorFile(NamedTuple):
     format
         Name of its format.
     rays
-        Rays that it holds.
+        Rays that it holds; none if it describes the sensor's optics.
     left_out
         What it does not hold of the sensor, a clause each.
     """
@@ -54,7 +54,7 @@ def export_sensor(
     seconds: Seconds | None = None,
     revolutions: Revolutions | None = None,
 ) -> SensorFile:
-    """Write the rays of a sensor to a file of another program.
+    """Write the rays of a sensor, or its optics, to a file of another program.
 
     Parameters
     ----------
@@ -90,11 +90,20 @@ def export_sensor(
     row = format_of(path, format)
     if not isinstance(sensor, Sensor):
         raise LidarError(f"{type(sensor).__name__} is no Sensor: load_sensor(MODEL) returns one.")
-    rays = fired_rays(sensor, seconds=seconds, revolutions=revolutions)
     if not path.parent.is_dir():
         raise LidarError(f"The folder {path.parent} does not exist: make it first.")
     write = row.function("write")
-    left_out = write(path, rays, _left_out(sensor, rays, row))
+    if row.describes:
+        rays = FiredRays(np.zeros((0, 3)))
+        duration_s = _duration_ns(sensor, seconds, revolutions) / 1e9
+        left_out = write(path, sensor, duration_s, _left_out(sensor, row))
+    else:
+        rays = fired_rays(sensor, seconds=seconds, revolutions=revolutions)
+        lost = _left_out(sensor, row)
+        if not rays.repeats:
+            assert rays.cycle_ns is not None  # of a sensor
+            lost.append(f"rays after {rays.cycle_ns / 1e9:.4g} s, which do not repeat these")
+        left_out = write(path, rays, lost)
     return SensorFile(path, row.name, rays, tuple(left_out))
 
 
@@ -111,11 +120,7 @@ def fired_rays(
     LidarError
         If both are given, or the rays are more than `MAX_RAYS`.
     """
-    if seconds is not None and revolutions is not None:
-        raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
-    duration_ns = 1e9 * seconds if seconds is not None else 0.0
-    if seconds is None:
-        duration_ns = sensor.revolution_start_ns(revolutions or 1)
+    duration_ns = _duration_ns(sensor, seconds, revolutions)
     count = _firings_before(sensor, duration_ns)
     firings = np.arange(count)
     times_ns = sensor.times_ns(firings).reshape(-1) - round(sensor.start_ns)
@@ -135,6 +140,15 @@ def fired_rays(
         repeats=_repeats(sensor, count),
         light=_light(sensor.optics),
     )
+
+
+def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None) -> float:
+    """Return the duration of a pattern, nanoseconds; LidarError if both figures are given."""
+    if seconds is not None and revolutions is not None:
+        raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
+    if seconds is not None:
+        return 1e9 * seconds
+    return sensor.revolution_start_ns(revolutions or 1)
 
 
 def _light(optics: Optics) -> Light:
@@ -197,12 +211,12 @@ def _repeats(sensor: Sensor, count: int) -> bool:
     return bool(abs(count - max(round(count / per_turn), 1) * per_turn) < 1)
 
 
-def _left_out(sensor: Sensor, rays: FiredRays, row: SensorFormat) -> list[str]:
+def _left_out(sensor: Sensor, row: SensorFormat) -> list[str]:
     """Return what a format does not hold of a sensor, a clause each."""
     has = {
         "times": True,
         "channels": sensor.channels > 1,
-        "origins": rays.origins is not None,
+        "origins": sensor.origins(np.arange(1)) is not None,
         "min_range": sensor.min_range_m > 0,
         "max_range": sensor.max_range_m < float("inf"),
         "rate": True,
@@ -210,8 +224,4 @@ def _left_out(sensor: Sensor, rays: FiredRays, row: SensorFormat) -> list[str]:
         "returns": sensor.returns is not None,
         "noise": sensor.noise is not None,
     }
-    clauses = [words for name, words in PROPERTIES.items() if has[name] and name not in row.holds]
-    if not rays.repeats:
-        assert rays.cycle_ns is not None  # of a sensor
-        clauses.append(f"rays after {rays.cycle_ns / 1e9:.4g} s, which do not repeat these")
-    return clauses
+    return [words for name, words in PROPERTIES.items() if has[name] and name not in row.holds]

@@ -46,7 +46,8 @@ class SensorFormat:
         Dotted name of the module of the format. `write(path, rays, left_out)` there writes rays,
         and returns all that the file does not hold of the sensor, a clause each, `left_out` by
         `PROPERTIES` first; `read(path)` returns `FiredRays`, or None for a file of
-        another format.
+        another format. If the format `describes`, it is
+        `write(path, sensor, duration_s, left_out)`, for a duration of the pattern in seconds.
     words
         Description in a few words.
     holds
@@ -55,6 +56,8 @@ class SensorFormat:
         Whether the ending alone chooses the format; else ``--as`` does.
     reads
         Whether there is a function `read`.
+    describes
+        Whether the file describes the sensor's optics, and does not list its rays.
     packages, extra
         Import packages that the module needs, and the extra that installs them.
     """
@@ -66,6 +69,7 @@ class SensorFormat:
     holds: frozenset[str] = frozenset()
     by_ending: bool = False
     reads: bool = True
+    describes: bool = False
     packages: tuple[str, ...] = ()
     extra: str = ""
 
@@ -96,7 +100,7 @@ _COLUMNS = ("times", "channels", "origins", "min_range", "max_range", "rate")
 FORMATS: tuple[SensorFormat, ...] = (
     _row(
         "mujoco",
-        ".npz",
+        ".npz .py",
         "angles for MuJoCo-LiDAR",
         ("times", "min_range", "max_range", "rate"),
         module="mujoco_rays",
@@ -132,6 +136,15 @@ FORMATS: tuple[SensorFormat, ...] = (
         ("times", "channels", "min_range", "max_range", "rate"),
         by_ending=True,
         reads=False,
+    ),
+    SensorFormat(  # its module needs the sensor, which stands above this package
+        "helios",
+        (".xml",),
+        "lidarsim.sensor.helios_scanner",
+        "a scanner of HELIOS++",
+        frozenset(PROPERTIES) - {"returns"},
+        reads=False,
+        describes=True,
     ),
     _row("npz", ".npz", "arrays of NumPy", _COLUMNS, module="ray_npz", by_ending=True),
     _row("livox", ".csv", "scan_mode of Livox's plug-in for Gazebo", ("times",)),

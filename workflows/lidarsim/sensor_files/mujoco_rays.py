@@ -1,4 +1,6 @@
-"""Angles of rays for MuJoCo-LiDAR (.npz): arrays `theta` and `phi`, as its scan patterns are.
+"""Angles of rays for MuJoCo-LiDAR: arrays `theta` and `phi`, as its scan patterns are.
+
+An .npz holds the arrays. A Python file (.py) needs NumPy only, and returns those of a frame.
 
 `theta` is the azimuth, counter-clockwise from x, and `phi` the elevation above the xy plane, both
 in radians, in the frame of a site: x forward, y left, z up. MuJoCo-LiDAR casts all rays of a call
@@ -13,16 +15,36 @@ from pathlib import Path
 
 import numpy as np
 
-from .complete_files import write_bytes_of
-from .fired_rays import FiredRays
+from .complete_files import write_bytes_of, write_text_of
+from .fired_rays import AXES, FiredRays
+from .python_file import array_code, python_text, times_code
 from .ray_header import TIME_COLUMN, check_names, columns_of, header_of, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 
+_PYTHON = ".py"
+_WORDS = f"""Angles are float64 radians in the frame of a site, {AXES}: theta is the
+azimuth, counter-clockwise from x, and phi the elevation above the xy plane.
+
+    ranges = lidar.trace_rays(data, *angles(frame=0))"""
+_FUNCTIONS = '''def angles(frame=0):
+    """Return theta (n,) and phi (n,) of the rays of a frame, radians."""
+    start, stop = _BOUNDS[frame % FRAMES], _BOUNDS[frame % FRAMES + 1]
+    return _THETA[start:stop], _PHI[start:stop]
+
+
+def times_ns(frame=0):
+    """Return the times (n,) of the rays of a frame, nanoseconds since the start of the pattern."""
+    start, stop = _BOUNDS[frame % FRAMES], _BOUNDS[frame % FRAMES + 1]
+    return _TIMES_NS[start:stop]
+'''
 _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write angles and times of rays, with a header."""
+    """Write angles and times of rays, with a header or as a Python file."""
+    if path.suffix.lower() == _PYTHON:
+        write_text_of(path, _python_text(rays.timed(), left_out))
+        return left_out
     header = np.array(json.dumps(header_of(rays, left_out, azimuth="theta", elevation="phi")))
     with write_bytes_of(path) as file:
         np.savez_compressed(
@@ -35,8 +57,19 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     return left_out
 
 
+def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
+    """Return the text of a Python file of rays with times."""
+    arrays = {
+        "_THETA": array_code(np.radians(rays.azimuths_deg), "<f8"),
+        "_PHI": array_code(np.radians(rays.elevations_deg), "<f8"),
+        "_TIMES_NS": times_code(rays),
+    }
+    title = "Angles of the rays of {name} for MuJoCo-LiDAR, as lidarpool wrote them."
+    return python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays)
+
+
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of arrays `theta` and `phi`; None for other arrays.
+    """Return the rays of arrays `theta` and `phi`; None for other arrays and for Python files.
 
     Raises
     ------
@@ -45,6 +78,8 @@ def read(path: Path) -> FiredRays | None:
     LidarError
         If the content is larger than the memory.
     """
+    if path.suffix.lower() == _PYTHON:
+        return None  # code is not run
     arrays = read_arrays(path)
     if not {"theta", "phi"} & arrays.keys():
         return None

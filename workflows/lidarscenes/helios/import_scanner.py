@@ -1,0 +1,232 @@
+"""Scanners of HELIOS++ without a survey, as scenarios: a sensor, or a sensor for each channel."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import yaml
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import read_input
+from lidarsim.base.words import did_you_mean, listed
+from lidarsim.base.xmlfile import xml_root
+from lidarsim.motion.trajectory import Pose
+from lidarsim.survey.survey import MAX_SENSORS
+
+from ..writers.lidar_scenario import SCENARIO_FILE
+from .files import Assets, clean, number
+from .scanner_xml import Device, HeliosScanner, channels, device, unsupported_features
+from .survey_xml import AHEAD, returns_section
+
+_MAX_NAMES = 12  # of scanners in a message
+
+
+class _Reference(NamedTuple):
+    """A scanner of a file: FILE.xml#ID, or FILE.xml with a single scanner."""
+
+    file: Path
+    scanner: str  # its id; empty without one
+
+    @classmethod
+    def of(cls, survey: Path) -> _Reference:
+        """Return the file and the id in a path, as surveys write them."""
+        name, mark, scanner = survey.name.rpartition("#")
+        if mark and not survey.exists():
+            return cls(survey.with_name(name), scanner)
+        return cls(survey, "")
+
+
+def is_scanner(survey: Path) -> bool:
+    """Return True if a path is of a file of HELIOS++ with scanners and without a survey."""
+    with suppress(OSError, LidarError, ValueError):
+        root = xml_root(read_input(_Reference.of(survey).file))
+        has_scanner = root.find("scanner") is not None
+        return root.tag == "document" and has_scanner and root.find("survey") is None
+    return False
+
+
+def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
+    """Write a scanner of HELIOS++ as a scenario into a folder.
+
+    The folder gets `scenario.yaml`, with the scene of `lidarpool demo`, and the sensor's data file.
+    Axes of the platform become axes of the carrier: y of HELIOS++ is x.
+
+    Parameters
+    ----------
+    survey
+        The file, whose <scannerSettings> have the rates; with several scanners, FILE.xml#ID.
+    folder
+        The folder, which exists.
+    assets
+        Folders in which referenced files are looked for first.
+
+    Returns
+    -------
+    What is not as in HELIOS++, a line each.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read, the scanner is not named or has no sensor like it.
+    """
+    reference = _Reference.of(survey)
+    files = Assets(reference.file, list(assets))
+    element = _element(files, reference)
+    scanners = channels(element)
+    first = next(iter(scanners.values()))
+    lines = [line for scanner in scanners.values() for line in unsupported_features(scanner)]
+    settings = _settings(files, reference.file, element)
+    if settings is None:
+        lines.append("its rates: there are no <scannerSettings> for it, so they are the highest")
+        settings = _highest_rates(first)
+    devices = {name: device(scanner, settings) for name, scanner in scanners.items()}
+    sensors = _merged(devices)
+    if len(sensors) > MAX_SENSORS:
+        raise LidarError(
+            f"its {len(sensors)} channels are a sensor each; a scenario has {MAX_SENSORS} at most."
+        )
+    if len(sensors) > 1:
+        lines.append(f"its {len(sensors)} channels are a sensor each")
+    _write(folder, survey.name, first, sensors, list(dict.fromkeys(lines)))
+    return list(dict.fromkeys(lines))
+
+
+def _element(files: Assets, reference: _Reference) -> Element:
+    """Return the <scanner> of a reference; LidarError if the reference does not name one."""
+    elements = files.root(reference.file).findall("scanner")
+    by_id = {element.get("id", ""): element for element in elements}
+    if reference.scanner:
+        if reference.scanner not in by_id:
+            hint = did_you_mean(reference.scanner, by_id)
+            raise LidarError(f"there is no <scanner> {reference.scanner!r} in the file.{hint}")
+        return by_id[reference.scanner]
+    if len(elements) > 1:
+        names = [*by_id][:_MAX_NAMES]
+        more = ", …" if len(by_id) > _MAX_NAMES else ""
+        raise LidarError(
+            f"it has {len(elements)} scanners: name one, {reference.file.name}#{names[0]}. "
+            f"There are {listed(names)}{more}."
+        )
+    return elements[0]
+
+
+def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | None:
+    """Return the settings beside a scanner: with its id, or the only ones; None without them."""
+    elements = files.root(home).findall("scannerSettings")
+    fitting = [e for e in elements if e.get("id") == scanner.get("id")]
+    if not fitting and len(files.root(home).findall("scanner")) == 1 and len(elements) == 1:
+        fitting = elements
+    return files.settings(fitting[0], home) if fitting else None
+
+
+def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:
+    """Return the settings of the highest rates of a scanner."""
+    pulses = scanner.values.get("pulseFreqs_Hz", "").split(",")
+    settings = {"pulseFreq_hz": max(pulses, key=lambda hz: number({"hz": hz}, "hz", 0))}
+    if scanner.number("scanFreqMax_Hz") > 0:
+        settings["scanFreq_hz"] = scanner.values["scanFreqMax_Hz"]
+    if scanner.number("scanAngleMax_deg") > 0:
+        settings["scanAngle_deg"] = scanner.values["scanAngleMax_deg"]
+    if scanner.number("headRotatePerSecMax_deg") > 0:
+        settings["headRotatePerSec_deg"] = scanner.values["headRotatePerSecMax_deg"]
+        settings["headRotateStop_deg"] = "360"
+    return settings
+
+
+def _merged(devices: dict[str, Device]) -> dict[str, Device]:
+    """Return a single sensor for channels that differ in their beams alone, else a sensor each."""
+    first, *others = devices.values()
+    tables = [mounted.data.get("beams", {}) for mounted in devices.values()]
+    shared = {name: value for name, value in first.data.items() if name != "beams"}
+    is_shared = all(
+        {name: value for name, value in other.data.items() if name != "beams"} == shared
+        and np.array_equal(other.rotation, first.rotation)
+        and other.range_m == first.range_m
+        for other in others
+    )
+    starts = np.array([mounted.position for mounted in devices.values()])
+    # A start beside the axis would turn with the head here, and does not in HELIOS++.
+    on_axis = not np.ptp(starts[:, :2], axis=0).any()
+    single = all(_count(table) == 1 for table in tables)
+    if not (others and is_shared and single and on_axis):
+        return devices
+    beams = {
+        "elevation_deg": [_only(table.get("elevation_deg", 0.0)) for table in tables],
+        "azimuth_deg": [_only(table.get("azimuth_deg", 0.0)) for table in tables],
+    }
+    heights = [[0.0, 0.0, float(clean(start[2] - starts[0][2]))] for start in starts]
+    if any(height for _, _, height in heights):
+        beams["origin_m"] = heights
+    merged = replace(first, data=shared | {"beams": beams})
+    return {"": merged}
+
+
+def _count(table: dict[str, Any]) -> int:
+    """Return the number of beams of a table of one or several beams."""
+    angles = table.get("elevation_deg", [0.0])
+    return int(angles["count"]) if isinstance(angles, dict) else len(angles)
+
+
+def _only(angles: Any) -> float:
+    """Return the only angle of a table's column."""
+    if isinstance(angles, dict):
+        return float(angles["first"])
+    return float(angles[0]) if isinstance(angles, list) else float(angles)
+
+
+def _write(
+    folder: Path, program_file: str, first: HeliosScanner, sensors: dict[str, Device], lines: list[str]
+) -> None:
+    """Write the scenario and the data files of its sensors."""
+    entries = {}
+    for name, mounted in sensors.items():
+        stem = re.sub(r"[^\w.-]+", "_", f"{mounted.data['name']} {name}").strip("._").lower()
+        file = f"{stem or 'sensor'}.yaml"
+        data = yaml.safe_dump(
+            mounted.data, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True
+        )
+        (folder / file).write_text(data, encoding="utf-8", newline="\n")
+        entries[name or "lidar"] = _entry(file, mounted)
+    only = next(iter(entries.values()))
+    if len(entries) == 1 and "mount" not in only:
+        content: dict[str, Any] = {"sensor": only}
+    else:
+        content = {"sensors": entries}
+    if accuracy_m := clean(first.number("accuracy_m")):
+        content["noise"] = {"range_m": accuracy_m}
+    if (waveforms := first.child("FWFSettings")) is not None:
+        content["returns"] = returns_section(
+            dict(waveforms.attrib), first.number("maxNOR"), first.number("pulseLength_ns", 4)
+        )
+    head = [
+        f"From {program_file} of HELIOS++ by lidarpool import.",
+        *(f"Not as there: {line}." for line in lines),
+    ]
+    text = "".join(f"# {line}\n" for line in head) + yaml.safe_dump(content, sort_keys=False)
+    (folder / SCENARIO_FILE).write_text(text, encoding="utf-8", newline="\n")
+
+
+def _entry(file: str, mounted: Device) -> dict[str, Any]:
+    """Return the entry of a sensor in a scenario."""
+    min_range_m, max_range_m = mounted.range_m
+    pose = Pose.from_rotation(AHEAD @ mounted.position, AHEAD @ mounted.rotation)
+    mount: dict[str, Any] = {
+        name: angle
+        for name in ("yaw_deg", "pitch_deg", "roll_deg")
+        if (angle := clean(getattr(pose, name)))
+    }
+    if any(position := clean(pose.position)):  # type: ignore[arg-type]
+        mount = {"position": position, **mount}
+    entry: dict[str, Any] = {"model": file}
+    if min_range_m:
+        entry["min_range_m"] = clean(min_range_m)
+    if np.isfinite(max_range_m):
+        entry["max_range_m"] = clean(max_range_m)
+    return {**entry, "mount": mount} if mount else entry

@@ -1,0 +1,446 @@
+"""Sensors as scanners of HELIOS++ (.xml): their optics and rotations, not a list of rays.
+
+The file has a <scanner>, and <scannerSettings> with its rates that legs name as their template.
+HELIOS++ looks along y with z up and x to the right. All channels fire at each pulse, mirrors and
+heads move by a step from pulse to pulse, and pulses a second are a whole number. Steps keep their
+angles, so that times are stretched where the sensor's pulses a second are no whole number.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from math import isfinite
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ..base.arrays import Floats
+from ..base.errors import LidarError
+from ..sensor_files.complete_files import remark, write_text_of
+from .beams import Mirror, Spin
+from .noise import Noise
+from .ray_sensors import ListedSensor, PrismSensor
+from .sensor import LineSensor, Sensor
+
+AXES = "x right, y forward, z up"
+MAX_CHANNELS = 1000
+MAX_PRISMS = 3
+# From the sensor frame (x forward) to the frame of HELIOS++, and from a frame whose x axis is the
+# beam at angle 0, and whose z axis a mirror or prisms turn about, to the frame of its optics.
+_FRAME = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+_OPTICS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+_REVERSED = np.diag([-1.0, 1, -1])  # of a mirror that turns the other way
+_EVEN_DEG = 1e-6  # of elevations of a line
+_EVEN_NS = 10.0  # of times of a line
+_MIN_LINE = 3  # beams of a line
+_ADVICE = "Formats npz and csv hold any rays."
+
+
+@dataclass
+class _Channel:
+    """A channel of a scanner.
+
+    Attributes
+    ----------
+    rotation
+        Rotation (3, 3) of its emitter.
+    height_m
+        Height of its start.
+    incident
+        Direction (3,) in which light enters prisms; None for other optics.
+    """
+
+    rotation: Floats
+    height_m: float = 0.0
+    incident: Floats | None = None
+
+
+@dataclass
+class _Scanner:
+    """Optics of a scanner.
+
+    Attributes
+    ----------
+    optics
+        Kind of its optics.
+    pulse_hz
+        Whole number of pulses a second.
+    exact_hz
+        Pulses a second of the sensor.
+    channels
+        Its channels.
+    limits
+        Attributes of the scanner. {name: value}
+    settings
+        Attributes of its settings. {name: value}
+    left_out
+        What HELIOS++ does not hold, a clause each.
+    """
+
+    optics: str
+    pulse_hz: int
+    exact_hz: float
+    channels: list[_Channel]
+    limits: dict[str, float] = field(default_factory=dict)
+    settings: dict[str, float] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+
+def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]) -> Sequence[str]:
+    """Write a scanner with its settings, which scan for a duration in seconds.
+
+    Raises
+    ------
+    LidarError
+        If HELIOS++ has no optics for the sensor; the message says why not.
+    """
+    scanner = _scanner_of(sensor, duration_s)
+    lost = [*left_out, *scanner.left_out, *_lost_light(sensor), *_lost_rate(scanner)]
+    name = re.sub(r"[^\w.-]+", "_", sensor.model).strip("_.").lower() or "lidar"
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f"<!-- {remark(sensor.model)}. Axes of the platform: {AXES}. -->",
+        *(f"<!-- Not in this file: {remark(clause)}. -->" for clause in lost),
+        f'<!-- A survey names it: scanner="{remark(path.name)}#{name}", and its legs name',
+        f'     their settings: <scannerSettings template="{remark(path.name)}#{name}"/>. -->',
+        "<document>",
+        *_scanner_lines(name, sensor, scanner),
+        f'  <scannerSettings id="{name}" active="true" pulseFreq_hz="{scanner.pulse_hz}"'
+        f"{_attributes(scanner.settings)}/>",
+        "</document>",
+    ]
+    write_text_of(path, "\n".join(lines) + "\n")
+    return lost
+
+
+def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
+    """Return the lines of <scanner>."""
+    optics = sensor.optics
+    numbers: dict[str, float] = {
+        "pulseFreqs_Hz": scanner.pulse_hz,
+        "pulseLength_ns": optics.pulse_ns,
+        "wavelength_nm": round(optics.wavelength_nm),
+        "beamDivergence_rad": 1e-3 * _divergence_mrad(sensor),
+        "accuracy_m": 0.0 if sensor.noise is None else sensor.noise.range_m,
+        "rangeMin_m": sensor.min_range_m,
+        **({"rangeMax_m": sensor.max_range_m} if isfinite(sensor.max_range_m) else {}),
+        **scanner.limits,
+    }
+    head = f'  <scanner id="{name}" name={quoteattr(sensor.model)} optics="{scanner.optics}"'
+    lines = [f"{head}{_attributes(numbers)}>"]
+    if "headRotatePerSecMax_deg" in scanner.limits:
+        lines.append('    <headRotateAxis x="0" y="0" z="1"/>')
+    if len(scanner.channels) == 1:
+        return [*lines, *_emitter_lines("    ", scanner.channels[0]), "  </scanner>"]
+    lines += ['    <beamOrigin x="0" y="0" z="0"/>', "    <channels>"]
+    for number, channel in enumerate(scanner.channels):
+        lines += [
+            f'      <channel id="{number}">',
+            *_emitter_lines("        ", channel),
+            "      </channel>",
+        ]
+    return [*lines, "    </channels>", "  </scanner>"]
+
+
+def _emitter_lines(indent: str, channel: _Channel) -> Iterable[str]:
+    """Yield the lines of the emitter of a channel."""
+    yield f'{indent}<beamOrigin x="0" y="0" z="{_number(channel.height_m)}">'
+    for axis, angle_deg in _turns(channel.rotation):
+        yield f'{indent}  <rot axis="{axis}" angle_deg="{_number(angle_deg)}"/>'
+    yield f"{indent}</beamOrigin>"
+    if channel.incident is not None:
+        x, y, z = channel.incident.tolist()
+        yield f'{indent}<incidentBeam x="{x!r}" y="{y!r}" z="{z!r}"/>'
+
+
+def _turns(rotation: Floats) -> list[tuple[str, float]]:
+    """Return rotations about the fixed axes x, y, z, one after the other, degrees."""
+    y_deg = np.degrees(np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2])))
+    if np.hypot(rotation[2, 1], rotation[2, 2]) < 1e-9:  # z and x turn about the same axis
+        x_deg = np.degrees(np.arctan2(-rotation[1, 2], rotation[1, 1]))
+        z_deg = 0.0
+    else:
+        x_deg = np.degrees(np.arctan2(rotation[2, 1], rotation[2, 2]))
+        z_deg = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    angles = (("x", float(x_deg)), ("y", float(y_deg)), ("z", float(z_deg)))
+    return [(axis, angle_deg) for axis, angle_deg in angles if abs(angle_deg) > 1e-12]
+
+
+def _attributes(numbers: dict[str, float]) -> str:
+    """Return numbers as attributes."""
+    return "".join(f' {name}="{_number(value)}"' for name, value in numbers.items())
+
+
+def _number(value: float) -> str:
+    """Return the shortest text of a number; HELIOS++ refuses whole numbers that end in .0."""
+    return str(int(value)) if value == int(value) else repr(float(value))
+
+
+def _divergence_mrad(sensor: Sensor) -> float:
+    """Return the divergence for HELIOS++, which has round beams: 0 if unknown."""
+    if sensor.optics.divergence_mrad is None:
+        return 0.0
+    across, up = np.broadcast_to(sensor.optics.divergence_mrad, 2).tolist()
+    return across if across == up else float(np.sqrt(across * up))
+
+
+def _lost_light(sensor: Sensor) -> Iterable[str]:
+    """Yield what HELIOS++ does not hold of a sensor's light and noise, a clause each."""
+    divergence_mrad = sensor.optics.divergence_mrad
+    if divergence_mrad is not None and np.ptp(divergence_mrad):
+        yield "the two widths of an oval beam: beams are round, of the geometric mean"
+    if sensor.optics.wavelength_nm % 1:
+        yield "a part of a nanometre of the wavelength"
+    if sensor.noise is not None and replace(sensor.noise, range_m=0.0, seed=0) != Noise():
+        yield "noise, but that of ranges"
+
+
+def _lost_rate(scanner: _Scanner) -> Iterable[str]:
+    """Yield a clause if the pulses a second are no whole number."""
+    if abs(scanner.exact_hz - scanner.pulse_hz) > 1e-6 * scanner.exact_hz / 1e3:
+        yield (
+            f"{scanner.exact_hz:,.2f} pulses a second: they are a whole number, "
+            f"{scanner.pulse_hz:,}, at the same angles"
+        )
+
+
+def _scanner_of(sensor: Sensor, duration_s: float) -> _Scanner:
+    """Return the optics for a sensor; LidarError if HELIOS++ has none."""
+    if isinstance(sensor, PrismSensor):
+        return _prisms(sensor, duration_s)
+    kind = type(sensor)
+    if isinstance(sensor, ListedSensor):
+        raise _refusal(sensor, "it is a list of rays, and scanners of HELIOS++ have optics")
+    if kind not in (Sensor, LineSensor) or type(sensor.head) not in (Spin, Mirror):
+        part = sensor if kind not in (Sensor, LineSensor) else sensor.head
+        raise _refusal(sensor, f"HELIOS++ has no optics like {type(part).__name__}")
+    if isinstance(sensor.head, Mirror):
+        return _mirror(sensor, sensor.head, duration_s)
+    assert isinstance(sensor.head, Spin)
+    if kind is LineSensor:
+        raise _refusal(sensor, "its head spins about x, and heads of HELIOS++ about z")
+    line = _line_of_beams(sensor, sensor.head, duration_s)
+    return line or _spinning_head(sensor, sensor.head, duration_s)
+
+
+def _refusal(sensor: Sensor, reason: str) -> LidarError:
+    """Return an error that says why HELIOS++ has no such scanner."""
+    return LidarError(f"{sensor.model} is no scanner of HELIOS++: {reason}. {_ADVICE}")
+
+
+def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
+    """Return a whole number of pulses a second; LidarError for less than one."""
+    if exact_hz < 0.5:
+        raise _refusal(sensor, f"it fires {exact_hz:.3g} times a second, and pulseFreq_hz is whole")
+    return round(exact_hz)
+
+
+def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float) -> _Scanner:
+    """Return a scanner without channels whose head turns as that of a sensor."""
+    speed = 360 / head.firings_per_turn * pulse_hz / pulses_per_firing
+    turned = 360 * head.rate_hz * duration_s
+    sign = -1 if head.clockwise else 1
+    return _Scanner(
+        "rotating",
+        round(pulse_hz),
+        pulse_hz,
+        [],
+        {"headRotatePerSecMax_deg": speed},
+        {
+            "headRotatePerSec_deg": sign * speed,
+            "headRotateStart_deg": float(head.zero_deg),
+            "headRotateStop_deg": float(head.zero_deg + sign * turned),
+        },
+    )
+
+
+def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
+    """Return a head with a channel for each beam, whose mirror stands.
+
+    HELIOS++'s own Velodyne VLP-16 is such a scanner. A standing mirror is at angle 0, and needs a
+    scan angle above 0 for its pulses to leave the device.
+    """
+    if sensor.channels > MAX_CHANNELS:
+        raise _refusal(
+            sensor,
+            f"its {sensor.channels:,} beams are no even line, and a scanner has at most "
+            f"{MAX_CHANNELS:,} channels here",
+        )
+    exact_hz = head.firings_per_turn * head.rate_hz
+    pulse_hz = _whole_hz(sensor, exact_hz)
+    scanner = _head(head, pulse_hz, 1, duration_s)
+    scanner.exact_hz = exact_hz
+    standing = {"scanAngleMax_deg": 1, "scanAngleEffectiveMax_deg": 1}
+    scanner.limits |= standing | {"scanFreqMin_Hz": 0, "scanFreqMax_Hz": 0}
+    scanner.settings |= {"scanFreq_hz": 0, "scanAngle_deg": 1}
+    beams = sensor.beams
+    if np.ptp(beams.time_ns):
+        scanner.left_out.append("times of the rays within a firing: all channels fire at once")
+    if beams.origin[:, :2].any():
+        scanner.left_out.append("starts of the rays beside the axis of the head")
+    scanner.channels = [
+        _Channel(_about_z(azimuth) @ _about_x(elevation), height_m)
+        for elevation, azimuth, height_m in zip(
+            beams.elevation.tolist(), beams.azimuth.tolist(), beams.origin[:, 2].tolist(), strict=True
+        )
+    ]
+    return scanner
+
+
+def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
+    """Return a mirror that draws a line in each firing; None for beams that make no even line."""
+    beams = sensor.beams
+    count = len(beams)
+    if count < _MIN_LINE or beams.origin.any():
+        return None
+    order = np.argsort(beams.time_ns, kind="stable")
+    times_ns = beams.time_ns[order]
+    elevations_deg = np.degrees(beams.elevation[order])
+    between_ns = (times_ns[-1] - times_ns[0]) / (count - 1)
+    step_deg = (elevations_deg[-1] - elevations_deg[0]) / (count - 1)
+    if not (between_ns > 0 and step_deg > 0):
+        return None
+    turned = beams.azimuth[order] - head.radians_per_ns * times_ns
+    is_even = (
+        np.abs(np.diff(times_ns) - between_ns).max() < _EVEN_NS
+        and np.abs(np.diff(elevations_deg) - step_deg).max() < _EVEN_DEG
+        and np.degrees(np.abs(turned - turned[0]).max()) < _EVEN_DEG
+    )
+    if not is_even:
+        return None
+    firing_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
+    pulses_per_line = max(round(firing_ns / between_ns), count)
+    # A line is shorter than a revolution of the mirror.
+    if step_deg * pulses_per_line > 360:
+        return None
+    exact_hz = pulses_per_line * 1e9 / firing_ns
+    pulse_hz = _whole_hz(sensor, exact_hz)
+    scanner = _head(head, pulse_hz, pulses_per_line, duration_s)
+    scanner.exact_hz = exact_hz
+    middle_deg = _set_line(scanner, step_deg, count, pulses_per_line, pulse_hz)
+    offset_deg = elevations_deg[0] + step_deg * (count - 1) / 2 - middle_deg
+    scanner.channels = [_Channel(_about_z(float(turned[0])) @ _about_x(np.radians(offset_deg)))]
+    return scanner
+
+
+def _set_line(
+    scanner: _Scanner, step_deg: float, count: int, pulses_per_line: int, pulse_hz: int
+) -> float:
+    """Give a scanner a mirror that draws lines; return the angle of their middle, degrees.
+
+    The mirror turns from -scanAngleMax_deg on, by a step from pulse to pulse; pulses between
+    verticalAngleMin_deg and verticalAngleMax_deg leave the device.
+    """
+    half_turn_deg = step_deg * pulses_per_line / 2
+    first_deg = (pulses_per_line - count) // 2 * step_deg - half_turn_deg
+    last_deg = first_deg + (count - 1) * step_deg
+    scan_hz = pulse_hz / pulses_per_line
+    half_line_deg = (count / 2 + 0.25) * step_deg  # of a line, with room for roundings
+    scanner.limits |= {
+        "scanAngleMax_deg": half_turn_deg,
+        "scanAngleEffectiveMax_deg": half_line_deg,
+        "scanFreqMin_Hz": 0,
+        "scanFreqMax_Hz": scan_hz,
+    }
+    scanner.settings |= {
+        "scanFreq_hz": scan_hz,
+        "scanAngle_deg": half_turn_deg,
+        "verticalAngleMin_deg": first_deg - step_deg / 2,
+        "verticalAngleMax_deg": last_deg + step_deg / 2,
+    }
+    return (first_deg + last_deg) / 2
+
+
+def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
+    """Return a mirror that draws lines with a single beam; LidarError for other mirrors."""
+    beams = sensor.beams
+    if len(beams) > 1 or abs(beams.elevation[0]) > 1e-9 or beams.origin.any():
+        raise _refusal(
+            sensor, "its mirror sweeps more than a beam at right angles to its axis from the centre"
+        )
+    if head.motion == "sine":
+        raise _refusal(
+            sensor, "its mirror swings as a sine, and HELIOS++'s goes to and fro evenly"
+        )
+    count = head.period
+    if count is None or count < _MIN_LINE:
+        raise _refusal(sensor, f"{head.firings_per_turn:g} firings of a line are no whole number")
+    pulses_per_line = count if head.motion == "triangle" else round(count / head.duty)
+    exact_hz = pulses_per_line * head.rate_hz
+    pulse_hz = _whole_hz(sensor, exact_hz)
+    optics = "oscillating" if head.motion == "triangle" else "rotating"
+    scanner = _Scanner(optics, pulse_hz, exact_hz, [])
+    middle = np.radians(head.zero_deg) + float(beams.azimuth[0])
+    sign = -1 if head.clockwise else 1
+    if head.motion == "triangle":
+        if head.duty != 1:
+            raise _refusal(sensor, f"its mirror pauses, with a duty of {head.duty:g}")
+        half_deg = head.width_deg / 2
+        scan_hz = pulse_hz / count
+        scanner.limits |= {
+            "scanAngleMax_deg": half_deg,
+            "scanFreqMin_Hz": 0,
+            "scanFreqMax_Hz": scan_hz,
+        }
+        scanner.settings |= {"scanFreq_hz": scan_hz, "scanAngle_deg": half_deg}
+        scanner.left_out.append("even turns of the mirror: HELIOS++ slows it at the ends of lines")
+    else:
+        step_deg = head.width_deg / count
+        line_deg = _set_line(scanner, step_deg, count, pulses_per_line, pulse_hz)
+        # A line of ours starts at half its width, and ends a step before the other half.
+        middle -= sign * np.radians(line_deg + step_deg / 2)
+    scanner.settings["maxDuration_s"] = duration_s
+    axes = np.eye(3) if sensor.axes is None else sensor.axes
+    rotation = _FRAME @ axes @ _about_z(middle) @ _OPTICS.T
+    scanner.channels = [_Channel(rotation if sign > 0 else rotation @ _REVERSED)]
+    return scanner
+
+
+def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
+    """Return Risley prisms; LidarError for what HELIOS++ does not have of prisms."""
+    if sensor.mirror is not None:
+        raise _refusal(sensor, "a mirror turns behind its prisms, and HELIOS++ has prisms alone")
+    if len(sensor.prisms) > MAX_PRISMS:
+        raise _refusal(sensor, f"it has {len(sensor.prisms)} prisms, and HELIOS++ {MAX_PRISMS}")
+    if not isinstance(sensor.head, Spin):
+        raise _refusal(sensor, f"HELIOS++ has no clock like {type(sensor.head).__name__}")
+    exact_hz = sensor.head.firings_per_turn * sensor.head.rate_hz
+    pulse_hz = _whole_hz(sensor, exact_hz)
+    scanner = _Scanner("risley", pulse_hz, exact_hz, [], {"refrIndex_air": 1.0})
+    for number, prism in enumerate(sensor.prisms, start=1):
+        scanner.limits |= {
+            f"refrIndex{number}": prism.index,
+            f"angle{number}_deg": prism.wedge_deg if prism.inclined_first else -prism.wedge_deg,
+            f"rotorFreq{number}_Hz": prism.rpm / 60 * pulse_hz / exact_hz,
+        }
+    scanner.settings |= {"maxDuration_s": duration_s}
+    phases_deg = [prism.phase_deg % 360 for prism in sensor.prisms]
+    if np.ptp(phases_deg):
+        listed = ", ".join(f"{phase_deg:g}" for phase_deg in phases_deg)
+        scanner.left_out.append(
+            f"different starting angles of the prisms, {listed} degrees: the same pattern starts "
+            "elsewhere"
+        )
+    if np.ptp(sensor.beams.time_ns):
+        scanner.left_out.append("times of the rays within a firing: all channels fire at once")
+    # All prisms start at the angle of the first: the whole device is turned by it.
+    turned = _about_x(np.radians(phases_deg[0]))
+    rotation = _FRAME @ turned @ _OPTICS.T
+    incident = sensor.ahead @ (_OPTICS @ turned.T).T
+    scanner.channels = [_Channel(rotation, incident=vector) for vector in incident]
+    return scanner
+
+
+def _about_x(radians: float) -> Floats:
+    """Return the rotation (3, 3) about x."""
+    sine, cosine = np.sin(radians), np.cos(radians)
+    return np.array([[1.0, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+
+
+def _about_z(radians: float) -> Floats:
+    """Return the rotation (3, 3) about z."""
+    sine, cosine = np.sin(radians), np.cos(radians)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0.0, 0, 1]])
