@@ -9,7 +9,8 @@ import re
 import runpy
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -21,11 +22,25 @@ from lidarpool.cli.import_plugins import import_whole
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.gazebo.import_world import import_world
+from lidarscenes.helios import import_scanner, is_scanner
 from lidarscenes.sensors.import_sensor import import_sensor
 from lidarscenes.sensors.omnilidar import read_omnilidar
-from lidarsim import Beams, LidarError, MujocoScanner, Sensor, Spin, export_sensor, load_sensor
+from lidarsim import (
+    Beams,
+    LidarError,
+    MujocoScanner,
+    Pose,
+    Sensor,
+    Spin,
+    export_sensor,
+    load_sensor,
+)
+from lidarsim.sensor import LineSensor
+from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.export import fired_rays
+from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.sensor_files.format_table import read_rays
+from raybeam import RayCaster
 
 TABLES = ("npz", "csv", "parquet")
 
@@ -112,6 +127,16 @@ def test_livox_lists_have_the_rays_that_the_plug_in_casts(tmp_path):
     firings = np.arange(len(file.rays))
     assert angle_deg(back.directions(firings)[:, 0], file.rays.directions) < 1e-5
     assert np.array_equal(back.times_ns(firings)[:, 0], file.rays.times_ns)
+
+
+def room_with_boxes():
+    """Vertices and faces of walls around the sensor, a floor, and boxes in it."""
+    boxes = [((0, 0, 1), (30, 20, 6)), ((5, 2, -1), (1, 2, 2)), ((-4, -3, -1), (2, 1, 1.5))]
+    corners = np.array(list(product((-0.5, 0.5), repeat=3)))
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([f for a, b, c, d in sides for f in ((a, b, c), (a, c, d))])
+    vertices = [np.array(middle) + corners * size for middle, size in boxes]
+    return np.concatenate(vertices), np.concatenate([faces + 8 * k for k in range(len(boxes))])
 
 
 def test_times_of_livox_lists_are_exact_from_the_first_ray_on(tmp_path):
@@ -345,6 +370,114 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
         read_omnilidar(path)
 
 
+def sensor_of_scanner(path, folder):
+    """The sensor that a scanner of HELIOS++ is imported as, its mount, and the notes."""
+    notes = import_whole(import_scanner, path, folder, (), lambda scenario: None)
+    content = yaml.safe_load((folder / "scenario.yaml").read_text())
+    [entry] = content["sensors"].values() if "sensors" in content else [content["sensor"]]
+    mount = entry.pop("mount", {})
+    pose = Pose(tuple(mount.pop("position", (0, 0, 0))), **mount)
+    entry["model"] = str(folder / entry["model"])
+    return load_sensor(**entry), pose, notes
+
+
+STRETCHED = "18,084.49 pulses a second: they are a whole number, 18,084, at the same angles"
+AT_ONCE = "times of the rays within a firing: all channels fire at once"
+SWING = Mirror(500, rate_hz=20, motion="triangle", width_deg=50, clockwise=True, zero_deg=12)
+HELIOS_SENSORS = {
+    "channels": ("velodyne/vlp16", (AT_ONCE, STRETCHED)),
+    "beside": ("ouster/os1-64", ("starts of the rays beside the axis of the head",)),
+    "prisms": ("livox/mid40", ()),  # which start at the same angle, half a turn from zero
+    "several": ("livox/avia", ()),
+    "polygon": ("airborne/riegl-vq780i", ()),
+    "line": (Sensor(Beams(np.radians(np.linspace(-20, 50, 70)), time_ns=np.arange(70) * 1e4),
+                    Spin(400, rate_hz=1, zero_deg=33)), ()),
+    "swing": (LineSensor(Beams(np.zeros(1)), SWING),
+              ("even turns of the mirror: HELIOS++ slows it at the ends of lines",)),
+    "grid": (Sensor.grid(360, 8, 40, max_range_m=50, min_range_m=0.5, rate_hz=20), ()),
+}  # fmt: skip
+
+
+@pytest.mark.extended(keep=("channels", "prisms", "polygon", "line"))
+@pytest.mark.parametrize("name", HELIOS_SENSORS)
+def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
+    sensor, left_out = HELIOS_SENSORS[name]
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    if name == "line":
+        turning = sensor.beams.turning(sensor.head.radians_per_ns)
+        sensor = replace(sensor, beams=turning)
+    file = export_sensor(sensor, tmp_path / "lidar.xml", format="helios")
+    assert file.left_out == left_out and not len(file.rays)
+    assert is_scanner(tmp_path / "lidar.xml")
+    back, mount, notes = sensor_of_scanner(tmp_path / "lidar.xml", tmp_path / "new")
+    assert notes == (["the slow turns of the mirror of LineSensor with 1 channels: it goes to and fro evenly"]
+                     if name == "swing" else [])  # fmt: skip
+    firings = np.arange(0, 5000, 7)
+    directions = back.directions(firings) @ mount.rotation_matrix.T
+    assert angle_deg(directions.reshape(-1, 3), sensor.directions(firings).reshape(-1, 3)) < 1e-5
+    times, expected = back.begins_ns(firings), sensor.begins_ns(firings)
+    if name == "channels":
+        expected *= 1e6 / 55.296 / 18_084
+    assert np.abs(times - expected).max() < 500, "a line of the polygon lasts 5,000 pulses"
+    assert (back.min_range_m, back.max_range_m) == (sensor.min_range_m, sensor.max_range_m)
+    if name == "channels":  # which start on the axis, above and below the centre
+        heights = back.origins(firings)[..., 2] + mount.position[2]
+        assert np.allclose(heights, sensor.origins(firings)[..., 2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "reason"),
+    [
+        ("livox/mid360", "a mirror turns behind its prisms"),
+        ("airborne/leica-als50-ii", "its mirror swings as a sine"),
+        (ListedSensor(), "it is a list of rays"),
+        (
+            Sensor(Beams(np.zeros(1)), Spin(1, rate_hz=0.1, step_deg=360)),
+            "fires 0.1 times a second",
+        ),
+    ],
+)
+def test_what_is_no_scanner_is_refused_for_helios(sensor, reason, tmp_path):
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    with pytest.raises(LidarError, match=f"is no scanner of HELIOS.*: .*{reason}.*npz and csv"):
+        export_sensor(sensor, tmp_path / "lidar.xml", format="helios")
+    assert list(tmp_path.iterdir()) == []
+
+
+SCANNERS = """<document>
+<scanner id="far" name="Far" optics="conic" pulseFreqs_Hz="1000,2000" scanFreqMax_Hz="50"
+  scanAngleMax_deg="20" accuracy_m="0.02" rangeMin_m="2"><beamOrigin z="0.1"/></scanner>
+<scanner id="two" name="Two" optics="rotating" pulseFreqs_Hz="1000" scanAngleMax_deg="1"
+  scanAngleEffectiveMax_deg="1" scanFreqMin_Hz="0" headRotatePerSecMax_deg="3600"><channels>
+  <channel id="low"><beamOrigin><rot axis="x" angle_deg="-5"/></beamOrigin></channel>
+  <channel id="high"><beamOrigin y="0.2"><rot axis="x" angle_deg="5"/></beamOrigin></channel>
+</channels></scanner>
+</document>"""
+
+
+def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
+    path = tmp_path / "scanners.xml"
+    path.write_text(SCANNERS)
+    with pytest.raises(
+        LidarError, match=r"2 scanners: name one, scanners.xml#far. There are far, "
+    ):
+        sensor_of_scanner(path, tmp_path / "new")
+    with pytest.raises(LidarError, match=r"no <scanner> 'fur' in the file\. Did you mean 'far'"):
+        sensor_of_scanner(tmp_path / "scanners.xml#fur", tmp_path / "new")
+    sensor, mount, [note] = sensor_of_scanner(tmp_path / "scanners.xml#far", tmp_path / "new")
+    assert note == "its rates: there are no <scannerSettings> for it, so they are the highest"
+    assert sensor.times_ns(np.arange(2))[:, 0].tolist() == [0, 500_000] and sensor.min_range_m == 2
+    assert np.allclose(np.degrees(np.arcsin(sensor.directions(np.arange(9))[:, 0, 2])), 70)
+    assert mount.position == (0, 0, 0.1) and mount.rotation is not None
+    content = yaml.safe_load((tmp_path / "new/scenario.yaml").read_text())
+    assert content["noise"] == {"range_m": 0.02}
+    notes = import_whole(
+        import_scanner, tmp_path / "scanners.xml#two", tmp_path / "two", (), Scenario.load
+    )
+    assert notes[-1] == "its 2 channels are a sensor each"
+    assert [*Scenario.load(tmp_path / "two/scenario.yaml").sensors] == ["low", "high"]
+
+
 def test_a_python_file_returns_the_rays_of_each_frame(tmp_path):
     """In a process that has NumPy and nothing of ours; vertices of the file are its sensor's."""
     sensor = load_sensor("livox/mid360")
@@ -369,6 +502,30 @@ print(mid360.NAME, mid360.RATE_HZ, mid360.FRAMES, mid360.MAX_RANGE_M)
         assert arrays["directions"].dtype == np.float32 and not arrays["origins"].any()
         assert angle_deg(arrays["directions"], file.rays.directions[frame]) < 1e-5
         assert np.array_equal(arrays["times_ns"], file.rays.times_ns[frame])
+
+
+@pytest.mark.parametrize("model", ["livox/mid360", "velodyne/hdl64e-s2"])
+def test_warp_casts_the_rays_of_a_python_file_as_we_do(model, tmp_path):
+    """On its CPU device, in one mesh; the origins of the second sensor are beside its centre."""
+    warp = pytest.importorskip("warp", reason="Warp is not installed: pip install warp-lang")
+    from tests.warp_kernels import first_distances
+
+    file = export_sensor(load_sensor(model), tmp_path / "lidar.py", seconds=0.02)
+    origins, directions, _ = runpy.run_path(str(tmp_path / "lidar.py"))["rays"]()
+    vertices, faces = room_with_boxes()
+    warp.init()
+    mesh = warp.Mesh(
+        warp.array(np.float32(vertices), dtype=warp.vec3, device="cpu"),
+        warp.array(np.int32(faces.ravel()), dtype=int, device="cpu"),
+    )
+    starts, rays = (warp.array(a, dtype=warp.vec3, device="cpu") for a in (origins, directions))
+    distances = warp.empty(len(origins), dtype=float, device="cpu")
+    arguments = [mesh.id, starts, rays, distances]
+    warp.launch(first_distances, dim=len(origins), inputs=arguments, device="cpu")
+    ours = RayCaster(vertices, faces, backend="numpy").cast(
+        file.rays.origins_or_centre, file.rays.directions
+    )
+    assert np.abs(distances.numpy() - ours.distance).max() < 1e-3  # no ray leaves the room
 
 
 class Tensor(np.ndarray):

@@ -123,10 +123,10 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a survey of another program as a scenario.
 
-    Surveys and scanners of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars, models of
-    MuJoCo (.xml) with their rangefinders, rays of a sensor (.csv, .npz, .parquet), OmniLidar prims
-    (.usd, .usda), and surveys for which a plug-in is installed. Unsupported features are listed,
-    one line each. Mesh files stay where they are.
+    Surveys and scanners of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars,
+    models of MuJoCo (.xml) with their rangefinders, rays of a sensor (.csv, .npz, .parquet),
+    OmniLidar prims (.usd, .usda), and surveys for which a plug-in is installed. Unsupported
+    features are listed, one line each. Mesh files stay where they are.
 
     \b
     Examples:

@@ -182,7 +182,11 @@ def _only(angles: Any) -> float:
 
 
 def _write(
-    folder: Path, program_file: str, first: HeliosScanner, sensors: dict[str, Device], lines: list[str]
+    folder: Path,
+    program_file: str,
+    first: HeliosScanner,
+    sensors: dict[str, Device],
+    lines: list[str],
 ) -> None:
     """Write the scenario and the data files of its sensors."""
     entries = {}

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.errors import LidarError
 from ..sensor_files.complete_files import remark, write_text_of
-from .beams import Mirror, Spin
+from .beams import Beams, Mirror, Spin
 from .noise import Noise
 from .ray_sensors import ListedSensor, PrismSensor
 from .sensor import LineSensor, Sensor
@@ -284,45 +285,69 @@ def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
     scanner.channels = [
         _Channel(_about_z(azimuth) @ _about_x(elevation), height_m)
         for elevation, azimuth, height_m in zip(
-            beams.elevation.tolist(), beams.azimuth.tolist(), beams.origin[:, 2].tolist(), strict=True
+            beams.elevation.tolist(),
+            beams.azimuth.tolist(),
+            beams.origin[:, 2].tolist(),
+            strict=True,
         )
     ]
     return scanner
 
 
-def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
-    """Return a mirror that draws a line in each firing; None for beams that make no even line."""
-    beams = sensor.beams
-    count = len(beams)
-    if count < _MIN_LINE or beams.origin.any():
+class _EvenLine(NamedTuple):
+    """Beams that follow each other upwards, with even steps of angle and time."""
+
+    lowest_deg: float
+    azimuth_deg: float
+    step_deg: float
+    step_ns: float
+
+
+def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
+    """Return the line of beams; None for beams that make no even line from the centre.
+
+    `radians_per_ns` is the speed of the head, which turns while the beams fire.
+    """
+    if len(beams) < _MIN_LINE or beams.origin.any():
         return None
     order = np.argsort(beams.time_ns, kind="stable")
     times_ns = beams.time_ns[order]
     elevations_deg = np.degrees(beams.elevation[order])
-    between_ns = (times_ns[-1] - times_ns[0]) / (count - 1)
-    step_deg = (elevations_deg[-1] - elevations_deg[0]) / (count - 1)
-    if not (between_ns > 0 and step_deg > 0):
-        return None
-    turned = beams.azimuth[order] - head.radians_per_ns * times_ns
+    azimuths_deg = np.degrees(beams.azimuth[order] - radians_per_ns * times_ns)
+    steps_ns = np.diff(times_ns)
+    steps_deg = np.diff(elevations_deg)
+    step_ns = float(steps_ns.mean())
+    step_deg = float(steps_deg.mean())
     is_even = (
-        np.abs(np.diff(times_ns) - between_ns).max() < _EVEN_NS
-        and np.abs(np.diff(elevations_deg) - step_deg).max() < _EVEN_DEG
-        and np.degrees(np.abs(turned - turned[0]).max()) < _EVEN_DEG
+        step_ns > 0
+        and step_deg > 0
+        and np.abs(steps_ns - step_ns).max() < _EVEN_NS
+        and np.abs(steps_deg - step_deg).max() < _EVEN_DEG
+        and np.ptp(azimuths_deg) < _EVEN_DEG
     )
     if not is_even:
         return None
-    firing_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
-    pulses_per_line = max(round(firing_ns / between_ns), count)
-    # A line is shorter than a revolution of the mirror.
-    if step_deg * pulses_per_line > 360:
+    return _EvenLine(float(elevations_deg[0]), float(azimuths_deg[0]), step_deg, step_ns)
+
+
+def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
+    """Return a mirror that draws a line in each firing; None for beams that make no even line."""
+    line = _even_line(sensor.beams, head.radians_per_ns)
+    if line is None:
         return None
-    exact_hz = pulses_per_line * 1e9 / firing_ns
+    count = sensor.channels
+    firing_hz = head.firings_per_turn * head.rate_hz
+    pulses_per_line = max(round(1e9 / (firing_hz * line.step_ns)), count)
+    if line.step_deg * pulses_per_line > 360:
+        return None  # the mirror would turn more than once in a line
+    exact_hz = pulses_per_line * firing_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
     scanner = _head(head, pulse_hz, pulses_per_line, duration_s)
     scanner.exact_hz = exact_hz
-    middle_deg = _set_line(scanner, step_deg, count, pulses_per_line, pulse_hz)
-    offset_deg = elevations_deg[0] + step_deg * (count - 1) / 2 - middle_deg
-    scanner.channels = [_Channel(_about_z(float(turned[0])) @ _about_x(np.radians(offset_deg)))]
+    middle_deg = _set_line(scanner, line.step_deg, count, pulses_per_line, pulse_hz)
+    tilt_deg = line.lowest_deg + line.step_deg * (count - 1) / 2 - middle_deg
+    rotation = _about_z(np.radians(line.azimuth_deg)) @ _about_x(np.radians(tilt_deg))
+    scanner.channels = [_Channel(rotation)]
     return scanner
 
 
@@ -362,9 +387,7 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
             sensor, "its mirror sweeps more than a beam at right angles to its axis from the centre"
         )
     if head.motion == "sine":
-        raise _refusal(
-            sensor, "its mirror swings as a sine, and HELIOS++'s goes to and fro evenly"
-        )
+        raise _refusal(sensor, "its mirror swings as a sine, and HELIOS++'s goes to and fro evenly")
     count = head.period
     if count is None or count < _MIN_LINE:
         raise _refusal(sensor, f"{head.firings_per_turn:g} firings of a line are no whole number")
