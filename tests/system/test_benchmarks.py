@@ -18,6 +18,7 @@ from benchmarks import (
 )
 from distributed import Client
 from docs.pictures import adapting as adapting_picture
+from docs.pictures import sensors as sensor_pictures
 from docs.pictures.effects import __main__ as pictures
 from tests.clusters import import_jobqueue, thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
@@ -111,6 +112,8 @@ def test_effects(capsys):
 def test_a_picture_of_an_effect(tmp_path):
     pictures.main([str(tmp_path), "--only", "range_noise"])
     assert (tmp_path / "effect-range-noise.png").stat().st_size > 10_000
+    sensor_pictures.main([str(tmp_path), "--only", "livox/mid40"])
+    assert 10_000 < (tmp_path / "livox-mid40.webp").stat().st_size < 50_000
 
 
 def test_formats(capsys):

@@ -140,7 +140,7 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     outcome = lidarpool("sensors", "velodyne/vlp16")
     assert outcome.out.startswith("Velodyne VLP-16\nangles ")
     out = "lidarpool sensors velodyne/vlp16 --out"
-    draw = f"to draw its beams: {out} beams.png"
+    draw = f"to draw its pattern: {out} pattern.png"
     assert outcome.out.endswith(f"\n{draw}\nfor other programs: {out} rays.npz\n")
     assert list(tmp_path.iterdir()) == []
     pictures = {"livox/mid40": "rose.png", "airborne/riegl-vq780i": "lines.png", "vlp16": "v.png"}

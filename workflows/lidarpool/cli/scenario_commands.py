@@ -436,7 +436,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     "--out",
     metavar="FILE",
     help="Write the sensor for other programs, in the format of the ending or of --as; .png draws "
-    "its beams.",
+    "its pattern.",
     shell_complete=completion.sensor_file,
 )
 @click.option(
@@ -502,7 +502,7 @@ def sensors(
     if out is None:
         assert model is not None  # without a file there is no calibration
         command = f"lidarpool sensors {shlex.quote(model)} --out"
-        click.echo(f"to draw its beams: {command} beams.png")
+        click.echo(f"to draw its pattern: {command} pattern.png")
         click.echo(f"for other programs: {command} rays.npz")
         return
     sensor = load_sensor(model, **settings)
@@ -511,11 +511,11 @@ def sensors(
         return
     if seconds is not None or revolutions is not None:
         raise click.UsageError("A picture shows fixed durations: leave the duration out.")
-    from lidarview.render.beam_picture import (
-        draw_beams,  # imports Matplotlib, which figures do not need
+    from lidarview.render.pattern_picture import (
+        draw_pattern,  # imports Matplotlib, which figures do not need
     )
 
-    draw_beams(out, sensor)
+    draw_pattern(out, sensor)
     click.echo(click.format_filename(out))
 
 

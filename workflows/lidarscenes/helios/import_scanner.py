@@ -108,11 +108,10 @@ def _element(files: Assets, reference: _Reference) -> Element:
             raise LidarError(f"there is no <scanner> {reference.scanner!r} in the file.{hint}")
         return by_id[reference.scanner]
     if len(elements) > 1:
-        names = [*by_id][:_MAX_NAMES]
-        more = ", …" if len(by_id) > _MAX_NAMES else ""
+        names = [*by_id]
         raise LidarError(
             f"it has {len(elements)} scanners: name one, {reference.file.name}#{names[0]}. "
-            f"There are {listed(names)}{more}."
+            f"There are {listed(names, _MAX_NAMES)}."
         )
     return elements[0]
 

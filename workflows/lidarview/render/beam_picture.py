@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,11 +24,6 @@ class _BeamPlot(NamedTuple):
     x_values: Floats  # (n,)
     y_values: Floats  # (n,)
     labels: tuple[str, str]
-
-
-def draw_beams(path: Path, sensor: Sensor) -> None:
-    """Write the picture of `beam_page`; LidarError if the file, a .png, cannot be written."""
-    beam_page(sensor).save(path)
 
 
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:

@@ -279,6 +279,10 @@ class Page:
             position = 0.03, 1 - (1.84 + 0.62 * number) * line
             self._text(self.figure, position, detail, 7.2, theme.MUTED, ha="left")
 
+    def note(self, text: str) -> None:
+        """Write a line at the bottom left."""
+        self._text(self.figure, (0.03, 0.025), text, 7.2, theme.MUTED, ha="left")
+
     def heading(self, axes: Axes, text: str, **options: Any) -> None:
         """Name a chart, above its left end."""
         style: dict[str, Any] = {

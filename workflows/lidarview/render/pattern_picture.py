@@ -1,0 +1,265 @@
+"""The picture of a sensor's pattern: a frame, and the coverage of the field of view over time."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize, to_rgb
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.words import listed
+from lidarsim.sensor import LineSensor, Sensor
+from lidarsim.sensor.ray_sensors import PrismSensor
+
+from . import theme
+from .beam_picture import COLOURS, beam_page
+from .picture_page import Page
+from .theme import mapped
+
+TIMES_S = (0.1, 0.5, 2.0)
+CELL_DEG = 0.28  # of the coverage: the width of a beam of Livox
+FIELD_S = 4.0  # cells that are met in this time are the field of view
+CONVENTIONS = "azimuth: degrees from x, forward, to y, left; elevation: above the xy plane"
+_COVERED = to_rgb(theme.OBJECT_COLOURS[0])
+_FIRST_FIRINGS = 8  # of sensors of several channels
+_MAX_FRAME_RAYS = 300_000  # of a longer frame, every so many firings
+_CHUNK_RAYS = 1_000_000
+_WIDE_DEG = 150.0  # charts of wider fields of view stand one above the other
+_WIDE_SIZE = (1600, 1150)
+_NARROW_SIZE = (1600, 640)
+
+
+class _Pattern(NamedTuple):
+    """Directions of a frame, and when the cells of all directions are met first.
+
+    Attributes
+    ----------
+    azimuths_deg, elevations_deg
+        Angles (n,) of the rays of a frame.
+    times_s
+        Their times (n,), seconds.
+    met_s
+        Times (rows, columns) at which cells are met first, seconds; infinite if never.
+    every
+        The frame has the rays of each so manieth firing.
+    """
+
+    azimuths_deg: Floats
+    elevations_deg: Floats
+    times_s: Floats
+    met_s: Floats
+    every: int
+
+
+class _Window(NamedTuple):
+    """Part of the grid of cells that has rays."""
+
+    rows: slice
+    columns: slice
+    extent: tuple[float, float, float, float]  # left, right, bottom, top, degrees
+
+
+def draw_pattern(path: Path, sensor: Sensor) -> None:
+    """Write the picture of `pattern_page`; LidarError if the file, a .png, cannot be written."""
+    pattern_page(sensor).save(path)
+
+
+def pattern_page(sensor: Sensor) -> Page:
+    """Draw a sensor's frame, coloured by time, and the directions covered after `TIMES_S`.
+
+    For sensors with prisms, whose patterns do not repeat, the covered shares of the field of view
+    are stated. A sensor that looks down has its angles over time instead, as in `beam_page`.
+    """
+    if isinstance(sensor, LineSensor):
+        page = beam_page(sensor)
+        page.note(
+            "angle: 0 is down, positive angles are left of the flight; rays lie in the yz plane"
+        )
+        return page
+    pattern = _pattern_of(sensor)
+    window = _window(pattern)
+    is_wide = window.extent[1] - window.extent[0] > _WIDE_DEG
+    page = Page(_WIDE_SIZE if is_wide else _NARROW_SIZE)
+    has_shares = isinstance(sensor, PrismSensor)
+    coverages = _coverages(pattern.met_s, has_shares)
+    has_zoom = sensor.channels > 1 and not has_shares
+    charts = _charts(page, 1 + has_zoom + len(coverages), is_wide, window)
+    _draw_frame(page, charts[0], sensor, pattern)
+    if has_zoom:
+        _draw_firings(page, charts[1], sensor)
+    for axes, (words, covered) in zip(charts[1 + has_zoom :], coverages, strict=True):
+        image = np.ones((*covered.shape, 4))
+        image[..., :3] = _COVERED
+        image[..., 3] = covered
+        axes.imshow(
+            image[window.rows, window.columns],
+            origin="lower",
+            extent=window.extent,
+            aspect="auto" if is_wide else "equal",
+        )
+        page.heading(axes, words)
+    channels = f"{sensor.channels:,} channel{'s' * (sensor.channels > 1)}"
+    details = [f"{channels} · {CONVENTIONS}"]
+    if has_shares:
+        details.append(
+            f"shares of the field of view, the cells of {CELL_DEG:g}° that rays meet within "
+            f"{FIELD_S:g} s"
+        )
+    page.title(sensor.model, *details)
+    return page
+
+
+def _pattern_of(sensor: Sensor) -> _Pattern:
+    """Return the directions of a frame, and the times at which cells are met."""
+    per_second = _firings_per_second(sensor)
+    per_frame = max(round(getattr(sensor.head, "firings_per_turn", per_second / 10)), 1)
+    every = -(-per_frame * sensor.channels // _MAX_FRAME_RAYS)
+    firings = np.arange(0, per_frame, every)
+    azimuths_deg, elevations_deg = _angles_deg(sensor, firings)
+    times_s = _times_s(sensor, firings)
+    met_s = np.full((round(180 / CELL_DEG) + 1, round(360 / CELL_DEG) + 1), np.inf)
+    count = round(FIELD_S * per_second)
+    if not isinstance(sensor, PrismSensor):
+        count = min(round(max(TIMES_S) * per_second), sensor.period or 2**62)
+    chunk = max(_CHUNK_RAYS // sensor.channels, 1)
+    for start in range(0, count, chunk):
+        part = np.arange(start, min(start + chunk, count))
+        np.minimum.at(met_s, _cells(*_angles_deg(sensor, part)), _times_s(sensor, part))
+    return _Pattern(azimuths_deg, elevations_deg, times_s, met_s, every)
+
+
+def _firings_per_second(sensor: Sensor) -> float:
+    """Return the rate of firings, from the times of the first thousand."""
+    start_ns, stop_ns = sensor.begins_ns(np.array([0, 1000]))
+    return float(1000 / (stop_ns - start_ns) * 1e9)
+
+
+def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
+    """Return azimuths and elevations (n,) of the rays of firings, degrees."""
+    x, y, z = sensor.directions(firings).reshape(-1, 3).T
+    return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
+
+
+def _times_s(sensor: Sensor, firings: Ints) -> Floats:
+    """Return times (n,) of the rays of firings since the start of the sensor, seconds."""
+    return (sensor.times_ns(firings).reshape(-1) - sensor.start_ns) / 1e9
+
+
+def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
+    """Return the rows and columns (n,) of the cells of directions."""
+    rows = ((elevations_deg + 90) / CELL_DEG).astype(np.int64)
+    return rows, ((azimuths_deg + 180) / CELL_DEG).astype(np.int64)
+
+
+def _window(pattern: _Pattern) -> _Window:
+    """Return the part of the cells that has rays, with an empty cell around."""
+    met = np.isfinite(pattern.met_s)
+    met[_cells(pattern.azimuths_deg, pattern.elevations_deg)] = True
+    edges = []
+    for axis, count in ((1, met.shape[0]), (0, met.shape[1])):
+        used = np.flatnonzero(met.any(axis=axis))
+        edges.append((max(int(used[0]) - 1, 0), min(int(used[-1]) + 2, count)))
+    (bottom, top), (left, right) = edges
+    azimuths = (left * CELL_DEG - 180, right * CELL_DEG - 180)
+    elevations = (bottom * CELL_DEG - 90, top * CELL_DEG - 90)
+    return _Window(slice(bottom, top), slice(left, right), (*azimuths, *elevations))
+
+
+def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
+    """Return headings, and the covered cells, of `TIMES_S`; equal ones together."""
+    field = np.isfinite(met_s).sum()
+    covered = {seconds: met_s <= seconds for seconds in TIMES_S}
+    groups = groupby(TIMES_S, key=lambda seconds: int(covered[seconds].sum()))
+    coverages = []
+    for count, members in groups:
+        times_s = [*members]
+        words = f"after {listed([f'{seconds:g}' for seconds in times_s])} s"
+        if times_s[1:]:
+            words += ": the same directions"
+        if has_shares:
+            words += f": {100 * count / field:.0f} %"
+        coverages.append((words, covered[times_s[0]]))
+    return coverages
+
+
+def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes]:
+    """Return charts one above the other, or side by side."""
+    left, right, bottom, top = window.extent
+    limits = {"xlim": (left, right), "ylim": (bottom, top)}
+    charts = []
+    for number in range(count):
+        if is_wide:
+            height = 0.84 / count
+            frame = (0.06, 0.06 + (count - 1 - number) * height, 0.79, height - 0.07)
+            labels = {"ylabel": "elevation"}
+            labels |= {"xlabel": "azimuth"} if number == count - 1 else {}
+        else:
+            width = 0.82 / count
+            frame = (0.068 + number * width, 0.12, width - 0.035, 0.62)
+            labels = {"xlabel": "azimuth"} | ({} if number else {"ylabel": "elevation"})
+        charts.append(page.chart(frame, **limits, **labels))
+        if not is_wide:
+            charts[-1].set_aspect("equal")
+    return charts
+
+
+class _TimeScale(NamedTuple):
+    """Unit of the times of a picture, and their colours."""
+
+    unit: str
+    per_s: float
+    norm: Normalize
+
+
+def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> None:
+    """Draw the rays of a frame, coloured by time."""
+    last_s = float(pattern.times_s.max())
+    unit, per_s = ("s", 1.0) if last_s > 5 else ("ms", 1e3)
+    scale = _TimeScale(unit, per_s, Normalize(0, max(per_s * last_s, 1e-3)))
+    area = 2.0 if len(pattern.times_s) < 5000 else 0.4
+    _draw_rays(
+        page, axes, (pattern.azimuths_deg, pattern.elevations_deg), pattern.times_s, scale, area
+    )
+    colours = mapped(COLOURS, np.linspace(0, 1, 256))
+    page.colour_bar(colours, scale.norm, f"time of a ray, {unit}")
+    words = "one frame" if sensor.cycle == "frame" else "one revolution"
+    if pattern.every > 1:
+        words += f", each {pattern.every}th firing"
+    page.heading(axes, words)
+
+
+def _draw_firings(page: Page, axes: Axes, sensor: Sensor) -> None:
+    """Draw the first firings of a sensor, coloured by their own times, where they are."""
+    firings = np.arange(_FIRST_FIRINGS)
+    angles_deg = _angles_deg(sensor, firings)
+    times_s = _times_s(sensor, firings)
+    last_s = float(times_s.max())
+    unit, per_s = ("µs", 1e6) if last_s < 0.01 else ("ms", 1e3)
+    stretched = _TimeScale(unit, per_s, Normalize(0, max(per_s * last_s, 1e-3)))
+    middle = angles_deg[0][0]  # no jump where azimuths pass 180 degrees
+    azimuths_deg = (angles_deg[0] - middle + 180) % 360 - 180 + middle
+    _draw_rays(page, axes, (azimuths_deg, angles_deg[1]), times_s, stretched, 8.0)
+    axes.autoscale()
+    duration = f"{per_s * last_s:,.0f} {unit}"
+    page.heading(axes, f"the first {_FIRST_FIRINGS} firings, {duration}, from the first colour on")
+
+
+def _draw_rays(
+    page: Page,
+    axes: Axes,
+    angles_deg: tuple[Floats, Floats],
+    times_s: Floats,
+    scale: _TimeScale,
+    area: float,
+) -> None:
+    """Draw rays as dots of an area, coloured by their times (n,)."""
+    axes.scatter(
+        *angles_deg,
+        s=area * page.unit**2,
+        c=mapped(COLOURS, scale.norm(scale.per_s * times_s)),
+        linewidths=0,
+    )
