@@ -156,13 +156,13 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
     single = all(_count(table) == 1 for table in tables)
     if not (others and is_shared and single and on_axis):
         return devices
-    beams = {
+    beams: dict[str, Any] = {
         "elevation_deg": [_only(table.get("elevation_deg", 0.0)) for table in tables],
         "azimuth_deg": [_only(table.get("azimuth_deg", 0.0)) for table in tables],
     }
-    heights = [[0.0, 0.0, float(clean(start[2] - starts[0][2]))] for start in starts]
-    if any(height for _, _, height in heights):
-        beams["origin_m"] = heights
+    heights = clean(starts[:, 2] - starts[0, 2])
+    if np.any(heights):
+        beams["origin_m"] = [[0.0, 0.0, height] for height in np.atleast_1d(heights).tolist()]
     merged = replace(first, data=shared | {"beams": beams})
     return {"": merged}
 

@@ -28,7 +28,7 @@ _COVERED = to_rgb(theme.OBJECT_COLOURS[0])
 _FIRST_FIRINGS = 8  # of sensors of several channels
 _MAX_FRAME_RAYS = 300_000  # of a longer frame, every so many firings
 _CHUNK_RAYS = 1_000_000
-_WIDE_DEG = 150.0  # charts of wider fields of view stand one above the other
+_WIDE = 2.0  # charts of fields of view with a greater ratio of sides stand one above the other
 _WIDE_SIZE = (1600, 1150)
 _NARROW_SIZE = (1600, 640)
 
@@ -82,7 +82,8 @@ def pattern_page(sensor: Sensor) -> Page:
         return page
     pattern = _pattern_of(sensor)
     window = _window(pattern)
-    is_wide = window.extent[1] - window.extent[0] > _WIDE_DEG
+    left, right, bottom, top = window.extent
+    is_wide = right - left > _WIDE * (top - bottom)
     page = Page(_WIDE_SIZE if is_wide else _NARROW_SIZE)
     has_shares = isinstance(sensor, PrismSensor)
     coverages = _coverages(pattern.met_s, has_shares)
@@ -146,7 +147,8 @@ def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
 
 def _times_s(sensor: Sensor, firings: Ints) -> Floats:
     """Return times (n,) of the rays of firings since the start of the sensor, seconds."""
-    return (sensor.times_ns(firings).reshape(-1) - sensor.start_ns) / 1e9
+    times_ns = sensor.times_ns(firings).reshape(-1).astype(np.float64)
+    return (times_ns - sensor.start_ns) / 1e9
 
 
 def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
