@@ -446,7 +446,7 @@ def test_what_is_no_scanner_is_refused_for_helios(sensor, reason, tmp_path):
 
 SCANNERS = """<document>
 <scanner id="far" name="Far" optics="conic" pulseFreqs_Hz="1000,2000" scanFreqMax_Hz="50"
-  scanAngleMax_deg="20" accuracy_m="0.02" rangeMin_m="2"><beamOrigin z="0.1"/></scanner>
+  scanAngleMax_deg="20" accuracy_m="0.02" rangeMin_m="2" maxNOR="1"><beamOrigin z="0.1"/></scanner>
 <scanner id="two" name="Two" optics="rotating" pulseFreqs_Hz="1000" scanAngleMax_deg="1"
   scanAngleEffectiveMax_deg="1" scanFreqMin_Hz="0" headRotatePerSecMax_deg="3600"><channels>
   <channel id="low"><beamOrigin><rot axis="x" angle_deg="-5"/></beamOrigin></channel>
@@ -470,7 +470,7 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     assert np.allclose(np.degrees(np.arcsin(sensor.directions(np.arange(9))[:, 0, 2])), 70)
     assert mount.position == (0, 0, 0.1) and mount.rotation is not None
     content = yaml.safe_load((tmp_path / "new/scenario.yaml").read_text())
-    assert content["noise"] == {"range_m": 0.02}
+    assert content["noise"] == {"range_m": 0.02} and content["returns"]["mode"] == "first"
     notes = import_whole(
         import_scanner, tmp_path / "scanners.xml#two", tmp_path / "two", (), Scenario.load
     )

@@ -204,9 +204,11 @@ def _write(
         content = {"sensors": entries}
     if accuracy_m := clean(first.number("accuracy_m")):
         content["noise"] = {"range_m": accuracy_m}
-    if (waveforms := first.child("FWFSettings")) is not None:
+    waveforms = first.child("FWFSettings")
+    if waveforms is not None or first.number("maxNOR"):
+        settings = {} if waveforms is None else dict(waveforms.attrib)
         content["returns"] = returns_section(
-            dict(waveforms.attrib), first.number("maxNOR"), first.number("pulseLength_ns", 4)
+            settings, first.number("maxNOR"), first.number("pulseLength_ns", 4)
         )
     head = [
         f"From {program_file} of HELIOS++ by lidarpool import.",
