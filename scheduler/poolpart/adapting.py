@@ -43,7 +43,7 @@ from .rules import check_count
 
 NAME = "poolpart-adapting"
 IDLE_S = 60.0  # after which a job without work ends, by default
-_ANSWER_S = 5.0  # for an idle worker to confirm that it runs no task
+_ANSWER_S = 5.0  # seconds that an idle worker has to confirm that it runs no task
 _LOST_S = 120.0  # without a report, after which the process that starts jobs counts as dead
 
 
@@ -77,8 +77,8 @@ class Bounds:
 class JobKind:
     """Size of the jobs of a partition, and their number."""
 
-    slots: int  # of a worker
-    workers: int = 1  # of a job
+    slots: int  # slots per worker
+    workers: int = 1  # workers per job
     bounds: Bounds | None = None  # None for a fixed number of jobs
     cancellable: bool = True  # before its workers have joined
 
@@ -117,7 +117,7 @@ class _Decision:
 
 @dataclass
 class _Record:
-    """State of a partition; times are values of `time.monotonic`."""
+    """State of a partition, with times from `time.monotonic`."""
 
     kind: JobKind
     queued_jobs: int = 0  # jobs whose workers have not joined
@@ -147,7 +147,7 @@ class Adaptation(SchedulerPlugin):
     # -- hooks of the scheduler --------------------------------------------------------
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Begin to count idle time; send a worker away whose job was cancelled meanwhile."""
+        """Begin to count idle time, or send a worker away whose job was cancelled meanwhile."""
         self._busy_at[worker] = time.monotonic()
         state = scheduler.workers[worker]
         if str(state.name) in self._cancelled:
@@ -195,7 +195,7 @@ class Adaptation(SchedulerPlugin):
         return waiting
 
     def missing_slots(self, name: str, waiting: float, limit: float) -> float:
-        """Return the slots that a partition lacks; below 0, the slots that no task needs.
+        """Return the slots that a partition lacks, below 0 if its tasks leave slots unused.
 
         Tasks that are bound to a worker, or run for long there, hold its slots. All other tasks may
         run on any worker of the partition, also on a new worker.
@@ -236,7 +236,7 @@ class Adaptation(SchedulerPlugin):
     def decide(
         self, name: str, jobs: Mapping[str, Sequence[str]], waiting: float
     ) -> _Decision | None:
-        """Decide which jobs of a partition start and end; None if their number is fixed.
+        """Decide which jobs of a partition start and end, or None if their number is fixed.
 
         Parameters
         ----------
@@ -355,7 +355,7 @@ def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
 async def look(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
 ) -> dict[str, Advice]:
-    """Return which jobs to start and to forget, by partition; close idle workers first.
+    """Close idle workers, then return which jobs to start and to forget, by partition.
 
     `jobs` is {partition: {job: names of its workers}}. Partitions with a fixed number of jobs have
     no advice.
@@ -372,7 +372,7 @@ async def look(
             continue
         advice[name] = decision.advice
         for job, workers in decision.idle.items():
-            for worker in workers:  # in this step of the event loop: no task can arrive before
+            for worker in workers:  # one step of the event loop: no task can arrive before
                 shut(dask_scheduler, worker)
             closing.append((name, job, workers))
     results = await asyncio.gather(*(adaptation.close_idle(workers) for *_, workers in closing))
@@ -386,7 +386,7 @@ async def look(
 async def look_at_groups(
     reports: Mapping[str, GroupReport], dask_scheduler: Any = None
 ) -> dict[str, GroupAdvice]:
-    """Return the sizes that groups of workers shall have, by partition; close idle workers first.
+    """Close idle workers, then return the sizes that groups of workers shall have, by partition.
 
     Closed workers are named again until a report says that they were removed: an earlier answer may
     not have arrived.
@@ -408,7 +408,7 @@ async def look_at_groups(
 
 
 def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
-    """Change the number of jobs of a partition; returns False if no process starts its jobs."""
+    """Change the number of jobs of a partition, or return False if no process starts its jobs."""
     record = _record(dask_scheduler, name)
     if record is not None:
         record.kind = replace(record.kind, bounds=bounds)
@@ -416,7 +416,7 @@ def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
 
 
 def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
-    """Request slots of a partition for a client, by its id; 0 ends the request.
+    """Request slots of a partition for a client, by its id, or end the request with 0 slots.
 
     Returns False if the partition does not adapt.
     """
@@ -441,7 +441,7 @@ def adaptive_names(dask_scheduler: Any = None) -> set[str]:
 
 
 def slots_of_new_worker(scheduler: Any, name: str) -> int:
-    """Return the slots of a worker that may join a partition; 0 if the partition is fixed."""
+    """Return the slots of a worker that may join a partition, or 0 if the partition is fixed."""
     return _upper_bound(scheduler, name)[1]
 
 
@@ -457,7 +457,7 @@ def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
 
 
 def max_slots(scheduler: Any, name: str) -> int:
-    """Return the slots of a partition with all its jobs; 0 if the partition is fixed."""
+    """Return the slots of a partition with all its jobs, or 0 if the partition is fixed."""
     return math.prod(_upper_bound(scheduler, name))
 
 
@@ -478,7 +478,7 @@ def expects_workers(scheduler: Any, name: str) -> bool:
 
 
 def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
-    """Return the number of workers with all jobs, and the slots of a worker; (0, 0) if fixed."""
+    """Return the number of workers with all jobs, and the slots of a worker, or (0, 0) if fixed."""
     record = _record(scheduler, name)
     if record is None or record.kind.bounds is None:
         return 0, 0

@@ -5,7 +5,7 @@ workers that may take it, which takes the scheduler some microseconds for each w
 (`benchmarks.placing`). Here it compares a few workers of the group that may take the task:
 
 - workers that hold inputs of the task;
-- else workers that have free slots, in the order in which they became free;
+- else workers that have free slots, the longest free worker first;
 - else, all being busy, some workers in turn.
 
 Dask's own objective decides between them. The groups are the partitions and, if there are fences,
@@ -40,18 +40,18 @@ _OUTSIDE = ""  # name of the group of the workers outside all fences
 
 
 class _Group:
-    """Workers of which each may take the same tasks."""
+    """Workers that may all take the same tasks."""
 
     def __init__(self, name: str, version: Any, workers: list[Any]) -> None:
         self.name = name
-        self.version = version  # of the cluster when the group was made
+        self.version = version  # the state of the cluster when the group was made
         self.workers = workers
         self.members = set(workers)
         self.free = dict.fromkeys(workers)  # ordered set: workers that may have free slots
-        self._next_index = 0  # of the first worker that `in_turn` returns next
+        self._next_index = 0  # the first worker that `in_turn` returns next
 
     def with_free_slots(self, slots: float) -> list[Any]:
-        """Return up to `COMPARED` workers with enough free slots; forget full workers."""
+        """Return up to `COMPARED` workers with enough free slots, and forget full workers."""
         workers: list[Any] = []
         for worker in list(islice(self.free, _EXAMINED)):
             free = free_slots_of(worker, self.name)
@@ -78,7 +78,7 @@ class WorkerChoice(SchedulerPlugin):
 
     def __init__(self, scheduler: Any, names: set[str]) -> None:
         self.scheduler = scheduler
-        self.names = names  # of the partitions; the caller adds and removes names
+        self.names = names  # the partitions: the caller adds and removes names
         self._changes = 0  # how often workers, or what they declare, have changed
         self._groups: dict[str, _Group] = {}
         self._rules = Rules()
@@ -138,7 +138,10 @@ class WorkerChoice(SchedulerPlugin):
     # -- the rule ----------------------------------------------------------------------
 
     def choose(self, task: Any) -> Any:
-        """Return the state of the worker for a task; NotImplemented to leave the choice to Dask."""
+        """Return the state of the worker for a task.
+
+        Returns NotImplemented to leave the choice to Dask.
+        """
         resource = group_of(task)
         if resource is None:
             return NotImplemented

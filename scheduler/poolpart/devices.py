@@ -64,8 +64,8 @@ def own_device() -> int | None:
 def own_device_share() -> float:
     """Share of its device's memory that this task's worker may take: 1 if no other uses the device.
 
-    The workers of a partition and host that see as many devices share these evenly; they count as
-    soon as they have joined. Errors are those of `own_device`.
+    The workers of a partition and host that see as many devices share these evenly. They count as
+    soon as they have joined. The errors of `own_device` are raised here, too.
     """
     if own_device() is None:
         return 1.0
@@ -89,7 +89,7 @@ def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int:
-    """Return the number of workers that use a worker's device, or are about to; at least 1."""
+    """Return the number of workers that use a worker's device, or are about to, at least 1."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return 1

@@ -1,7 +1,7 @@
 """Requests of clients to the steward: make partitions, move workers, dissolve partitions.
 
-Each is one request to the scheduler, which completes it or refuses it, also if the client dies
-meanwhile; simultaneous requests run one after the other.
+Each is one request to the scheduler. The scheduler completes or refuses the request, even if the
+client dies meanwhile. Simultaneous requests run one after the other.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
 from .workers import WorkerInfo, on_scheduler
 
-PATIENCE_S = 60.0  # for a worker to answer
-_RETURN_S = 10.0  # for workers to declare their former resources, at least
-_STAY_S = 1.0  # for workers that could not be moved to be members again
+PATIENCE_S = 60.0  # seconds that a worker has to answer
+_RETURN_S = 10.0  # minimum time for workers to declare their former resources
+_STAY_S = 1.0  # time until workers that could not be moved are members again
 _LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
 _MOVES = "The number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
@@ -77,7 +77,7 @@ async def declare(
     rules
         {partition: rule for workers that join later}.
     initial_rules
-        {partition: rule by which workers are chosen at first}.
+        {partition: rule that chooses the first workers}.
     pool
         {name of a worker to choose from: the worker as the client saw it, with its GPUs}.
     known_partitions
@@ -169,7 +169,10 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
 
 
 async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
-    """Wait until new members of partitions declare their resources; PoolError if any does not."""
+    """Wait until new members of partitions declare their resources.
+
+    Raises PoolError if a member does not.
+    """
     late = await steward.arrive(members, PATIENCE_S)
     if absent := [seat for seat in members if seat in late or seat.removed]:
         raise PoolError(
@@ -180,7 +183,7 @@ async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Prepare the scheduler for tasks of new partitions; return a remark for users, or "".
+    """Prepare the scheduler for tasks of new partitions and return a remark for users, or "".
 
     From now on, features such as inheritance are on (`features.py`), fences keep other tasks off
     exclusive partitions (`fence.py`), and tasks are counted (`stats.py`). The remark names features
@@ -213,7 +216,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
 async def grow(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers into a partition; see `Partition.grow`. Returns their names."""
+    """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
     if source == name:
@@ -235,7 +238,7 @@ async def grow(
 
 
 async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
-    """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
+    """Move workers out of a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
     members = _settled_members(steward, name)
@@ -252,7 +255,7 @@ async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> l
 async def _move(
     steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers into a partition or, with None, out of all; return their names.
+    """Move workers into a partition or, with None, out of all, and return their names.
 
     Workers whose tasks do not end in time stay where they are, and raise a PoolError.
     """
@@ -289,7 +292,7 @@ def _settled_members(steward: Steward, name: str) -> list[Seat]:
 
 
 def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
-    """Sort seats by the load of their workers; workers with long-running tasks come last."""
+    """Sort seats by the load of their workers, and put workers with long-running tasks last."""
 
     def load(seat: Seat) -> tuple[int, int]:
         """Return the numbers of long-running tasks and of all tasks of a worker."""
@@ -303,7 +306,7 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
 
 
 def ask_to_dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
-    """Ask the steward to undo partitions, or every partition if `names` is None; see `dissolve`."""
+    """Ask the steward to undo partitions, or every partition if `names` is None."""
     arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
     try:
         dissolved: list[str] = ask(client, dissolve, **arguments)
@@ -317,7 +320,7 @@ async def dissolve(
 ) -> list[str]:
     """Undo partitions, or every partition if `names` is None, and return their names.
 
-    See `Pool.dissolve`. `client_id` is of the client that asks; it has to register again.
+    `client_id` names the client that asks. That client has to register again.
     """
     scheduler = steward.scheduler
     await _wait_for_tasks(steward, names, timeout_s)
@@ -330,7 +333,7 @@ async def dissolve(
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
     release(scheduler, dissolved, client_id, had_rule=True)
-    if names is None:  # also in partitions that workers were started with, which have no rule
+    if names is None:  # this includes partitions that workers were started with: these have no rule
         release(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
         for feature in FEATURES:
@@ -339,7 +342,7 @@ async def dissolve(
     for seat in seats:
         steward.put(seat, None)
     lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
-    await features_settled()  # that tasks lend no more
+    await features_settled()  # then tasks lend no more
     # An absent worker comes back as it was started.
     present = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
@@ -351,7 +354,7 @@ async def dissolve(
 
 
 def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
-    """Return the partitions of these names that exist; every partition if `names` is None."""
+    """Return the partitions of these names that exist, or every partition if `names` is None."""
     return [name for name in steward.rules if names is None or name in names]
 
 
@@ -368,7 +371,10 @@ def _belongs(seat: Seat, names: Collection[str]) -> bool:
 async def _wait_for_tasks(
     steward: Steward, names: Collection[str] | None, timeout_s: float
 ) -> None:
-    """Wait until the tasks of partitions have ended; PoolError if they have not in time."""
+    """Wait until the tasks of partitions have ended.
+
+    Raises PoolError if they do not end in time.
+    """
     deadline = time.monotonic() + timeout_s
     # Tasks that the client just submitted arrive by another connection, milliseconds later.
     await asyncio.sleep(_LOOK_EVERY_S)

@@ -1,4 +1,4 @@
-"""Errors of pools and pipes; a leaf module."""
+"""Errors of pools and pipes."""
 
 
 class PoolError(RuntimeError):
@@ -10,4 +10,4 @@ class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an 
 
 
 class PipeFailed(RuntimeError):  # noqa: N818 - reads as what happened to the pipe
-    """A pipe was failed with `Pipe.fail`; the message is the reason."""
+    """A pipe was failed with `Pipe.fail`, whose reason is the message."""

@@ -14,14 +14,14 @@ class Feature:
     """A feature beside the core. Its methods run on the scheduler, and do nothing by default."""
 
     def begin(self, scheduler: Any, names: Iterable[str]) -> str:
-        """Begin in partitions; return a remark for users on what this version of Dask lacks."""
+        """Begin in partitions and return a remark for users on what this version of Dask lacks."""
         return ""
 
     def end(self, scheduler: Any, name: str) -> None:
         """End in a partition, if the feature has begun there."""
 
     def names(self, scheduler: Any) -> Set[str]:
-        """Return the partitions in which the feature has begun."""
+        """Return the partitions that the feature has begun in."""
         return frozenset()
 
     async def settle(self) -> None:
@@ -41,7 +41,7 @@ FEATURES: list[Feature] = []  # filled when `poolpart` is imported
 
 
 def begin_features(scheduler: Any, names: Iterable[str]) -> str:
-    """Begin all features in partitions; return their remarks for users, or ""."""
+    """Begin all features in partitions and return their remarks for users, or ""."""
     names = [*names]
     return "; ".join(filter(None, (feature.begin(scheduler, names) for feature in FEATURES)))
 
@@ -53,7 +53,7 @@ def end_features(scheduler: Any, name: str) -> None:
 
 
 def names_with_features(scheduler: Any) -> frozenset[str]:
-    """Return the partitions in which features have begun."""
+    """Return the partitions that features have begun in."""
     return frozenset().union(*(feature.names(scheduler) for feature in FEATURES))
 
 

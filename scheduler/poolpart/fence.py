@@ -15,8 +15,8 @@ The fence lives on the scheduler until it is lowered, also when the client has g
 that join late, are restarted or move between partitions are covered. Tasks that no worker outside
 may take wait; the scheduler logs that, and every client gets a warning.
 
-A fence is a rule that is called whenever the scheduler places a task, see `internals.py`; tasks
-and workers are not modified. Two approaches without such a rule were tried:
+A fence is a rule that is called whenever the scheduler places a task (`internals.method_rules`).
+Tasks and workers are not modified. Two approaches without such a rule were tried:
 a resource that all workers outside declare, put on every task without one, and
 `worker_restrictions` that name the workers outside. Both restrict every task, and Dask does not
 hold back restricted tasks: the open worker got all of 200 root tasks at once, and its memory all
@@ -67,7 +67,7 @@ def expect(scheduler: Any, worker: Any, name: str | None) -> None:
 
 
 def lower(scheduler: Any, name: str) -> None:
-    """Lower a fence; lowering the last fence removes the rule."""
+    """Lower a fence, and remove the rule with the last fence."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
         return
@@ -92,7 +92,7 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self.changes = 0  # of the set `closed`
+        self.changes = 0  # changes of the set `closed`
         self._rules = Rules()
         self._warned_at = float("-inf")  # time.monotonic()
         rule_for_fences(self._rules, scheduler, self.closed, self.stop)

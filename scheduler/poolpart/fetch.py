@@ -25,7 +25,9 @@ _held: dict[str, Any] = {}  # {name: bytes that this process holds}
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0, *, holder: str | None = None
 ) -> dict[str, Any]:
-    """Fetch the results that are available now; a later call fetches further results.
+    """Fetch the results that are available now.
+
+    A later call fetches further results.
 
     `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a
     connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
@@ -81,7 +83,7 @@ async def _take(client: Client, address: str, held: list[str], patience_s: float
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker; None if the worker is silent for `patience_s`."""
+    """Await a request to a worker, or return None if the worker is silent for `patience_s`."""
     answer_task = asyncio.ensure_future(request)
     try:
         # Giving up a worker that answers would discard the data so far, and the next call would be
@@ -98,7 +100,7 @@ async def _unless_silent(
 
 
 def hold_for_driver(name: str, data: Any) -> str:
-    """Keep bytes in this worker's memory until `take_held`; returns the worker's address.
+    """Keep bytes in this worker's memory until `take_held` and return the worker's address.
 
     The caller has to limit the amount: bytes that nobody fetches stay for ever.
     """
@@ -114,7 +116,7 @@ def holds_for_driver() -> bool:
 
 
 def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch bytes that a worker holds under a name; the worker then forgets the bytes.
+    """Fetch bytes that a worker holds under a name and then forgets.
 
     The address is the result of `hold_for_driver`. Returns None if the bytes were taken before, or
     if the worker has died or is silent for `patience_s`; a transfer may take longer.
@@ -132,6 +134,6 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
 
 
 def _hand_over(name: str) -> dict[str, Any]:
-    """Return and forget held bytes; a handler of a worker."""
+    """Return and forget held bytes, as a handler of a worker."""
     data = _held.pop(name, None)
     return {"data": None if data is None else as_bytes(data)}

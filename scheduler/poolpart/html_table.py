@@ -34,7 +34,7 @@ def html_paragraph(text: str) -> str:
 
 
 def shown_seconds(seconds: float) -> str:
-    """Return a running time with three digits; a dash if nothing has run."""
+    """Return a running time with three digits, or a dash if nothing has run."""
     if not seconds:
         return "–"
     return f"{seconds:,.0f}" if seconds >= 100 else f"{seconds:.3g}"

@@ -43,7 +43,7 @@ CHUNK_S_PER_SLOT = 0.005  # … or longer with many slots, so that the scheduler
 PATIENCE = 4  # a task ends after so many times the target; its other items are sent again
 
 Call = tuple[Any, ...]  # the arguments of one call
-Row = tuple[Call, ...]  # of one item, by stage: arguments besides the previous result
+Row = tuple[Call, ...]  # calls of an item, by stage: arguments besides the previous result
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class Chunk:
 class ChunkResult:
     """Result of a chunk."""
 
-    results: list[Any]  # of its first items, at least one; of all, unless one failed or time was up
-    seconds: float  # from start to end
+    results: list[Any]  # at least one; results of all items, unless one failed or time was up
+    seconds: float  # seconds from start to end
     nbytes: int  # estimated size of items and results
 
     def __sizeof__(self) -> int:
-        """Return the size of the results in bytes, by which Dask counts and spills."""
+        """Return the size of the results in bytes, which Dask counts and spills by."""
         return int(sizeof(self.results))
 
 
@@ -78,7 +78,9 @@ def run_chunk(
     result_position: int,
     return_exceptions: bool,
 ) -> ChunkResult:
-    """Call a function for each item of a chunk in turn; runs on a worker.
+    """Call a function for each item of a chunk in turn.
+
+    Runs on a worker.
 
     The task fails if the function fails for the first item of the chunk. If the function fails for
     a later item, the task ends before that item, and the error occurs when the items are sent
@@ -187,7 +189,7 @@ class ChunkSize:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a map: function, partition and options; see `Partition.map`."""
+    """One stage of a map: function, partition and options."""
 
     client: Client
     partition: str
@@ -222,7 +224,7 @@ class Stage:
         calls: Sequence[Sequence[Call]],
         previous_tasks: Sequence[Future] | None = None,
     ) -> list[Future]:
-        """Submit a task for each chunk; `previous_tasks` are the tasks of the stage before."""
+        """Submit a task for each chunk, after `previous_tasks`, the tasks of the stage before."""
         # Dask tries again only what fails.
         keep_errors = self.return_exceptions and not self.retries
         # One message is cheaper for the scheduler than one for each task.
@@ -263,7 +265,7 @@ class Results(Iterator[Any]):
         self._length = math.inf if math.inf in lengths else min(lengths, default=0)
         self._closed = False
         self._begun = False  # a result was requested
-        self._items_read = 0  # from the source
+        self._items_read = 0  # items read from the source
         self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent again
         self._size = ChunkSize()
         self._running: dict[Future, Chunk] = {}
@@ -272,7 +274,7 @@ class Results(Iterator[Any]):
         self._undelivered: dict[int, tuple[Chunk, ChunkResult | Future]] = {}
         self._next_item = 0  # index of the next one to deliver, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
-        self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
+        self._failed: tuple[Chunk, Future] | None = None  # raised after these
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
         # A second map is an ordinary iterable: its tasks have other items.
         previous = iterables[maps[0]] if maps else None
@@ -422,7 +424,7 @@ class Results(Iterator[Any]):
             when_done(future, self._ended.put)
 
     def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
-        """Return a chunk of items to send again or, if `fresh`, of new items; None if empty."""
+        """Return a chunk of items to send again or, if `fresh`, of new items, or None if empty."""
         if self._unfinished:
             first, rows = heapq.heappop(self._unfinished)
             if len(rows) > size:
@@ -439,7 +441,7 @@ class Results(Iterator[Any]):
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
 
     def _wait(self) -> list[Future]:
-        """Wait until tasks are done; a task of a partition lends its slots meanwhile."""
+        """Wait until tasks are done, and lend the slots of a task of a partition meanwhile."""
         ended: list[Future] = []
         with slots_lent(self._ended.empty()):
             while not ended:
@@ -456,7 +458,7 @@ class Results(Iterator[Any]):
             raise CancelledError(
                 f"The client of partition {self._stages[-1].partition!r} was closed."
             )
-        # Not while there are results: those of a partition that was dissolved are read first.
+        # Not while there are results: results of a dissolved partition are read first.
         if self._ended.empty() and time.monotonic() > self._next_look:
             self._look()
 
@@ -497,7 +499,7 @@ class Results(Iterator[Any]):
                 heapq.heappush(self._unfinished, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
-        """Stop, and raise a task's error; a note names the item."""
+        """Stop, and raise a task's error with a note that names the item."""
         self.close()
         try:
             future.result()

@@ -42,13 +42,15 @@ NAME = "poolpart-registrations"
 
 
 class MemberName(str):
-    """Name or address of a member of a partition; the scheduler looks its address up."""
+    """Name or address of a member of a partition, for the scheduler to look its address up."""
 
     __slots__ = ()
 
 
 def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
-    """Register a client for a partition, once; return whether the partition has, or had, a rule.
+    """Register a client for a partition, once.
+
+    Returns whether the partition has, or had, a rule.
 
     Parameters
     ----------
@@ -93,7 +95,10 @@ class Prospects:
 
 
 def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects:
-    """Ask what tasks of so many slots may expect of a partition; arguments as of `register`."""
+    """Ask what tasks of so many slots may expect of a partition.
+
+    The arguments are as in `register`.
+    """
     answer: Prospects = on_scheduler(client, _prospects, name=name, slots=slots, by_rule=by_rule)
     return answer
 
@@ -102,7 +107,7 @@ def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects
 
 
 class Registrations(SchedulerPlugin):
-    """Clients that use partitions, and the rule by which their tasks are refused."""
+    """Clients that use partitions, and the rule that refuses their tasks."""
 
     name = NAME
 
@@ -149,7 +154,10 @@ class Registrations(SchedulerPlugin):
     # -- tasks -------------------------------------------------------------------------
 
     def _check(self, graph: dict[str, Any]) -> dict[str, Any]:
-        """Return the arguments of a graph, with addresses of members; PoolError to refuse it."""
+        """Return the arguments of a graph, with addresses of members.
+
+        Raises PoolError to refuse the graph.
+        """
         annotations = graph["global_annotations"] or {}
         client = graph["client"]
         for resources in graph["annotations_by_type"].get("resources", {}).values():
@@ -258,7 +266,7 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     max_slots = max(
         slots_of_new_worker(scheduler, name),
         *(worker.resources[name] for worker in members),
-        *(seat.slots for seat in seats),  # also of members that are starting
+        *(seat.slots for seat in seats),  # includes members that are starting
         0,
     )
     if not max_slots or slots <= max_slots:

@@ -48,7 +48,7 @@ class Partition:
     name
         Name of the partition and of the resource.
     client
-        Client of the cluster. By default, in a task, that of its worker.
+        Client of the cluster. By default, in a task, the client of its worker.
     note
         A remark for users, such as that there were no GPUs. The division that makes the
         partition logs the note as a warning, once.
@@ -122,7 +122,8 @@ class Partition:
         """Return the tasks of the partition one by one, of all clients.
 
         There are those that wait or run, and the last 1,000 that have ended since tasks are
-        counted, see `stats`.
+        The tasks wait or run, or are among the last 1,000 that have ended since tasks are counted
+        (`stats`).
 
         Raises
         ------
@@ -209,7 +210,10 @@ class Partition:
         )
 
     def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
-        """Check and return the resources of a task; `asks` allows a request to the scheduler."""
+        """Check and return the resources of a task.
+
+        `asks` allows a request to the scheduler.
+        """
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
         if asks:
@@ -231,15 +235,14 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> Results:
-        """Call a function for each item; returns an iterator of the results.
+        """Call a function for each item and return an iterator of the results.
 
         The number of items may be infinite: items are taken, and results fetched, while
         results are read, and a bounded number is under way. Small items share a task; their
         number is learned from their time and size.
 
-        A map over the results of another map fetches them between workers, also of different
-        partitions, past driver and scheduler. That holds for one unread map among the
-        iterables.
+        A map over the results of another map fetches them between workers, past driver and
+        scheduler, even if the partitions differ. That holds for one unread map among the iterables.
 
         Parameters
         ----------
@@ -411,12 +414,12 @@ class Partition:
         *,
         running: Literal["continue", "restart"] = "continue",
     ) -> dict[Any, str]:
-        """Cancel tasks of this partition; returns what happened to each.
+        """Cancel tasks of this partition and return what happened to each.
 
         Parameters
         ----------
         futures
-            Futures of the tasks, also if they were cancelled before.
+            Futures of the tasks. Futures that were cancelled before are accepted.
         running
             What to do with tasks that run. Dask does not stop them: they keep their slot until
             their function returns, which can look whether it was `cancelled`. With "restart", a
@@ -492,7 +495,7 @@ class Partition:
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
-        """Put data into the memory of these workers; returns futures.
+        """Put data into the memory of these workers and return futures.
 
         Scattered data cannot be recomputed when its worker dies.
 
@@ -510,7 +513,7 @@ class Partition:
         """
         _refuse_options("scatter", options, workers="the data is put on members of the partition")
         addresses = [worker.address for worker in self.workers]
-        if not addresses:  # to Dask that would be any worker
+        if not addresses:  # Dask would take any worker
             raise PoolError(f"Partition {self.name!r} has no workers to keep data.")
         return self.client.scatter(data, workers=addresses, **options)
 
@@ -542,7 +545,7 @@ class Partition:
     def grow(
         self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Move workers into this partition while everything runs; returns their names.
+        """Move workers into this partition while everything runs, and return their names.
 
         Tasks of the former partition that a worker runs end there first, and its waiting tasks
         go to other members. If this partition's rule is a number of workers, that grows too.
@@ -560,8 +563,8 @@ class Partition:
         Raises
         ------
         PoolError
-            If there are too few, beyond the minimum of `source`; or if tasks do not end in time,
-            in which case their workers stay.
+            If there are too few, beyond the minimum of `source`; or if tasks do not end in time. In
+            the latter case their workers stay.
 
         Examples
         --------
@@ -573,7 +576,7 @@ class Partition:
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
-        """Move workers out of this partition while everything runs; returns their names.
+        """Move workers out of this partition while everything runs, and return their names.
 
         They go to the partition that has the rest, or to none, as described for `grow`. Those
         with the least load go first.
@@ -624,7 +627,7 @@ class Partition:
             )
 
     def want(self, slots: int) -> bool:
-        """Say how many slots this client wants; returns whether the number of workers adapts.
+        """Say how many slots this client wants, and return whether the number of workers adapts.
 
         For a program that chooses a worker for each task and so has none waiting: as long as it
         wants slots, jobs are started as if tasks waited for them, and kept. 0 ends it, and so does
@@ -645,7 +648,7 @@ class Partition:
         return bool(on_scheduler(self.client, want, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
-        """Undo this partition; see `Pool.dissolve`."""
+        """Undo this partition, as `Pool.dissolve` does."""
         ask_to_dissolve(self.client, [self.name], timeout_s)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from .html_table import html_table, shown_seconds
 
-COUNTS = ("waiting", "queued", "running", "done", "failed")  # of tasks, in the order of tables
+COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 

@@ -4,12 +4,11 @@ A pipe is a `distributed.Queue` of items and a `distributed.Variable` with its s
 the pipe's name; `pipe_states.py` is their side on the scheduler. Any client can look at them, put
 and take by `Queue(name)`, and close the pipe by `Variable(name)`.
 
-`Pipe.put` and `Pipe.get` ask the scheduler by requests of their own. A request waits there for a
-second at most, and is then asked again. So no item goes to a process that was killed while it
-waited, and to a process that was stopped, or a machine that was cut off, at most the items of one
-second.
+`Pipe.put` and `Pipe.get` send the scheduler special requests. A request waits there for a second at
+most, and is then asked again. So no item goes to a process that was killed while it waited, and to
+a process that was stopped, or a machine that was cut off, at most the items of one second.
 
-Pipes end with the client that made them, also if it was killed. Otherwise tasks at both ends would
+Pipes end with the client that made them, even if it was killed. Otherwise tasks at both ends would
 wait for ever, and keep their slots; Dask does not stop the thread of a task whose client has left.
 """
 
@@ -68,7 +67,7 @@ class Pipe:
 
     After `fail`, every `put` raises `PipeFailed`. A `get` first hands out what this object has
     already taken, and then raises; waiting calls raise within a second. A pipe that does not exist,
-    or was deleted, raises the same error, also in `close` and `fail`. If the scheduler has died,
+    or was deleted, raises the same error, `close` and `fail` included. If the scheduler has died,
     calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``.
 
     A consumer takes all queued items, up to about `capacity`, in one request; `get` and
@@ -78,8 +77,8 @@ class Pipe:
     if the object is dropped, such as by a `break` and the end of the task: for exactly-once
     delivery, record what has arrived, and put missing items again.
 
-    Each object hands out items in the order in which they were put, but threads that share an
-    object get them in any order. An item that cannot be unpickled raises its error when its turn
+    Each object hands out items in the order of their `put`, but threads that share an object get
+    them in any order. An item that cannot be unpickled raises its error when its turn
     comes, and is lost; the items after it are not. A wait that is interrupted, as by Ctrl-C, takes
     no item away: an item that arrives within the next second stays in the object for its next
     `get`. A thread that an event loop no longer awaits (`asyncio.to_thread`) goes on waiting, and
@@ -94,20 +93,20 @@ class Pipe:
     client
         The client to use. By default, on a worker, the worker's own.
     producers
-        Number of producers, each of which calls `close` when it is done.
+        Number of producers. Each producer calls `close` when it is done.
 
     Notes
     -----
-    Any client can use ``Queue(pipe.name)`` and ``Variable(pipe.name)`` of Dask. The items of the
-    queue are those of the pipe, in the same order and within the same capacity; its `put` and `get`
-    raise `PipeClosed` and `PipeFailed`, too. Unlike `Pipe.get`, `Queue.get` loses an item if its
-    client is killed while it waits: the scheduler does not know whose request it is. A
+    Any client can use ``Queue(pipe.name)`` and ``Variable(pipe.name)`` of Dask. The queue has the
+    items of the pipe, in the same order and within the same capacity. Its `put` and `get` raise
+    `PipeClosed` and `PipeFailed`, too. Unlike `Pipe.get`, `Queue.get` loses an item if its client
+    is killed while it waits: the scheduler does not know whose request it is. A
     ``Queue.get(batch=5)`` that has got fewer items when the pipe ends raises, and loses these
-    items: use ``batch=True``, which does not wait. The variable
-    is the state, see `poolpart.pipe_states.PipeState`. ``variable.set({**variable.get(), "closed":
-    True})`` closes the pipe; what does not follow from the state is a ValueError, also if the state
-    has changed since it was read: read and set it again. ``Variable.delete``, or releasing the last
-    reference to the queue, deletes the pipe.
+    items: use ``batch=True``, which does not wait. The variable is the state, a
+    `poolpart.pipe_states.PipeState`. ``variable.set({**variable.get(), "closed": True})`` closes
+    the pipe. What does not follow from the state is a ValueError. So is a state that has changed
+    since it was read: read and set it again. ``Variable.delete``, or releasing the last reference
+    to the queue, deletes the pipe.
 
     Examples
     --------
@@ -134,7 +133,7 @@ class Pipe:
         # Items that the scheduler has handed over and no call has returned yet. The event loop of
         # the client appends them, threads that share this object remove them.
         self._buffer: deque[Packed] = deque()
-        self._advice: int | None = None  # of the last reply
+        self._advice: int | None = None  # advice of the last reply
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Pipe, (self.name, self.capacity, None, self.producers)
@@ -157,7 +156,7 @@ class Pipe:
     # -- creating and deleting ---------------------------------------------------------
 
     def create(self) -> Pipe:
-        """Open the pipe on the scheduler; returns itself.
+        """Open the pipe on the scheduler and return itself.
 
         Raises
         ------
@@ -177,7 +176,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe on the scheduler, with all queued items; skip an unknown pipe."""
+        """Delete the pipe on the scheduler, with all queued items, if it exists."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -215,7 +214,7 @@ class Pipe:
         on_reply: Callable[[Reply], None] = lambda reply: None,
         **arguments: Any,
     ) -> Reply:
-        """Repeat a request to the scheduler until a reply ends the wait; return the last reply.
+        """Repeat a request to the scheduler until a reply ends the wait, and return the last reply.
 
         Parameters
         ----------
@@ -226,7 +225,7 @@ class Pipe:
             Returns True for a reply that ends the wait. A reply of a pipe that was closed, has
             failed or is gone always ends the wait.
         question
-            PUT or TAKE, see `pipe_states.Pipes`; `arguments` are those of the request.
+            PUT or TAKE, with the `arguments` of this request of `pipe_states.Pipes`.
         on_reply
             Called with each reply in the event loop of the client, even if this thread has been
             interrupted.
@@ -253,10 +252,12 @@ class Pipe:
         return int(self._change()["answer"])
 
     def close(self) -> None:
-        """Close the pipe for a producer; the last producer closes the pipe for all.
+        """Close the pipe for a producer.
+
+        The last producer closes the pipe for all.
 
         Then nothing can be put, and consumers take the remaining items and end. With several
-        `producers`, each task counts once, also if it is run again; elsewhere each call counts.
+        `producers`, each task counts once, even if it is run again; elsewhere each call counts.
         """
         self._change(producer=_producer())
 
@@ -289,7 +290,7 @@ class Pipe:
             self._change(advice=amount)
 
     def put(self, item: Any, timeout_s: float | None = None, *, unbounded: bool = False) -> None:
-        """Add an item; waits while the pipe is full.
+        """Add an item, and wait while the pipe is full.
 
         Parameters
         ----------
@@ -315,7 +316,7 @@ class Pipe:
     def put_many(
         self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
     ) -> None:
-        """Add items in order, up to `capacity` items in a request; waits like `put`.
+        """Add items in order, up to `capacity` items in a request, and wait like `put`.
 
         The items may be endless; `capacity` of them are read before they are sent. After an error,
         such as that `timeout_s` was too short for all, the first of them may be in the pipe.
@@ -336,12 +337,15 @@ class Pipe:
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self) -> list[Any]:
-        """Take all queued items, possibly none; never waits, and raises `PipeFailed`."""
+        """Take all queued items, possibly none, without waiting.
+
+        Raises `PipeFailed`.
+        """
         self._fill_buffer(-math.inf)
         return self._unpack(self._remove())
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
-        """Take all queued items; waits until there are any.
+        """Take all queued items, and wait until there are any.
 
         Parameters
         ----------
@@ -368,7 +372,10 @@ class Pipe:
             self._raise_at_end(reply, deadline, timeout_s)
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item; waits for an item and 2 ms for more, and raises like `get_all`."""
+        """Take the next item, waiting for an item and 2 ms for more.
+
+        Raises like `get_all`.
+        """
         deadline = _deadline(timeout_s)
         while True:
             try:
@@ -419,11 +426,11 @@ class Pipe:
         is_settled: Callable[[Reply], bool] | None = None,
         **arguments: Any,
     ) -> Reply:
-        """Take queued items into the buffer, in the event loop of the client; raises `PipeFailed`.
+        """Take queued items into the buffer, in the event loop of the client.
 
-        Without `is_settled`, the wait ends once the buffer has items, also items that another
-        thread has taken. `deadline` and `is_settled` are those of `_ask_until`; `arguments` are
-        those of the request TAKE. Returns the last reply.
+        Without `is_settled`, the wait ends once the buffer has items, even if another thread has
+        taken them. `_ask_until` describes `deadline` and `is_settled`; `arguments` belong to the
+        request TAKE. Returns the last reply. Raises `PipeFailed`.
         """
 
         def append_items(reply: Reply) -> None:
@@ -478,7 +485,7 @@ class Pipe:
                 yield self.get()
 
     def listen(self, function: Callable[[Any], Any]) -> Listener:
-        """Call a function for each item, in this process, until the pipe ends; does not wait.
+        """Call a function for each item, in this process, until the pipe ends, without waiting.
 
         The calls are in the order of the items, in one thread. This process is any consumer of the
         pipe: items that others take do not come here.
@@ -505,7 +512,7 @@ class Pipe:
 
 
 def _deadline(timeout_s: float | None) -> float:
-    """Return the time of `time.monotonic` after a time-out in seconds; inf without a time-out."""
+    """Return the time of `time.monotonic` after a time-out in seconds, inf without a time-out."""
     return math.inf if timeout_s is None else time.monotonic() + timeout_s
 
 
@@ -521,7 +528,7 @@ def _producer() -> str:
 
 
 def forget_pipes(client: Client, names: Sequence[str]) -> None:
-    """Delete pipes on the scheduler, with their items; skip unknown pipes."""
+    """Delete pipes on the scheduler, with their items, if they exist."""
     on_scheduler(client, delete_pipes, names=list(names))
 
 
@@ -570,12 +577,12 @@ def take_news(
     return {name: [unpack(client, item) for item in items] for name, items in answers.items()}
 
 
-# {client: connection by which the client has asked its scheduler to answer requests}
+# {client: connection on which the client has asked its scheduler to answer requests}
 _connections: WeakKeyDictionary[Client, Any] = WeakKeyDictionary()
 
 
 def _let_answer(client: Client) -> None:
-    """Have the scheduler answer requests, whether it has pipes or not; asks once a connection."""
+    """Have the scheduler answer requests, whether it has pipes or not, once a connection."""
     connection = client.scheduler_comm
     if connection is None or _connections.get(client) is not connection:
         on_scheduler(client, answer_pipes)
@@ -585,10 +592,12 @@ def _let_answer(client: Client) -> None:
 
 
 def _ask(client: Client, question: str, **arguments: Any) -> Replies:
-    """Send a single request to the scheduler; return {pipe: reply} of the pipes that exist.
+    """Send a single request to the scheduler.
+
+    Returns {pipe: reply} of the pipes that exist.
 
     `question` is CHANGE, PUT or TAKE: the name of a handler that `pipe_states.Pipes` adds to the
-    scheduler. `arguments` are those of the handler.
+    scheduler. The handler takes `arguments`.
     """
     _let_answer(client)
     replies: Replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
@@ -616,7 +625,7 @@ def _ask_until(
     is_settled
         Returns True for replies, {pipe: reply}, that end the wait.
     question
-        PUT or TAKE, as of `_ask`; `arguments` are those of the handler.
+        PUT or TAKE, with `arguments` for the handler, as in `_ask`.
     on_replies
         Called with the replies to each request, in the event loop of the client.
     """

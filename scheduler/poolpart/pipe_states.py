@@ -4,10 +4,10 @@ The Queue holds the items. The Variable holds all else that is known of the pipe
 copy: a client that sets it to ``{**state, "closed": True}`` closes the pipe. Other clients may put,
 take and look by Dask's own classes.
 
-Pipes use requests of their own, because Dask's lack three things: `Queue.get` does not know its
-client, so that the item which a killed client waits for is lost; a queue cannot be closed; and
-state and items cannot be asked for together. A request waits here, for the pipes that it names
-only, and takes items only if its client is still there.
+Pipes use special requests, because Dask's lack three things: `Queue.get` does not know its client,
+so that the item which a killed client waits for is lost; a queue cannot be closed; and state and
+items cannot be asked for together. A request waits here, for the pipes that it names only, and
+takes items only if its client is still there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NAME = "poolpart-pipes"
 CHANGE, PUT, TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "take"))
 
 Reply = dict[str, Any]  # state of a pipe, and the answer to a request
-Replies = dict[str, Reply]  # by pipe, of those that exist
+Replies = dict[str, Reply]  # {pipe that exists: its reply}
 
 _ENDED = ("memory", "erred", "forgotten")  # states of tasks that nobody need wait for
 _SETTABLE = ("closed", "failure", "advice")  # what any client may set
@@ -45,7 +45,7 @@ class PipeState:
     The value of the Variable, which all clients see, is a dict:
 
     ==========  ====================================================================
-    owner       id of the client that has created the pipe, and with which it ends
+    owner       id of the client that has created the pipe; the pipe ends with it
     capacity    items that may be queued
     producers   number of producers that close the pipe, each for itself
     closed_by   those that have: keys of their tasks, or random ids
@@ -117,13 +117,19 @@ class PipeState:
         self._dask.set({**self.value, **changes})
 
     def close(self, producer: str) -> None:
-        """Close the pipe for a producer; the last producer closes the pipe for all."""
+        """Close the pipe for a producer.
+
+        The last producer closes the pipe for all.
+        """
         closed_by = tuple(dict.fromkeys((*self.value["closed_by"], producer)))
         closed = self.value["closed"] or len(closed_by) >= self.value["producers"]
         self.change(closed_by=closed_by, closed=closed)
 
     def fail(self, reason: str) -> None:
-        """Let the pipe fail; the first reason stays, later reasons are its consequences."""
+        """Let the pipe fail.
+
+        The first reason stays. Later reasons are its consequences.
+        """
         self.change(failure=self.value["failure"] or reason)
 
     def check(self, value: Any) -> None:
@@ -171,7 +177,10 @@ def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
 async def open_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
-    """Create a pipe; False if its name is used. Runs on the scheduler."""
+    """Create a pipe, or return False if its name is used.
+
+    Runs on the scheduler.
+    """
     # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
     # or get the answer.
     if QueueAndVariable.is_used(dask_scheduler, name) or owner not in dask_scheduler.clients:
@@ -205,7 +214,7 @@ def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
 
 
 class Pipes(SchedulerPlugin):
-    """The pipes of a scheduler; exists as long as there are any pipes."""
+    """The pipes of a scheduler, which exists as long as there are any pipes."""
 
     name = NAME
 
@@ -231,7 +240,7 @@ class Pipes(SchedulerPlugin):
             self._awaited[key].notify()
 
     def delete(self, names: Collection[str]) -> None:
-        """Delete pipes, as far as they exist; after the last pipe, leave the scheduler."""
+        """Delete pipes, as far as they exist, and leave the scheduler after the last pipe."""
         for name in self.states.keys() & set(names):
             self.states.pop(name).delete()
         if not self.states:
@@ -241,7 +250,7 @@ class Pipes(SchedulerPlugin):
             handlers_of(self.scheduler).update(dict.fromkeys((CHANGE, PUT, TAKE), no_pipes))
 
     def _check(self, name: str, value: Any) -> None:
-        """Check a value to which a client sets a Variable."""
+        """Check a value that a client sets a Variable to."""
         if (state := self.states.get(name)) is not None:
             state.check(value)
 
@@ -260,7 +269,7 @@ class Pipes(SchedulerPlugin):
         failure: str = "",
         advice: int = 0,
     ) -> Replies:
-        """Close pipes for a producer, let pipes fail, or set an advice; answer the depth."""
+        """Close pipes for a producer, let pipes fail, or set an advice, and answer the depth."""
         states = self._existing(names)
         for state in states.values():
             if producer:
@@ -274,7 +283,7 @@ class Pipes(SchedulerPlugin):
     def put(
         self, names: Sequence[str], asker: str, items: list[bytes], unbounded: bool, seconds: float
     ) -> Replies | Awaitable[Replies]:
-        """Put items into a pipe as soon as there is room for any; the answer is their number.
+        """Put items into a pipe as soon as there is room for any, and answer their number.
 
         At once if there is room: for a coroutine Dask makes a task, which takes longer than this.
         """

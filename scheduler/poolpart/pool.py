@@ -33,10 +33,9 @@ class Pool:
     """Some workers of a Dask cluster that can be divided into partitions.
 
     Start with all of them (`Pool.from_client`); `partition` takes some out under a name and also
-    returns the rest, which can be divided again. If workers were started with
     ``--resources "GPU=1"`` and the like, the cluster is divided already: ``pool["GPU"]`` finds a
-    partition. At the end of a ``with pool:`` block, those that it made are dissolved. `Pool.local`
-    starts a cluster of its own, which ends with its block.
+    partition. At the end of a ``with pool:`` block, the partitions that it made are dissolved.
+    `Pool.local` starts a separate cluster, which ends with its block.
 
     Examples
     --------
@@ -108,8 +107,8 @@ class Pool:
         partitions
             {name: (workers, slots of each worker)}. A worker has as many threads as slots.
         idle_s
-            Everything also ends after so many seconds in which there was no task, no result that
-            somebody keeps, and no pipe. The log says so; the pool can then no longer be used.
+            Everything also ends after so many seconds without a task, a result that somebody keeps,
+            or a pipe. The log says so; the pool can then no longer be used.
         options
             Others of `poolpart.deploy.local_cluster`.
 
@@ -228,7 +227,7 @@ class Pool:
             self._local.close()
             return
         try:
-            if self._partition_names:  # by now `dissolve` may have undone them
+            if self._partition_names:  # `dissolve` may have undone them by now
                 ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
@@ -348,7 +347,9 @@ class Pool:
         return parts[name], remainder
 
     def page(self) -> str:
-        """Add a page to Dask's dashboard: partitions, stages, workers and pipes; returns its URL.
+        """Add a page to Dask's dashboard and return its URL.
+
+        The page shows partitions, stages, workers and pipes.
 
         All users of the cluster can see it, and it is read-only. It needs no bokeh, and is as
         public as the dashboard: on a shared network, whoever reaches one can see the other. It
@@ -402,7 +403,7 @@ class Pool:
     def _divide(
         self, rules: Mapping[str, Rule], initial_rules: Mapping[str, Rule]
     ) -> tuple[dict[str, Partition], Pool]:
-        """Make all partitions or none; return the partitions by name, and a pool of the remainder.
+        """Make all partitions or none, and return them by name, with a pool of the remainder.
 
         Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
         """

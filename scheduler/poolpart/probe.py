@@ -1,4 +1,4 @@
-"""Facts about a worker's machine; these functions run on the workers."""
+"""Facts about a worker's machine, found by functions that run on the workers."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-# Asks the driver itself, in the order in which CUDA numbers the devices (nvidia-smi's order
-# may be another) and with CUDA_VISIBLE_DEVICES applied. In a process of its own: cuInit
-# would fix the visible devices of the worker for good. Version 2 tells the instances of a
-# divided (MIG) device apart; drivers before CUDA 11.4 have only the first.
+# Asks the driver itself, in CUDA's order of the devices (nvidia-smi's order may be another) and
+# with CUDA_VISIBLE_DEVICES applied. In a separate process: cuInit would fix the visible devices of
+# the worker for good. Version 2 tells the instances of a divided (MIG) device apart; drivers before
+# CUDA 11.4 have only the first.
 CUDA_DRIVER = "libcuda.so.1"
 _LIST_GPUS = """
 import ctypes, sys
@@ -33,7 +33,7 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 @cache  # it takes up to a second; an error is not kept
 def list_gpus() -> tuple[str, ...]:
-    """Return the UUIDs of the CUDA devices of this process, by ordinal; empty without a driver.
+    """Return the UUIDs of the CUDA devices of this process, by ordinal, or () without a driver.
 
     CalledProcessError or TimeoutExpired if the driver fails.
     """
@@ -47,7 +47,7 @@ def list_gpus() -> tuple[str, ...]:
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """UUIDs of the CUDA devices this process may use, by ordinal; empty without a driver.
+    """UUIDs of the CUDA devices this process may use, by ordinal, or () without a driver.
 
     A driver that fails counts as none, with a warning in the log.
     """
@@ -61,6 +61,6 @@ def visible_gpus() -> tuple[str, ...]:
 
 
 async def worker_gpus(dask_worker: Any = None) -> tuple[str, ...]:
-    """CUDA devices of a worker, see `visible_gpus`."""
+    """CUDA devices of a worker, as `visible_gpus` finds them."""
     # In a thread, to keep the worker's event loop free.
     return await asyncio.to_thread(visible_gpus)

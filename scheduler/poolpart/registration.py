@@ -1,6 +1,6 @@
 """Partitions for which the clients of this process are registered with their scheduler.
 
-A client registers once for each partition, see `membership.py`; afterwards it submits without a
+A client registers once for each partition (`membership.py`); afterwards it submits without a
 request. The registration ends with the connection of the client, and with the partition.
 """
 
@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 
 from distributed import Client
 
-# {client: {partition: connection to the scheduler by which the client has registered}}. A client
+# {client: {partition: connection to the scheduler on which the client registered}}. A client
 # that was cut off from its scheduler connects again, and the scheduler has forgotten the client.
 _connections: WeakKeyDictionary[Client, dict[str, Any]] = WeakKeyDictionary()
 

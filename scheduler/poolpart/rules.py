@@ -16,7 +16,7 @@ NO_GPU = "no GPU in the pool: CPU workers instead"
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of a partition; every rule takes these parameters by name.
+    """Rule of a partition, with parameters by name that every rule takes.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Rule:
                 check_count(f"{name} of the rule {type(self).__name__}", value, lower_bound)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose from available workers; the first workers are preferred.
+        """Choose from available workers, and prefer the first workers.
 
         This base class chooses none: the members of a partition without a rule were started with
         its resource.
@@ -51,7 +51,7 @@ class Rule:
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether to add a worker to the members; `everyone` is the list of all workers."""
+        """Whether to add a worker to the members, where `everyone` lists all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     def slots_of(self, worker: WorkerInfo) -> int:
@@ -61,7 +61,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
-    """At most `max_workers` for each GPU; in a pool without GPUs, CPU workers of each host.
+    """At most `max_workers` for each GPU or, in a pool without GPUs, CPU workers of each host.
 
     Examples
     --------
@@ -126,7 +126,7 @@ class n_workers(Rule):  # noqa: N801
 
 @dataclass(frozen=True)
 class Named(Rule):
-    """The workers of a list of names or addresses, see `named`."""
+    """The workers of a list of names or addresses, as `named` makes it."""
 
     names: tuple[str, ...]
 
@@ -152,12 +152,12 @@ class rest(Rule):  # noqa: N801
 
 
 def named(*names: str | int, **common: Any) -> Named:
-    """Return a rule that takes the workers of these names or addresses, also if they join later.
+    """Return a rule that takes the workers of these names or addresses, now or when they join.
 
     Raises
     ------
     PoolError
-        If there are no names, or a name is a list or the like.
+        If no name is given, or a name is a list or the like.
     """
     wrong = [name for name in names if isinstance(name, bool) or not isinstance(name, str | int)]
     if wrong or not names:
@@ -251,7 +251,7 @@ def shortfalls(
     Parameters
     ----------
     rules
-        Rules by which the workers are chosen, by partition.
+        Rules that choose the workers, by partition.
     pool, pool_as_seen
         The workers with the resources that they declare now, and with those that the client saw.
     """

@@ -22,7 +22,7 @@ from .partition_stats import PartitionStats, StageStats
 from .task_table import KEPT, TaskRow, moment
 
 NAME = "poolpart-stats"
-_ERROR_LETTERS = 200  # of the error of a task
+_ERROR_LETTERS = 200  # letters kept of the error of a task
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
 # {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
@@ -66,11 +66,11 @@ class Statistics(SchedulerPlugin):
         computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
         counts["seconds"] += sum(span["stop"] - span["start"] for span in computing)
         self._keep(task, finish, runnable, computing, kwargs)
-        if computing and runnable is not None:  # by the scheduler's clock, as Dask corrects both
+        if computing and runnable is not None:  # both by the scheduler's clock: Dask corrects them
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
     def queued_since(self, key: Any) -> float | None:
-        """Return the time since when a task could run, seconds since 1970; None if unknown."""
+        """Return the time since when a task could run, seconds since 1970, or None if unknown."""
         return self._runnable.get(key)
 
     def _keep(
@@ -86,15 +86,15 @@ class Statistics(SchedulerPlugin):
         worker = self.scheduler.workers.get(report.get("worker"))
         self.recent[partition].appendleft(
             TaskRow(
-                "done" if finish == "memory" else "failed",
-                str(task.key),
-                task.prefix.name,
-                "" if worker is None else str(worker.name),
-                _slots_taken(task, partition),
-                moment(runnable),
-                moment(computing[0]["start"] if computing else None),
-                moment(computing[-1]["stop"] if computing else None),
-                " ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
+                state="done" if finish == "memory" else "failed",
+                key=str(task.key),
+                function=task.prefix.name,
+                worker="" if worker is None else str(worker.name),
+                slots=_slots_taken(task, partition),
+                queued=moment(runnable),
+                started=moment(computing[0]["start"] if computing else None),
+                finished=moment(computing[-1]["stop"] if computing else None),
+                error=" ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
             )
         )
 
@@ -122,7 +122,7 @@ def partition_of(task: Any) -> str:
 
 
 def members(scheduler: Any, partition: str) -> list[Any]:
-    """Return the states of the workers of a partition; for "", of workers without resources."""
+    """Return the states of the workers of a partition or, for "", of workers without resources."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -130,7 +130,7 @@ def members(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Return the slots of a worker for a partition; for "", the threads of the worker."""
+    """Return the slots of a worker for a partition or, for "", the threads of the worker."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
@@ -149,7 +149,7 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 
 def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
-    """Yield the tasks of a partition that a worker runs; see `running_on`."""
+    """Yield the tasks of a partition that a worker runs."""
     free = slots_of(worker, partition)
     for task in islice(worker.processing, _LOOK_AT_MOST):
         if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
@@ -163,7 +163,10 @@ def _slots_taken(task: Any, partition: str) -> int:
 
 
 def tasks_of(name: str, dask_scheduler: Any = None) -> list[TaskRow]:
-    """Return the tasks of a partition under way, and those kept that ended; on the scheduler."""
+    """Return the tasks of a partition under way, and the ended tasks that are kept.
+
+    Runs on the scheduler.
+    """
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     running = {
@@ -208,7 +211,10 @@ def forget_statistics(scheduler: Any) -> None:
 
 
 def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
-    """Return the statistics of partitions; runs on the scheduler."""
+    """Return the statistics of partitions.
+
+    Runs on the scheduler.
+    """
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)

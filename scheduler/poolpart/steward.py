@@ -5,8 +5,8 @@ Requests of clients (`division.py`) and workers that join and leave change it. A
 one loop for each worker (`Steward._settle`) synchronises three things with the seat:
 
 1. the resources that the worker declares, which its tasks must find there;
-2. the resources by which the scheduler places tasks: removed before a worker leaves a partition, so
-   that it gets no more of its tasks, and added only when the worker has declared them;
+2. the resources that the scheduler places tasks by: removed before a worker leaves a partition,
+   so that it gets no more of its tasks, and added only when the worker has declared them;
 3. the workers behind a fence, from the moment of the change. A fence keeps all tasks that do not
    ask for an exclusive partition off the partition's workers (`fence.py`).
 
@@ -56,7 +56,7 @@ class Seat:
     declared: Resources = field(default_factory=dict)  # resources at the worker's last reply
     is_declaring: bool = False  # a request to declare resources is under way
     partition: str | None = None
-    slots: float = 0  # of the partition
+    slots: float = 0  # slots for the partition
     # It joined after the division, and the rules are to choose its partition: for the first time,
     # or again if it is in the remainder.
     unplaced: bool = False
@@ -74,10 +74,10 @@ class Steward(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.rules: dict[str, Rule] = {}  # by partition, in the order in which they choose
-        self.seats: dict[Hashable, Seat] = {}  # by key
-        self.open_requests = 0  # of clients
-        self._names: set[str] = set()  # of all partitions so far, also of dissolved partitions
+        self.rules: dict[str, Rule] = {}  # {partition: its rule}, in the order of choosing
+        self.seats: dict[Hashable, Seat] = {}  # {key: its seat}
+        self.open_requests = 0  # requests of clients that are under way
+        self._names: set[str] = set()  # all partitions so far, dissolved ones included
         self._assigning: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
@@ -85,7 +85,7 @@ class Steward(SchedulerPlugin):
     # -- membership --------------------------------------------------------------------
 
     def members(self, name: str, present: bool = False) -> list[Seat]:
-        """Return the seats of a partition; only of present workers if `present`."""
+        """Return the seats of a partition, or only the seats of present workers if `present`."""
         members = (seat for seat in self.seats.values() if seat.partition == name)
         return [seat for seat in members if not (present and seat.away)]
 
@@ -135,7 +135,7 @@ class Steward(SchedulerPlugin):
         self._assign_soon()
 
     def enter(self, name: str, rule: Rule) -> None:
-        """Add a partition or change its rule; the partition with the rule `rest` stays last."""
+        """Add a partition or change its rule, and keep the partition with the rule `rest` last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
@@ -146,7 +146,7 @@ class Steward(SchedulerPlugin):
         Raises
         ------
         PoolError
-            If there is no such partition.
+            If the partition does not exist.
         """
         if name in self.rules:
             return
@@ -202,7 +202,7 @@ class Steward(SchedulerPlugin):
         self.settle([seat])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Record that a worker has left; the seat of a worker with a nanny is kept for a while."""
+        """Record that a worker has left, and keep the seat of a worker with a nanny for a while."""
         for seat in list(self.seats.values()):
             if seat.info.address == worker and not seat.away:
                 seat.away = True
@@ -256,7 +256,7 @@ class Steward(SchedulerPlugin):
         self.settle([seat for seat in ready if self._assign(seat)])
 
     def _assign(self, seat: Seat) -> bool:
-        """Assign an unplaced worker by the rules; return whether the worker's partition changes."""
+        """Assign an unplaced worker by the rules, and return whether its partition changes."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
         if moves := name not in (None, seat.partition):
@@ -286,7 +286,7 @@ class Steward(SchedulerPlugin):
         return bool(worker.resources == seat.declared == self.target_resources(seat))
 
     def settle(self, seats: Iterable[Seat]) -> None:
-        """Have workers declare their target resources; `settled` is True once they do."""
+        """Have workers declare their target resources, until `settled` is True for them."""
         for seat in seats:
             # A running loop checks the seat again before it ends.
             if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
@@ -320,7 +320,7 @@ class Steward(SchedulerPlugin):
             wake(self.scheduler, worker)
 
     async def _step(self, seat: Seat, worker: Any, requested_moves: set[Any]) -> bool:
-        """Let a worker declare its target resources; return False if its tasks must end first.
+        """Let a worker declare its target resources, or return False if its tasks must end first.
 
         The worker refuses while it runs a task that holds a resource to be removed, also a task
         that the scheduler has forgotten.
@@ -351,7 +351,7 @@ class Steward(SchedulerPlugin):
     def _has_released(
         self, seat: Seat, worker: Any, leaving: Collection[str], requested_moves: set[Any]
     ) -> bool:
-        """Move the tasks of partitions that a worker leaves; return whether none is left.
+        """Move the tasks of partitions that a worker leaves, and return whether none is left.
 
         The worker gets no new tasks of these partitions. Tasks that run end on the worker, which
         keeps the resource until then.
@@ -371,7 +371,7 @@ class Steward(SchedulerPlugin):
         expect(self.scheduler, worker, seat.partition)
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
-        """Wait until workers declare their target resources; return the late workers.
+        """Wait until workers declare their target resources, and return the late workers.
 
         Restarting workers are waited for; workers that have left for good are not.
         """
@@ -399,7 +399,7 @@ class Steward(SchedulerPlugin):
                 task.cancel()
 
     def remove_if_done(self) -> None:
-        """Leave the scheduler once there are no partitions and all workers are restored."""
+        """Leave the scheduler after the last partition, once all workers are restored."""
         present = [seat for seat in self.seats.values() if not seat.away]
         if not self.rules and not self.open_requests and all(map(self.settled, present)):
             self._stop()
@@ -423,7 +423,7 @@ def names_of(seats: Iterable[Seat]) -> str:
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Yield the scheduler's steward; a steward without partitions leaves after the block."""
+    """Yield the scheduler's steward, which leaves after the block if it has no partitions."""
     require(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:

@@ -16,7 +16,7 @@ _one_at_a_time = threading.Lock()
 
 
 def own_client() -> Client:
-    """Return the client of this task's worker; outside tasks, the current client.
+    """Return the client of this task's worker or, outside tasks, the current client.
 
     `distributed.get_client` makes the worker's client on first use. That fails, with an
     AssertionError without a message, if the scheduler broadcasts to all clients while it registers
@@ -52,7 +52,10 @@ _LEAVING = (Status.closing, Status.closed, Status.failed)
 
 
 class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
-    """A long task has ended because its worker is leaving; submit the task again."""
+    """A long task has ended because its worker is leaving.
+
+    Submit the task again.
+    """
 
 
 @contextmanager

@@ -38,9 +38,9 @@ class TaskLocations:
     # {address: slots that no task holds or waits for}; below 0 with more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
     slots: int = 0  # free or not
-    most_slots: int = 0  # with those of workers that may be started, see `Partition.adapt`
+    most_slots: int = 0  # slots, with the workers that `Partition.adapt` may start
     coming: int = 0  # jobs of such workers that wait in a queue, or start
-    tasks: dict[str, TaskPlace] = field(default_factory=dict)  # by requested key, of known ones
+    tasks: dict[str, TaskPlace] = field(default_factory=dict)  # {requested key: its known task}
 
     def out_of_reach(self, key: str) -> bool:
         """Return whether a task or its result is on silent workers only."""

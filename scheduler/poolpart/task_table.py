@@ -11,7 +11,7 @@ from .html_table import html_table, shown_seconds
 
 KEPT = 1_000  # tasks of a partition that have ended
 STATES = ("waiting", "queued", "running", "done", "failed")
-_ENDED = STATES.index("done")  # from here on
+_ENDED = STATES.index("done")  # this and later states have ended
 _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "seconds", "error")
 
 
@@ -66,7 +66,10 @@ class TaskTable(tuple[TaskRow, ...]):
 
     @classmethod
     def of_rows(cls, rows: Iterable[TaskRow]) -> TaskTable:
-        """Return the table of rows; rows of a state keep their order, as do those that ended."""
+        """Return the table of rows.
+
+        Rows of a state keep their order. So do rows that ended.
+        """
         return cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
 
     def __repr__(self) -> str:
@@ -82,7 +85,10 @@ class TaskTable(tuple[TaskRow, ...]):
         return html_table("Tasks", _HEAD, [_cells(row) for row in self])
 
     def to_pandas(self) -> Any:
-        """Return a DataFrame with a row for each task; PoolError if pandas is not installed."""
+        """Return a DataFrame with a row for each task.
+
+        Raises PoolError if pandas is not installed.
+        """
         try:
             import pandas as pd
         except ImportError:
@@ -93,7 +99,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
 
 def _cells(row: TaskRow) -> tuple[str, ...]:
-    """Return the cells of a row; times are of the day, in UTC."""
+    """Return the cells of a row, with times of the day in UTC."""
     seconds = "" if row.seconds is None else shown_seconds(row.seconds)
     times = [_time(row.queued), _time(row.started)]
     return (

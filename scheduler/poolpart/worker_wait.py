@@ -34,7 +34,7 @@ class WorkerWait:
         self._since: float | None = None  # time.monotonic()
 
     def check(self, prospects: Prospects) -> None:
-        """Note the present state of the partition; warn at the beginning of a wait.
+        """Note the present state of the partition, and warn at the beginning of a wait.
 
         Raises
         ------

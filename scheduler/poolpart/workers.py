@@ -12,7 +12,7 @@ from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
 from .internals.client import ask
-from .internals.worker import resources_here as resources_here  # for records of tasks
+from .internals.worker import resources_here as resources_here  # records of tasks use it
 
 SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
 MISSED_BEATS = 3  # heartbeats that a worker may miss at least
@@ -48,7 +48,7 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Partitions of the worker: resources of which the worker declares a slot."""
+        """Partitions of the worker: resources that the worker declares a slot of."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:

@@ -29,11 +29,11 @@ from ..rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
 
-_NAME = "poolpart"  # of what looks after the jobs of a cluster
+_NAME = "poolpart"  # name of what looks after the jobs of a cluster
 ADAPT_EVERY_S = 1.0  # seconds between two adaptations of the partitions to their tasks
 LOOK_EVERY_S = 5.0  # seconds between two looks for workers that are gone
-INFORMATION = " - INFO - "  # in lines of Dask's logs that are no complaints
-_DEATH_S = 60  # a worker that finds no scheduler for so long ends, as those of dask-jobqueue do
+INFORMATION = " - INFO - "  # marks lines of Dask's logs that are not complaints
+_DEATH_S = 60  # a worker that finds no scheduler for so long ends, like a worker of dask-jobqueue
 
 
 def start_partitions(
@@ -56,12 +56,12 @@ def start_partitions(
     partitions
         {name: options}. ``workers`` is their number, 1 by default, and ``slots`` the tasks that
         each takes at a time, 1 by default. In place of ``workers``, ``adapt`` is their least and
-        greatest number, such as ``[0, 8]``, and ``idle_s`` after how many seconds without work
-        they are returned, 60 by default; see `Partition.adapt`. All other options are those of the
-        cluster's class, where this partition differs: ``job_extra_directives``, ``queue``,
+        greatest number, such as ``[0, 8]`` (`Partition.adapt` describes it), and ``idle_s`` after
+        how many seconds without work they are returned, 60 by default. All other options belong to
+        the cluster's class, where this partition differs: ``job_extra_directives``, ``queue``,
         ``memory``. An SSHCluster takes ``connect_options``, ``remote_python``, ``worker_class``,
-        ``worker_options``, and ``hosts``, which workers are dealt out to in turn; by default there
-        is one for each.
+        ``worker_options``, and ``hosts``. Workers are dealt out to the hosts in turn; by default
+        there is one for each.
     tell
         Called with what went wrong later: the last line of a job's log while workers are missing,
         or why a worker cannot be started.
@@ -117,8 +117,8 @@ class _PartitionJobs:
     """The jobs of a partition."""
 
     name: str
-    options: Mapping[str, Any]  # of the cluster's class, where this partition differs
-    initial_count: int  # of jobs
+    options: Mapping[str, Any]  # options of the cluster's class, where this partition differs
+    initial_count: int  # number of jobs
     kind: JobKind
     describe: Describe
     submitted: int = 0  # jobs so far
@@ -177,7 +177,7 @@ class _PartitionJobs:
 
 
 def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
-    """Remove `adapt` and `idle_s` from the options of a partition; return None if absent."""
+    """Remove `adapt` and `idle_s` from the options of a partition, or return None if absent."""
     adapt = options.pop("adapt", None)
     idle_s = options.pop("idle_s", None)
     if adapt is None:
@@ -251,7 +251,7 @@ class _JobStarter:
                         self._say(line)
 
     async def _adapt(self) -> bool:
-        """Start and forget jobs as the scheduler advises; return whether jobs must be started."""
+        """Start and forget jobs as the scheduler advises, and return whether jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
         advice = await ask_of_cluster(self._cluster, look, jobs=jobs)
         for name, advice_of_part in advice.items():
@@ -364,7 +364,7 @@ def _process(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Describe a worker as an SSHCluster does; `index` chooses the host."""
+    """Describe a worker as an SSHCluster does, on the host of a number `index`."""
     common = cluster.scheduler_spec["options"]
     options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(
         partition_options

@@ -28,9 +28,9 @@ class KubernetesGroups:
     Notes
     -----
     By its source, the operator closes the least busy workers of the whole cluster when a group
-    shrinks, also those of other groups. So the Deployments of the workers that `scale_groups` has
-    closed are deleted first: then the group has its new size, and the operator closes no worker.
-    That needs the right to delete Deployments in the cluster's namespace.
+    shrinks, even if they belong to other groups. So the Deployments of the workers that
+    `scale_groups` has closed are deleted first: then the group has its new size, and the operator
+    closes no worker. That needs the right to delete Deployments in the cluster's namespace.
     """
 
     def __init__(self, cluster: Any) -> None:
@@ -43,13 +43,13 @@ class KubernetesGroups:
         self._cluster = cluster
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> None:
-        """Give a group `n` workers; see `WorkerGroups.scale`."""
+        """Give a group `n` workers, as `WorkerGroups.scale` describes."""
         if leaving:
             self._delete(leaving)
         self._cluster.scale(n, worker_group=group.lower().replace("_", "-"))
 
     def _delete(self, workers: Sequence[str]) -> None:
-        """Delete the Deployments of workers; each has the name of its worker."""
+        """Delete the Deployments of workers, which are named after their workers."""
         from kr8s import NotFoundError  # dask-kubernetes needs kr8s, too
         from kr8s.objects import Deployment
 

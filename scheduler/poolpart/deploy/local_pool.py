@@ -26,7 +26,7 @@ LOOK_EVERY_S = 1.0  # between looks whether the cluster is used
 
 
 class LocalPool:
-    """A cluster of `local_cluster` and a client; see `Pool.local`."""
+    """Cluster of `local_cluster` with a client, as `Pool.local` starts them."""
 
     def __init__(
         self, partitions: Mapping[str, tuple[int, int]], idle_s: float, options: dict[str, Any]

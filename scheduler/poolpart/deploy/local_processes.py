@@ -17,7 +17,7 @@ from ..errors import PoolError
 
 @contextmanager
 def forked_workers() -> Iterator[None]:
-    """Let nannies fork workers from the fork server, also for a restart.
+    """Let nannies fork workers from the fork server, at first and for a restart.
 
     Dask would make it import pandas and more; it has already imported what is needed.
     """

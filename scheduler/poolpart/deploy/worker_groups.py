@@ -37,7 +37,7 @@ class WorkerGroups(Protocol):
         group
             Name of the partition.
         n
-            Number of workers without those of `leaving`.
+            Number of workers, without the workers in `leaving`.
         leaving
             Names of workers that have been closed, and must not be started again. No other worker
             may be removed: it may have tasks, and results that no other worker has.
@@ -102,7 +102,10 @@ def scale_groups(
 
 
 def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
-    """Read the options of a partition; PoolError if one is wrong."""
+    """Read and check the options of a partition.
+
+    Raises PoolError if an option is wrong.
+    """
     check_name(name)
     remaining = dict(options)
     bounds = take_bounds(name, remaining)
@@ -139,7 +142,7 @@ class GroupScaler:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop scaling; wait for a call of `scale` that is under way."""
+        """Stop scaling, and wait for a call of `scale` that is under way."""
         self._closed.set()
         self._thread.join()
 
@@ -162,7 +165,10 @@ class GroupScaler:
                 self._scale(name, advice_of_group)
 
     def _scale(self, name: str, advice: GroupAdvice) -> None:
-        """Scale a group; if that fails, the next advice is the same."""
+        """Scale a group.
+
+        If that fails, the next advice is the same.
+        """
         if advice == GroupAdvice(self._reports[name].size):
             return
         try:

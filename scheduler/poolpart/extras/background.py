@@ -1,7 +1,8 @@
 """Calls in threads of this process, and futures of their results.
 
-The futures are those of `concurrent.futures`, so that `concurrent.futures.wait` and
-`asyncio.wrap_future` take them. A future of Dask has a task on the scheduler; these have none.
+The futures are futures of `concurrent.futures`, so that `concurrent.futures.wait` and
+`asyncio.wrap_future` take them. A future of Dask has a task on the scheduler. These futures have
+none.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Result = TypeVar("Result")
 def in_background(
     call: Callable[[], Result], stop: Callable[[], object] = lambda: None
 ) -> concurrent.futures.Future[Result]:
-    """Make a call in a thread; return a future of its result or error.
+    """Make a call in a thread and return a future of its result or error.
 
     `Future.cancel` takes effect at once, and calls `stop`, which should end the call. The thread
     does not keep this process alive.
@@ -59,7 +60,7 @@ def after_all(
     futures: Iterable[Future | concurrent.futures.Future[Any]],
     function: Callable[[list[Any]], Result],
 ) -> concurrent.futures.Future[Result]:
-    """Call `function(results)` once all futures have succeeded; returns a future of its result.
+    """Call `function(results)` once all futures have succeeded and return a future of its result.
 
     The function is called in this process, in a thread. To call it on a partition, give the futures
     to a task: ``partition.submit(function, futures)``.

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 Outcomes = dict[Any, str]  # {key of a task: what happened}
 
-ARRIVAL_S = 1.0  # for a task to arrive at the scheduler, by another connection than the request
-ANSWER_S = 5.0  # for a worker to say what it runs; a function may hold its interpreter
-RESTART_S = 60.0  # for a worker to come back
+ARRIVAL_S = 1.0  # a task has to arrive at the scheduler, on another connection than the request
+ANSWER_S = 5.0  # seconds for a worker to say what it runs: a function may hold its interpreter
+RESTART_S = 60.0  # seconds for a worker to come back
 
 
 def cancelled() -> bool:
@@ -48,7 +48,7 @@ def cancelled() -> bool:
 
 
 def ask_to_cancel(tasks: Mapping[Any, Future], partition: Partition, restarts: bool) -> Outcomes:
-    """Cancel tasks of a partition, by key, on the scheduler; see `Partition.cancel`.
+    """Cancel tasks of a partition, by key, on the scheduler.
 
     Returns {key: what happened}, without tasks that had not started, or had ended.
     """
@@ -104,7 +104,7 @@ async def _cancel_tasks(
 
 
 async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
-    """Restart a worker, if it has nothing but cancelled tasks; return what happened."""
+    """Restart a worker, if it has nothing but cancelled tasks, and return what happened."""
     still_running = f"running: worker {worker.name}"
     if not restarts:
         return still_running
@@ -112,7 +112,7 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
         return f"{still_running} has no nanny to restart it"
     if worker.status is not Status.running:
         return f"{still_running} is {worker.status.name}"
-    shut(scheduler, worker)  # in this step of the event loop: no task can arrive before
+    shut(scheduler, worker)  # one step of the event loop: no task can arrive before
     load = await _load(scheduler, worker)
     alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
     if not alone or not holds_nothing(scheduler, worker):
@@ -126,12 +126,12 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
 class _Load(NamedTuple):
     """What a worker itself knows that it has."""
 
-    running: list[Any]  # keys of tasks, also of cancelled tasks that the scheduler has forgotten
-    holds_results: bool  # that a driver has not fetched yet
+    running: list[Any]  # keys of tasks, even of cancelled tasks that the scheduler has forgotten
+    holds_results: bool  # whether a driver still has to fetch results from it
 
 
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
-    """Ask a worker for its load; None if it does not answer."""
+    """Ask a worker for its load, or return None if it does not answer."""
     try:
         load: _Load = await asyncio.wait_for(call(scheduler, worker.address, _load_here), ANSWER_S)
     except (OSError, TimeoutError):

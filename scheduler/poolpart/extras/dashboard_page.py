@@ -143,14 +143,17 @@ def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
 
 
 class _Handler(web.RequestHandler):
-    """Sends the page, but to no other website; the browser may load and run the page alone."""
+    """Sends the page, but to no other website.
+
+    The browser may load and run the page alone.
+    """
 
     def initialize(self, scheduler: Any, owners: PageOwners) -> None:
         self.scheduler = scheduler
         self.names = owners.names
 
     def prepare(self) -> None:
-        """Refuse requests of other websites; only links to the page are followed."""
+        """Refuse requests of other websites, except for links to the page."""
         reason = refusal(self.request.headers, self.names, is_page=True)
         if reason:
             self.set_status(HTTPStatus.FORBIDDEN)
@@ -197,7 +200,7 @@ class PageOwners(SchedulerPlugin):
 
 
 def partitions_page(client: Client) -> str:
-    """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
+    """Add the page to the dashboard of the client's cluster and return its URL."""
     check_client(client)
     on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
     link = page_link(client)
@@ -210,7 +213,7 @@ def partitions_page(client: Client) -> str:
 
 
 def page_link(client: Client) -> str | None:
-    """Return the URL that the page has while it is open; None without an HTTP server."""
+    """Return the URL that the page has while it is open, or None without an HTTP server."""
     link = _dashboard_link(client)
     return link and f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
 
@@ -241,7 +244,10 @@ async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> Non
 
 
 async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
-    """Remove the page for a client; the page stays for further clients. Runs on the scheduler."""
+    """Remove the page for a client.
+
+    It stays for further clients. Runs on the scheduler.
+    """
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
 

@@ -40,7 +40,7 @@ class _PipeItems:
     def __init__(self, pipe: Pipe) -> None:
         self.name = f"pipe {pipe.name!r}"
         self.closed = False  # no item can come later than now
-        self.drained = False  # there are no further items
+        self.drained = False  # all items have been read
         self._pipe = pipe
         _ = pipe.client  # a thread of a worker that runs no task would get another client
 
@@ -86,7 +86,7 @@ def _items_of(source: object) -> _PipeItems | _IterableItems:
 
 
 class ItemTasks:
-    """Tasks for the items of a pipe or an iterable, of which at most `window` are under way.
+    """Tasks for the items of a pipe or an iterable, at most `window` of them under way.
 
     No window is two tasks a slot, so that each slot has the next item at hand. Items that have no
     task yet stay where they are, so that producers wait when the tasks are slower than they are.
@@ -109,7 +109,7 @@ class ItemTasks:
         self._items = _items_of(source)
         self._function = function
         self._given_window = window
-        self._options = options  # of `Partition.submit`, and keyword arguments of the function
+        self._options = options  # takes `Partition.submit`, and keyword arguments of the function
         # {key of a task: the task, the number of its item and the item}
         self._running: dict[str, tuple[Future, int, Any]] = {}
         self._window = window or 1
@@ -118,7 +118,7 @@ class ItemTasks:
         self._stopped = False
 
     def run(self) -> int:
-        """Run tasks until the items and all tasks have ended; return the number of items.
+        """Run tasks until the items and all tasks have ended, and return the number of items.
 
         An error of a task, or of the items, cancels the other tasks; the pipe fails with it.
         """
@@ -182,7 +182,10 @@ class ItemTasks:
             self._count += 1
 
     def _check(self) -> None:
-        """Forget tasks that have ended; raise the error of a failed task, or that this stopped."""
+        """Forget tasks that have ended.
+
+        Raises the error of a failed task, or an error that says that this has stopped.
+        """
         if self._stopped:
             raise CancelledError
         ended = [key for key, (future, _, _) in self._running.items() if future.done()]

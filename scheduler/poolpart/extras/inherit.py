@@ -1,9 +1,8 @@
 """Tasks that are submitted from inside a task of a partition belong to that partition.
 
-Dask's resources are not inherited: what a GPU task submits runs anywhere. Here the scheduler
-gives such tasks the partition of the task that submits them, at any depth, unless they say
-otherwise: by resources, workers or a partition of their own, or with
-``dask.annotate(resources={})`` for none.
+Dask's resources are not inherited: what a GPU task submits runs anywhere. Here the scheduler gives
+such tasks the partition of the task that submits them, at any depth, unless they say otherwise: by
+resources, by workers, by another partition, or with ``dask.annotate(resources={})`` for none.
 
 Each takes a slot, as a task that `Partition.submit` submits. The task that submits them lends its
 own while it waits for them (`lending.py`).
@@ -37,7 +36,7 @@ from .lending import lending_plugin
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-inherit"
-ANSWER_S = 5.0  # for workers to begin or end lending; a worker that is stopped does so later
+ANSWER_S = 5.0  # workers have to begin or end lending; a worker that is stopped does so later
 
 
 class Inheritance(SchedulerPlugin):
@@ -48,7 +47,7 @@ class Inheritance(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        self.note = ""  # for users: what does not work with this version of Dask
+        self.note = ""  # remark for users: what does not work with this version of Dask
         self._rules = Rules()
         self._choice: WorkerChoice | None = None
         self.lends = self._begin(NESTED, "tasks from inside tasks may run anywhere", self._nest)
@@ -57,7 +56,10 @@ class Inheritance(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
-        """Begin a feature; return False, and note the missing names, if Dask lacks its names."""
+        """Begin a feature.
+
+        Returns False, and notes the missing names, if Dask lacks them.
+        """
         try:
             require(feature)
             begin()
@@ -77,7 +79,7 @@ class Inheritance(SchedulerPlugin):
         self._choice = WorkerChoice(self.scheduler, self.names)
 
     def _bequeath(self, task: Any) -> Resources:
-        """Return the resources of tasks that a task submits; empty outside partitions."""
+        """Return the resources of tasks that a task submits, empty outside partitions."""
         resources = task.resource_restrictions
         return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}
 
@@ -130,7 +132,7 @@ FEATURES.append(_Inheriting())
 
 # -- workers, which lend -------------------------------------------------------------------
 
-_requests: set[asyncio.Future[Any]] = set()  # to workers, under way, of all schedulers here
+_requests: set[asyncio.Future[Any]] = set()  # sent to workers and under way, of all schedulers here
 
 
 def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:

@@ -12,7 +12,7 @@ while it waits, its slots are there for others, and its thread if it has one of 
   producer and a consumer that a client submits need a slot each.
 
 A loan lasts to the end of the wait. Then the task gets slots and thread back before it goes on,
-also if the wait ended by a time-out; from the end of its wait until it has them, no other task may
+even if the wait ended by a time-out. From the end of its wait until it has them, no other task may
 start in them. Of several tasks that want slots back on one worker, the first to ask is the first to
 get them. Do not hold a `threading.Lock` while you wait: a task that borrows the slot may want it.
 
@@ -59,12 +59,12 @@ from ..internals.worker import (
 
 logger = logging.getLogger(__name__)
 
-WARN_AFTER_S = 5.0  # that a nested task waits for slots, before clients are warned
+WARN_AFTER_S = 5.0  # seconds that a nested task waits for slots before clients are warned
 _CHECK_EVERY_S = 1.0  # whether the worker still exists
 _ENDING = (Status.closing, Status.closed, Status.failed)
 
 _lock = threading.Lock()
-_lenders: dict[Any, Lender] = {}  # by worker of this process
+_lenders: dict[Any, Lender] = {}  # {worker of this process: its lender}
 _thread = threading.local()
 
 
@@ -72,7 +72,7 @@ _thread = threading.local()
 class _Loan:
     """Slots that a task has lent, and whether the task has the slots back."""
 
-    key: Any  # of the task
+    key: Any  # key of the task
     slots: Resources
     returned: threading.Event = field(default_factory=threading.Event)
 
@@ -86,12 +86,12 @@ class _NestedTask:
 
 
 class Lender:
-    """Lends the slots of a worker's tasks; its methods run in the worker's event loop."""
+    """Lends the slots of a worker's tasks, in the worker's event loop."""
 
     def __init__(self, worker: Any) -> None:
         self.worker = worker
         self.names: set[str] = set()  # partitions whose tasks lend
-        self.waiters: set[threading.Event] = set()  # of threads that lend once slots are wanted
+        self.waiters: set[threading.Event] = set()  # threads that lend once slots are wanted
         self._nested: dict[Any, _NestedTask] = {}  # {key: a task that waits for slots}
         self._loans: Counter[Any] = Counter()  # {key of a task: its loans under way}
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
@@ -174,7 +174,10 @@ class Lender:
                 waiter.set()
 
     def transition(self, key: Any, finish: str) -> None:
-        """Follow the tasks of the worker; tasks in the state "constrained" wait for slots."""
+        """Follow the tasks of the worker.
+
+        Tasks in the state "constrained" wait for slots.
+        """
         self._nested.pop(key, None)
         if finish not in ("executing", "long-running"):
             self._lent.discard(key)
@@ -241,7 +244,10 @@ class Lender:
 
 
 def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
-    """Return whether a task holds slots of a worker; runs on that worker."""
+    """Return whether a task holds slots of a worker.
+
+    Runs on that worker.
+    """
     lender = _lenders.get(dask_worker)
     return lender is not None and lender.holds_slots(key)
 
@@ -250,7 +256,7 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 
 
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
-    """Return the lender and a new loan for the task of this thread; None without slots."""
+    """Return the lender and a new loan for the task of this thread, or None without slots."""
     running = task_of_thread()
     if running is None or getattr(_thread, "in_loan", False):
         return None
@@ -263,7 +269,7 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
 
 
 class _WaitHooks:
-    """What the waits of clients call, see `internals.client.WaitHooks`."""
+    """Hooks that the waits of clients call, as `internals.client.WaitHooks` describes."""
 
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""
@@ -302,7 +308,7 @@ class _WaitHooks:
         worker = lender.worker
         _thread.in_loan = True
         has_thread = False
-        # After `worker_client`, or in an executor of the user's, this is no thread of the worker's.
+        # After `worker_client`, or in the user's executor, the worker did not start this thread.
         with suppress(KeyError, AttributeError):
             secede()
             has_thread = True
@@ -329,7 +335,7 @@ WAIT_HOOKS = _WaitHooks()
 
 
 def begin_lending(worker: Any, name: str) -> Lender:
-    """Let the tasks of a partition lend on a worker; runs in the worker's event loop."""
+    """Let the tasks of a partition lend on a worker, in the worker's event loop."""
     with _lock:
         let_waits_lend(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
@@ -338,7 +344,7 @@ def begin_lending(worker: Any, name: str) -> Lender:
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Let the tasks of a partition keep their slots again; runs in the worker's event loop."""
+    """Let the tasks of a partition keep their slots again, in the worker's event loop."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)
@@ -349,7 +355,7 @@ def end_lending(worker: Any, name: str) -> None:
 
 
 def lending_plugin(name: str) -> bytes:
-    """Return a pickled plugin by which workers begin to lend, and end with its removal.
+    """Return a pickled plugin that has workers lend until it is removed.
 
     A joining worker gets tasks before a request can reach the worker, and plugins before its tasks.
     Workers without this package ignore the plugin.

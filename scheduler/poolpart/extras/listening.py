@@ -19,7 +19,7 @@ _LOOK_S = 1.0  # between looks whether the listener was stopped
 
 
 class Listener:
-    """A thread that calls a function for each item of a pipe; see `Pipe.listen`.
+    """Thread that calls a function for each item of a pipe, as `Pipe.listen` starts it.
 
     At the end of a ``with`` block it is closed. If the block raises an error, the function is not
     called again, and the block does not wait for the end of the pipe.

@@ -25,11 +25,11 @@ class PartitionCollector:
         self._collect_stats = collect_stats
 
     def describe(self) -> Iterator[Any]:
-        """Name no figures before they are requested; the scheduler may just be starting."""
+        """Name no figures before they are requested, since the scheduler may just be starting."""
         return iter(())
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metric families; tasks without a partition have the label ""."""
+        """Yield the metric families, with the label "" for tasks without a partition."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")

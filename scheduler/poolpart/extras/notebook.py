@@ -42,13 +42,13 @@ def table_of_partitions(client: Client, title: str) -> str:
 
 
 def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of the figures of a partition; of a dissolved partition, a sentence."""
+    """Return the HTML of the figures of a partition, or a sentence if it was dissolved."""
     gone = "The partition was dissolved, or its workers have left: no worker declares it."
     return _table_of_one(get_client, _one_partition, name, (title, _HEAD, gone))
 
 
 def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of the state of a pipe; of a deleted pipe, a sentence."""
+    """Return the HTML of the state of a pipe, or a sentence if it was deleted."""
     gone = "The pipe was deleted, or never created."
     return _table_of_one(get_client, _one_pipe, name, (title, _HEAD_OF_A_PIPE, gone))
 
@@ -95,7 +95,10 @@ def _row(stats: PartitionStats) -> list[object]:
 
 
 def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]], bool]:
-    """Return the rows of all partitions, and whether the page is open; runs on the scheduler."""
+    """Return the rows of all partitions, and whether the page is open.
+
+    Runs on the scheduler.
+    """
     workers = dask_scheduler.workers.values()
     declared = {name for worker in workers for name, n in worker.resources.items() if n}
     names = [*sorted(declared | adaptive_names(dask_scheduler)), ""]
@@ -103,7 +106,9 @@ def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]],
 
 
 def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a partition, None if it does not exist; runs on the scheduler.
+    """Return the row of a partition, or None if it does not exist.
+
+    Runs on the scheduler.
 
     A partition of a division, and an adaptive partition, exist without workers, too.
     """
@@ -114,7 +119,10 @@ def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[obje
 
 
 def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a pipe, None if it does not exist; runs on the scheduler."""
+    """Return the row of a pipe, or None if it does not exist.
+
+    Runs on the scheduler.
+    """
     pipe = pipes_of(dask_scheduler).get(name)
     row = None if pipe is None else [name, *pipe.figures]
     return row, is_open(dask_scheduler)

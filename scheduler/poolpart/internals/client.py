@@ -29,7 +29,7 @@ class WaitHooks(Protocol):
         """Lend the slots within the block, if the task waits."""
 
 
-_hooks: list[WaitHooks] = []  # of `let_waits_lend`
+_hooks: list[WaitHooks] = []  # hooks that `let_waits_lend` has set
 
 
 @cache  # once: another library may have wrapped the same since, and goes on calling this

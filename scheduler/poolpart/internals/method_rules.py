@@ -75,7 +75,10 @@ class _Method:
 
 
 class Rules:
-    """Rules for methods of a running scheduler; several objects may have rules for a method."""
+    """Rules for methods of a running scheduler.
+
+    Several objects may have rules for a method.
+    """
 
     def __init__(self) -> None:
         self._added: list[tuple[Any, str, Any]] = []  # (object, name of its method, rule)
@@ -95,7 +98,10 @@ class Rules:
         self._added.append((owner, name, rule))
 
     def call_instead(self, owner: Any, name: str, rule: Instead, parameter: str) -> None:
-        """Call `rule(…)` in place of a method; the method runs if that is NotImplemented."""
+        """Call `rule(…)` in place of a method.
+
+        If that is NotImplemented, the method runs.
+        """
         self._stand_in(owner, name, {parameter}).rules_instead.append(rule)
         self._added.append((owner, name, rule))
 
@@ -160,7 +166,7 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
 
 
 def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> None:
-    """Call `check` with the arguments of each graph that arrives; its PoolError refuses the graph.
+    """Call `check` with the arguments of each graph that arrives, so that its PoolError refuses it.
 
     The client then gets the error from each of the graph's futures.
     """

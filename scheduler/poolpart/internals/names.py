@@ -41,10 +41,10 @@ CANCELLING = "Partition.cancel"
 class PrivateNames:
     """Private names of Dask that a feature needs for a purpose."""
 
-    feature: str  # that does not work without them
+    feature: str  # does not work without them
     names: tuple[str, ...]  # "module:object.attribute", with (parameters) of a method
     purpose: str
-    tests: tuple[str, ...]  # in tests/poolpart unless a folder is given
+    tests: tuple[str, ...]  # paths in tests/poolpart unless a folder is given
 
 
 _SCHEDULER = "distributed.scheduler:Scheduler"

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def group_of(task: Any) -> tuple[str, float] | None:
-    """Return the only resource that a task asks for, with its quantity; ("", 1) for none.
+    """Return the only resource that a task asks for, with its quantity, or ("", 1) for none.
 
     None for a task that is bound to workers or hosts, asks for several resources, or is an actor.
     """
@@ -23,7 +23,10 @@ def workers_declaring(scheduler: Any, name: str) -> list[Any]:
 
 
 def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
-    """Return whether a worker declares so many slots of a resource; usually the first does."""
+    """Return whether a worker declares so many slots of a resource.
+
+    Usually the first worker does.
+    """
     return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
 
 
@@ -40,7 +43,7 @@ def free_slots_of(worker: Any, name: str) -> float:
 
 
 def may_take(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
-    """Return whether a worker runs and declares enough slots of a resource; "" is no resource."""
+    """Return whether a worker runs and declares enough slots of a resource, "" for none."""
     enough = not name or worker.resources.get(name, 0) >= slots
     return bool(enough and worker in scheduler.running)
 

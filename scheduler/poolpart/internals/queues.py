@@ -31,7 +31,7 @@ PRIVATE_NAMES = (
 VARIABLE_SET = "variable_set"  # the request of `Variable.set`
 LOOK_S = 1.0  # a wait looks so often whether it has ended, even if nothing has changed
 
-Record = dict[str, Any]  # of an item, as Dask's queue extension keeps them
+Record = dict[str, Any]  # an item's record, as Dask's queue extension keeps it
 Packed = bytes | Record  # an item on its way to a client, see `unpack`
 # Type of the items that pipes put. Their value is serialized: the scheduler passes it on, and
 # `Queue.get` of a client returns the object. Clients themselves put types "msgpack" and "Future".
@@ -121,7 +121,7 @@ class BoundedQueue:
         return len(self._queue)
 
     def empty(self) -> bool:
-        """Whether there are no items."""
+        """Whether the queue has no items."""
         return not self._queue
 
     @property
@@ -209,7 +209,7 @@ class QueueAndVariable:
         self.queue.extend([_record_of(item) for item in items])
 
     def take(self, limit: int) -> list[Packed]:
-        """Remove the first items, at most `limit`, from the queue; return these items packed."""
+        """Remove the first items, at most `limit`, from the queue, and return them packed."""
         records = self.queue.take(limit)
         return [_packed(self.name, record) for record in records]
 
@@ -256,7 +256,7 @@ def unpack(client: Client, packed: Packed) -> Any:
 def intercept_variable_set(
     handlers: dict[str, Any], check: Callable[[str, Any], None], on_change: Callable[[str], None]
 ) -> Callable[[], None]:
-    """Check and follow the variables that clients set; return a function that ends this.
+    """Check and follow the variables that clients set, and return a function that ends this.
 
     Parameters
     ----------

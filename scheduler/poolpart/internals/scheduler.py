@@ -161,7 +161,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set
 
 # -- workers that a cluster gives back ----------------------------------------------------
 #
-# From the step of the event loop in which one is found idle, it gets no tasks. What
+# Once a worker is found idle, it gets no tasks from this step of the event loop on. What
 # `retire_workers` does comes later: it waits for a lock, and for its turn.
 
 
@@ -205,7 +205,7 @@ def reopen(scheduler: Any, worker: Any) -> None:
 
 
 async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
-    """Close workers; return False if any stays, because nobody can take over its results."""
+    """Close workers, or return False if any stays because nobody can take over its results."""
     addresses = [worker.address for worker in workers]
     retired = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
     return len(retired) == len(addresses)
@@ -225,14 +225,14 @@ def number_of_transitions(scheduler: Any) -> int:
 
 
 def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
-    """Cancel tasks for a client, by its id, as `Client.cancel` does; skip unknown tasks."""
+    """Cancel tasks for a client, by its id, as `Client.cancel` does, and skip unknown tasks."""
     scheduler.stimulus_cancel(
         list(keys), client=client, force=False, reason="unknown", msg="by Partition.cancel"
     )
 
 
 async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
-    """Have a worker restarted by its nanny; return False if it is not back in time."""
+    """Have a worker restarted by its nanny, or return False if it is not back in time."""
     try:
         await scheduler.restart_workers(
             [worker.address], timeout=seconds, stimulus_id=f"poolpart-restart-{time.time()}"
@@ -248,7 +248,7 @@ def is_bound(task: Any) -> bool:
 
 
 def waiting_for_workers(scheduler: Any) -> Collection[Any]:
-    """Return the tasks that could run, and for which there is no worker."""
+    """Return the tasks that could run but have no worker."""
     tasks: Collection[Any] = scheduler.unrunnable
     return tasks
 
@@ -285,7 +285,7 @@ def _unpacked(result: Any) -> Any:
 
 
 def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
-    """Add a plugin to all workers, present and future; remove the plugin if None.
+    """Add a plugin to all workers, present and future, or remove the plugin if None.
 
     Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
     """
@@ -318,7 +318,7 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
 
 
 def handlers_of(scheduler: Any) -> dict[str, Any]:
-    """Handlers of a scheduler, by request; they and their callers exchange plain data."""
+    """Handlers of a scheduler, by request, which exchange plain data with their callers."""
     handlers: dict[str, Any] = scheduler.handlers
     return handlers
 

@@ -15,7 +15,7 @@ def has_running_tasks(dask_worker: Any = None) -> bool:
 
 
 def running_keys(worker: Any) -> list[Any]:
-    """Return the keys of the tasks that a worker runs, also of cancelled tasks."""
+    """Return the keys of the tasks that a worker runs, cancelled tasks included."""
     return [task.key for task in worker.state.all_running_tasks]
 
 
@@ -34,7 +34,9 @@ class _Available(dict[str, float]):
 
 
 def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
-    """Declare exactly these resources; runs on a worker.
+    """Declare exactly these resources.
+
+    Runs on a worker.
 
     Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
     still running, and unknown to the scheduler.
@@ -60,7 +62,10 @@ def resources_of(task: Any) -> Resources:
 
 
 def resources_here(worker: Any) -> tuple[str, ...]:
-    """Names of the resources that a worker has; runs on the worker."""
+    """Names of the resources that a worker has.
+
+    Runs on the worker.
+    """
     return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
 
 
@@ -78,7 +83,7 @@ def task_of_thread() -> tuple[Any, Any] | None:
     if (key := getattr(thread_state, "key", None)) is None:
         return None
     worker = thread_state.execution_state["worker"]
-    task = worker.state.tasks.get(key)  # an actor's method is no task
+    task = worker.state.tasks.get(key)  # a call of an actor's method is not a task
     return None if task is None else (worker, task)
 
 
@@ -95,12 +100,12 @@ def threads_of(worker: Any) -> int:
 
 
 def is_running(worker: Any, key: Any) -> bool:
-    """Return whether a worker runs a task; a task that has seceded counts."""
+    """Return whether a worker runs a task, even if the task has seceded."""
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
 def free_slots(worker: Any, slots: Resources) -> None:
-    """Give slots of a worker to its waiting tasks; runs in its event loop."""
+    """Give slots of a worker to its waiting tasks, in its event loop."""
     from distributed.worker_state_machine import UnpauseEvent
 
     for name, number in slots.items():
@@ -110,7 +115,7 @@ def free_slots(worker: Any, slots: Resources) -> None:
 
 
 def take_slots(worker: Any, slots: Resources) -> None:
-    """Keep these slots from waiting tasks, also if there are fewer now; runs in its event loop."""
+    """Keep these slots from waiting tasks, even if there are fewer now, in its event loop."""
     for name, number in slots.items():
         worker.state.available_resources[name] -= number
 
